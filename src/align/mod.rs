@@ -1,0 +1,1 @@
+//! Measurements in order of validity, whatever the order of their arrival.

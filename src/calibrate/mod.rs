@@ -1,0 +1,1 @@
+//! Calibration: intrinsics, boresight, and the Monte Carlo error analysis.

@@ -1,0 +1,19 @@
+//! `windhover check-config FILE`
+
+use std::path::PathBuf;
+
+use super::{CliError, CliResult};
+use crate::app::config_file;
+
+/// Say what is wrong with a configuration, or print the effective one with every default filled in.
+#[derive(clap::Args, Debug)]
+pub(super) struct Args {
+    /// Configuration file
+    file: PathBuf,
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    let config = config_file::load(&args.file).map_err(CliError::config)?;
+    print!("{}", config.to_toml().map_err(CliError::config)?);
+    Ok(())
+}

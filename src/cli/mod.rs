@@ -1,0 +1,41 @@
+//! The command line: parse arguments, call the library, turn results into exit codes.
+
+mod check_config;
+mod error;
+
+pub use error::{CliError, CliResult};
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Watches a ground vehicle from a small helicopter: where it is, where it points, how it moves.
+#[derive(Parser, Debug)]
+#[command(name = "windhover", version, max_term_width = 100, propagate_version = true)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand, Debug)]
+enum Command {
+    /// Say what is wrong with a configuration, or print the effective one
+    CheckConfig(check_config::Args),
+}
+
+/// Runs the command line of this process.
+pub fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => {
+            let code = if error.use_stderr() { error::WRONG_USAGE } else { error::DONE };
+            // Nothing can be done where even the message cannot be written.
+            let _ = error.print();
+            return ExitCode::from(code);
+        }
+    };
+    let result = match cli.command {
+        Command::CheckConfig(args) => check_config::run(&args),
+    };
+    error::exit_code(result)
+}

@@ -1,0 +1,218 @@
+//! What a configuration must satisfy beyond its syntax.
+
+use super::{Config, GroundConfig, MarkerConfig, MarkerKind, TargetConfig, TargetModel};
+
+/// What is wrong with a configuration.
+#[derive(Clone, PartialEq, Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// Not TOML, an unknown key, or a value of the wrong kind. The text carries line and column.
+    #[error("{0}")]
+    Syntax(String),
+    /// A value that cannot be.
+    #[error("{key}: {reason}")]
+    Value {
+        /// The key, with its table.
+        key: String,
+        /// What is wrong and what to do.
+        reason: String,
+    },
+    /// The effective configuration could not be written as TOML.
+    #[error("the configuration cannot be written as TOML: {0}")]
+    Unwritable(String),
+}
+
+impl ConfigError {
+    pub(super) fn syntax(error: &toml::de::Error) -> Self {
+        Self::Syntax(error.to_string().trim_end().to_owned())
+    }
+}
+
+fn refuse(key: impl Into<String>, reason: impl Into<String>) -> Result<(), ConfigError> {
+    Err(ConfigError::Value { key: key.into(), reason: reason.into() })
+}
+
+/// A figure must be finite and within bounds.
+fn within(key: impl Into<String>, value: f64, low: f64, high: f64) -> Result<(), ConfigError> {
+    if value.is_finite() && (low..=high).contains(&value) {
+        return Ok(());
+    }
+    refuse(key, format!("{value} is not between {low} and {high}"))
+}
+
+/// Line speeds a UART can be set to.
+const BAUDS: [u32; 13] =
+    [1200, 2400, 4800, 9600, 19200, 38400, 57600, 115_200, 230_400, 460_800, 921_600, 1_000_000, 2_000_000];
+
+fn baud(key: &str, value: u32) -> Result<(), ConfigError> {
+    if BAUDS.contains(&value) {
+        return Ok(());
+    }
+    refuse(key, format!("{value} is not a line speed; use one of {BAUDS:?}"))
+}
+
+impl Config {
+    /// Checks every value; the first that cannot be is the error.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        self.check_sensors()?;
+        self.check_camera()?;
+        check_ground(&self.ground)?;
+        if let Some(datum) = &self.datum {
+            within("datum.lat_deg", datum.lat_deg, -90.0, 90.0)?;
+            within("datum.lon_deg", datum.lon_deg, -180.0, 180.0)?;
+            within("datum.height_m", datum.height_m, -1_000.0, 20_000.0)?;
+        }
+        self.check_targets()?;
+        within("detector.min_px", self.detector.min_px, 8.0, 1_000.0)?;
+        within("detector.max_hamming", f64::from(self.detector.max_hamming), 0.0, 3.0)?;
+        within("detector.ground_features", self.detector.ground_features as f64, 0.0, 64.0)?;
+        within("estimator.history_ms", self.estimator.history_ms, 500.0, 10_000.0)?;
+        within("estimator.smoother_lag_ms", self.estimator.smoother_lag_ms, 0.0, 5_000.0)
+    }
+
+    fn check_sensors(&self) -> Result<(), ConfigError> {
+        baud("gps.baud", self.gps.baud)?;
+        baud("compass.baud", self.compass.baud)?;
+        for (key, device) in [
+            ("gps.device", &self.gps.device),
+            ("compass.device", &self.compass.device),
+            ("camera.device", &self.camera.device),
+        ] {
+            if device.is_empty() {
+                refuse(key, "names no device; give a path such as /dev/ttyS0")?;
+            }
+        }
+        for (axis, value) in self.gps.antenna_position_m.iter().enumerate() {
+            within(format!("gps.antenna_position_m[{axis}]"), *value, -20.0, 20.0)?;
+        }
+        within("gps.latency_ms", self.gps.latency_ms, -200.0, 2_000.0)?;
+        within("gps.latency_sigma_ms", self.gps.latency_sigma_ms, 0.0, 1_000.0)?;
+        within("gps.bias_sigma_m", self.gps.bias_sigma_m, 0.0, 1_000.0)?;
+        within("gps.bias_tau_s", self.gps.bias_tau_s, 1.0, 1e6)?;
+        within("gps.noise_m", self.gps.noise_m, 1e-4, 1_000.0)?;
+        within("gps.velocity_noise_mps", self.gps.velocity_noise_mps, 1e-4, 100.0)?;
+        let compass = &self.compass;
+        match (compass.declination_deg, compass.declination) {
+            (Some(_), Some(_)) => refuse(
+                "compass.declination",
+                "declination_deg is given too; keep the figure or the model, not both",
+            )?,
+            (Some(figure), None) => within("compass.declination_deg", figure, -180.0, 180.0)?,
+            _ => {}
+        }
+        within("compass.latency_ms", compass.latency_ms, -200.0, 2_000.0)?;
+        within("compass.yaw_offset_deg", compass.yaw_offset_deg, -180.0, 180.0)?;
+        within("compass.pitch_offset_deg", compass.pitch_offset_deg, -45.0, 45.0)?;
+        within("compass.roll_offset_deg", compass.roll_offset_deg, -45.0, 45.0)?;
+        within("compass.heading_bias_sigma_deg", compass.heading_bias_sigma_deg, 0.0, 180.0)?;
+        within("compass.heading_noise_deg", compass.heading_noise_deg, 1e-3, 90.0)?;
+        within("compass.tilt_noise_deg", compass.tilt_noise_deg, 1e-3, 90.0)
+    }
+
+    fn check_camera(&self) -> Result<(), ConfigError> {
+        let camera = &self.camera;
+        within("camera.width", f64::from(camera.width), 16.0, 16_384.0)?;
+        within("camera.height", f64::from(camera.height), 16.0, 16_384.0)?;
+        within("camera.fps", camera.fps, 0.1, 1_000.0)?;
+        within("camera.exposure_offset_ms", camera.exposure_offset_ms, -1_000.0, 1_000.0)?;
+        within("camera.intrinsics.fx", camera.intrinsics.fx, 1.0, 1e6)?;
+        within("camera.intrinsics.fy", camera.intrinsics.fy, 1.0, 1e6)?;
+        within("camera.intrinsics.cx", camera.intrinsics.cx, -1e5, 1e5)?;
+        within("camera.intrinsics.cy", camera.intrinsics.cy, -1e5, 1e5)?;
+        within("camera.intrinsics.skew", camera.intrinsics.skew, -1.0, 1.0)?;
+        for (term, value) in ["k1", "k2", "p1", "p2", "k3"].iter().zip(camera.intrinsics.distortion) {
+            within(format!("camera.intrinsics.distortion ({term})"), value, -100.0, 100.0)?;
+        }
+        for (axis, value) in camera.mount.position_m.iter().enumerate() {
+            within(format!("camera.mount.position_m[{axis}]"), *value, -20.0, 20.0)?;
+        }
+        within("camera.mount.yaw_deg", camera.mount.yaw_deg, -180.0, 180.0)?;
+        within("camera.mount.pitch_deg", camera.mount.pitch_deg, -90.0, 90.0)?;
+        within("camera.mount.roll_deg", camera.mount.roll_deg, -180.0, 180.0)
+    }
+
+    fn check_targets(&self) -> Result<(), ConfigError> {
+        if self.target.is_empty() {
+            return refuse("target", "no [[target]]: say which vehicle to watch");
+        }
+        let mut names = std::collections::BTreeSet::new();
+        let mut tags = std::collections::BTreeSet::new();
+        for target in &self.target {
+            check_target(target)?;
+            if !names.insert(&target.name) {
+                refuse("target.name", format!("two targets are called {:?}", target.name))?;
+            }
+            for marker in &target.marker {
+                if let (Some(family), Some(id)) = (marker.family, marker.id)
+                    && !tags.insert((family.name(), id))
+                {
+                    refuse("target.marker.id", format!("tag {id} of {} is used twice", family.name()))?;
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+fn check_ground(ground: &GroundConfig) -> Result<(), ConfigError> {
+    let given = [ground.elevation_msl_m.is_some(), ground.source.is_some(), ground.terrain.is_some()];
+    if given.iter().filter(|g| **g).count() != 1 {
+        return refuse("ground", "give exactly one of elevation_msl_m, source = \"takeoff\", terrain");
+    }
+    ground.elevation_msl_m.map_or(Ok(()), |m| within("ground.elevation_msl_m", m, -500.0, 9_000.0))
+}
+
+fn check_target(target: &TargetConfig) -> Result<(), ConfigError> {
+    let allowed = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+    if target.name.is_empty() || !target.name.chars().all(allowed) {
+        refuse("target.name", format!("{:?} must be letters, digits, - and _ only", target.name))?;
+    }
+    match (target.model, target.wheelbase_m) {
+        (TargetModel::Ackermann, None) => {
+            refuse("target.wheelbase_m", "an ackermann target needs its wheelbase")?;
+        }
+        (_, Some(wheelbase)) => within("target.wheelbase_m", wheelbase, 0.05, 50.0)?,
+        (_, None) => {}
+    }
+    within("target.reference_m", target.reference_m, -50.0, 50.0)?;
+    if target.marker.is_empty() {
+        refuse("target.marker", format!("target {:?} has no [[target.marker]]", target.name))?;
+    }
+    target.marker.iter().try_for_each(check_marker)
+}
+
+fn check_marker(marker: &MarkerConfig) -> Result<(), ConfigError> {
+    for (axis, value) in marker.position_m.iter().enumerate() {
+        within(format!("target.marker.position_m[{axis}]"), *value, -50.0, 50.0)?;
+    }
+    within("target.marker.yaw_deg", marker.yaw_deg, -360.0, 360.0)?;
+    match marker.kind {
+        MarkerKind::Apriltag => {
+            let (Some(family), Some(id)) = (marker.family, marker.id) else {
+                return refuse("target.marker", "an apriltag needs family and id");
+            };
+            if id as usize >= family.codes() {
+                refuse("target.marker.id", format!("{} has ids 0 to {}", family.name(), family.codes() - 1))?;
+            }
+            match marker.size_m {
+                Some(size) => within("target.marker.size_m", size, 0.005, 50.0),
+                None => refuse("target.marker.size_m", "an apriltag needs the edge of its black square"),
+            }
+        }
+        MarkerKind::Disc => {
+            if marker.brightness.is_some() == marker.color.is_some() {
+                refuse("target.marker", "a disc needs either brightness or color")?;
+            }
+            if let Some(color) = &marker.color
+                && !(color.len() == 7
+                    && color.starts_with('#')
+                    && color[1..].chars().all(|c| c.is_ascii_hexdigit()))
+            {
+                refuse("target.marker.color", format!("{color:?} is not #rrggbb"))?;
+            }
+            match marker.diameter_m {
+                Some(d) => within("target.marker.diameter_m", d, 0.005, 50.0),
+                None => refuse("target.marker.diameter_m", "a disc needs its diameter"),
+            }
+        }
+    }
+}

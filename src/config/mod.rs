@@ -1,0 +1,78 @@
+//! What was asked for: the configuration as values, its defaults and its checks.
+//!
+//! This is core: text in, values or errors out. Reading the file and reporting to people is `app`'s.
+//! Angles are degrees here, as people write them; each section converts where it is used.
+
+mod check;
+mod estimator;
+mod link;
+mod log;
+mod montecarlo;
+mod sensors;
+mod store;
+mod target;
+
+pub use check::ConfigError;
+pub use estimator::{DetectorConfig, EstimatorConfig};
+pub use link::LinkConfig;
+pub use log::LogConfig;
+pub use montecarlo::{Distribution, MonteCarloConfig};
+pub use sensors::{
+    CameraConfig, CameraMount, CompassConfig, CompassFormat, Datum, Declination, GpsConfig, GroundConfig,
+    GroundSource, PixelFormat,
+};
+pub use store::StoreConfig;
+pub use target::{Brightness, MarkerConfig, MarkerKind, TagFamily, TargetConfig, TargetModel};
+
+use serde::{Deserialize, Serialize};
+
+/// The whole configuration. Unknown keys are errors everywhere.
+#[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// The GPS receiver.
+    pub gps: GpsConfig,
+    /// The digital compass.
+    pub compass: CompassConfig,
+    /// The camera, its lens and its mount.
+    pub camera: CameraConfig,
+    /// The ground the vehicle drives on.
+    pub ground: GroundConfig,
+    /// Origin of the NED frame; the first fix at ground elevation where absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub datum: Option<Datum>,
+    /// The vehicles to watch.
+    pub target: Vec<TargetConfig>,
+    /// Marker detection.
+    #[serde(default)]
+    pub detector: DetectorConfig,
+    /// The joint filter.
+    #[serde(default)]
+    pub estimator: EstimatorConfig,
+    /// Flights on the data card.
+    #[serde(default)]
+    pub store: StoreConfig,
+    /// The wireless link.
+    #[serde(default)]
+    pub link: LinkConfig,
+    /// The operator's log.
+    #[serde(default)]
+    pub log: LogConfig,
+    /// The error analysis of `windhover montecarlo`.
+    #[serde(default)]
+    pub montecarlo: MonteCarloConfig,
+}
+
+impl Config {
+    /// Parses and checks a configuration. The error names line, column and key where it can.
+    pub fn parse(text: &str) -> Result<Self, ConfigError> {
+        let config: Self = toml::from_str(text).map_err(|e| ConfigError::syntax(&e))?;
+        config.check()?;
+        Ok(config)
+    }
+
+    /// The effective configuration, defaults filled in, as TOML.
+    pub fn to_toml(&self) -> Result<String, ConfigError> {
+        toml::to_string_pretty(self).map_err(|e| ConfigError::Unwritable(e.to_string()))
+    }
+}

@@ -1,0 +1,265 @@
+//! GPS, compass, camera and ground sections.
+
+use nalgebra::{Rotation3, Vector3};
+use serde::{Deserialize, Serialize};
+
+use crate::geo::{CameraModel, ImageTop, TiltConvention, body_from_camera};
+
+/// `[gps]`
+#[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GpsConfig {
+    /// Serial device; a `/dev/serial/by-id` path survives renumbering.
+    pub device: String,
+    /// Line speed, bits a second.
+    pub baud: u32,
+    /// Antenna in the body frame, forward-right-down, metres.
+    #[serde(default)]
+    pub antenna_position_m: [f64; 3],
+    /// From a fix's time of validity to the arrival of the first byte of its sentences, ms.
+    #[serde(default = "defaults::gps_latency_ms")]
+    pub latency_ms: f64,
+    /// One-sigma uncertainty of `latency_ms`; the filter learns the rest from motion.
+    #[serde(default = "defaults::gps_latency_sigma_ms")]
+    pub latency_sigma_ms: f64,
+    /// One-sigma of the slowly wandering horizontal position error, metres.
+    #[serde(default = "defaults::gps_bias_sigma_m")]
+    pub bias_sigma_m: f64,
+    /// Correlation time of the wandering error, seconds.
+    #[serde(default = "defaults::gps_bias_tau_s")]
+    pub bias_tau_s: f64,
+    /// One-sigma of the fix-to-fix position noise, metres.
+    #[serde(default = "defaults::gps_noise_m")]
+    pub noise_m: f64,
+    /// One-sigma of the velocity noise per axis, m/s.
+    #[serde(default = "defaults::gps_velocity_noise_mps")]
+    pub velocity_noise_mps: f64,
+    /// Configure a Garmin receiver at start: sentences, position averaging off, line speed.
+    #[serde(default)]
+    pub configure_garmin: bool,
+    /// Pulse-per-second device (`/dev/pps0`) that marks the receiver's seconds.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pps_device: Option<String>,
+}
+
+/// `[compass]`
+#[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CompassConfig {
+    /// Serial device.
+    pub device: String,
+    /// Line speed, bits a second.
+    pub baud: u32,
+    /// What the device speaks.
+    pub format: CompassFormat,
+    /// What it means by pitch and roll.
+    #[serde(default)]
+    pub angles: TiltConvention,
+    /// Magnetic declination, degrees, east positive.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub declination_deg: Option<f64>,
+    /// Declination from a model instead of a figure.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub declination: Option<Declination>,
+    /// From a sample's time of validity to the arrival of its first byte, ms (filter delay of the
+    /// device and its transmission start).
+    #[serde(default = "defaults::compass_latency_ms")]
+    pub latency_ms: f64,
+    /// Small rotation of the compass on the aircraft: added to heading, degrees.
+    #[serde(default)]
+    pub yaw_offset_deg: f64,
+    /// Tilt zero: subtracted from pitch, degrees.
+    #[serde(default)]
+    pub pitch_offset_deg: f64,
+    /// Tilt zero: subtracted from roll, degrees.
+    #[serde(default)]
+    pub roll_offset_deg: f64,
+    /// One-sigma of the heading's constant error, degrees.
+    #[serde(default = "defaults::heading_bias_sigma_deg")]
+    pub heading_bias_sigma_deg: f64,
+    /// One-sigma of the heading noise, degrees.
+    #[serde(default = "defaults::heading_noise_deg")]
+    pub heading_noise_deg: f64,
+    /// One-sigma of the tilt noise of the sensor at rest, degrees.
+    #[serde(default = "defaults::tilt_noise_deg")]
+    pub tilt_noise_deg: f64,
+}
+
+/// Serial compass formats.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CompassFormat {
+    /// PNI TCM2, TCM2.5, TCM2.6 word format `$C…P…R…`.
+    Tcm2,
+    /// OceanServer OS5000.
+    Os5000,
+    /// Honeywell HMR3000 `$PTNTHPR`.
+    Hmr3000,
+    /// True North Revolution `$PTNTHTM`.
+    Revolution,
+    /// PNI TCM3/5/XB binary.
+    Pni,
+    /// `$PASHR`.
+    Pashr,
+    /// Generic NMEA heading sentences.
+    Nmea,
+}
+
+/// Where declination comes from when not given as a figure.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Declination {
+    /// The World Magnetic Model at the first fix.
+    Wmm,
+}
+
+/// `[camera]`
+#[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraConfig {
+    /// V4L2 device.
+    pub device: String,
+    /// Frame width, pixels.
+    pub width: u32,
+    /// Frame height, pixels.
+    pub height: u32,
+    /// Frames a second asked for.
+    pub fps: f64,
+    /// What V4L2 is asked for.
+    #[serde(default)]
+    pub pixel_format: PixelFormat,
+    /// Added to the driver's stamp to reach mid-exposure, ms.
+    #[serde(default)]
+    pub exposure_offset_ms: f64,
+    /// The lens.
+    pub intrinsics: CameraModel,
+    /// How it is mounted.
+    #[serde(default)]
+    pub mount: CameraMount,
+}
+
+/// Pixel formats understood.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
+pub enum PixelFormat {
+    /// 8-bit grey.
+    #[default]
+    #[serde(rename = "GREY")]
+    Grey,
+    /// Packed 4:2:2, Y first.
+    #[serde(rename = "YUYV")]
+    Yuyv,
+    /// Packed 4:2:2, U first.
+    #[serde(rename = "UYVY")]
+    Uyvy,
+    /// Planar 4:2:0, Y then interleaved UV.
+    #[serde(rename = "NV12")]
+    Nv12,
+    /// Motion JPEG.
+    #[serde(rename = "MJPG")]
+    Mjpg,
+    /// 24-bit RGB (V4L2 RGB3).
+    #[serde(rename = "RGB24", alias = "RGB3")]
+    Rgb24,
+}
+
+/// `[camera.mount]`
+#[derive(Clone, Copy, PartialEq, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CameraMount {
+    /// Where the top of the image points on the aircraft.
+    pub image_top: ImageTop,
+    /// Camera in the body frame, forward-right-down, metres.
+    pub position_m: [f64; 3],
+    /// Small mounting yaw, degrees.
+    pub yaw_deg: f64,
+    /// Small mounting pitch, degrees.
+    pub pitch_deg: f64,
+    /// Small mounting roll, degrees.
+    pub roll_deg: f64,
+}
+
+impl CameraMount {
+    /// `body_from_camera` with the mounting angles.
+    pub fn body_from_camera(&self) -> Rotation3<f64> {
+        body_from_camera(
+            self.image_top,
+            self.yaw_deg.to_radians(),
+            self.pitch_deg.to_radians(),
+            self.roll_deg.to_radians(),
+        )
+    }
+
+    /// Camera position in the body frame, metres.
+    pub fn position(&self) -> Vector3<f64> {
+        Vector3::from(self.position_m)
+    }
+}
+
+/// `[ground]`: either an elevation, or where it comes from.
+#[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GroundConfig {
+    /// Elevation of level ground above mean sea level, metres.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub elevation_msl_m: Option<f64>,
+    /// Where the elevation comes from instead.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub source: Option<GroundSource>,
+    /// Terrain tile (SRTM .hgt or GeoTIFF).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub terrain: Option<String>,
+}
+
+/// Where the ground's elevation comes from.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum GroundSource {
+    /// The height of the first fixes: the aircraft stands on the ground when the program starts.
+    Takeoff,
+}
+
+/// `[datum]`: the NED origin.
+#[derive(Clone, Copy, PartialEq, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Datum {
+    /// Latitude, degrees.
+    pub lat_deg: f64,
+    /// Longitude, degrees.
+    pub lon_deg: f64,
+    /// Height above the ellipsoid, metres.
+    pub height_m: f64,
+}
+
+/// Defaults from data sheets; `config/windhover.toml` tells where each comes from.
+mod defaults {
+    pub(super) fn gps_latency_ms() -> f64 {
+        120.0
+    }
+    pub(super) fn gps_latency_sigma_ms() -> f64 {
+        40.0
+    }
+    pub(super) fn gps_bias_sigma_m() -> f64 {
+        1.5
+    }
+    pub(super) fn gps_bias_tau_s() -> f64 {
+        100.0
+    }
+    pub(super) fn gps_noise_m() -> f64 {
+        0.15
+    }
+    pub(super) fn gps_velocity_noise_mps() -> f64 {
+        0.05
+    }
+    pub(super) fn compass_latency_ms() -> f64 {
+        20.0
+    }
+    pub(super) fn heading_bias_sigma_deg() -> f64 {
+        2.0
+    }
+    pub(super) fn heading_noise_deg() -> f64 {
+        0.5
+    }
+    pub(super) fn tilt_noise_deg() -> f64 {
+        0.3
+    }
+}

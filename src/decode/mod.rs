@@ -1,0 +1,1 @@
+//! Serial framing, NMEA, Garmin sentences, compass formats.

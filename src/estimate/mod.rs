@@ -1,0 +1,1 @@
+//! The joint filter, the smoother, and the paper's estimator.

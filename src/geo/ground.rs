@@ -1,0 +1,40 @@
+//! The ground the vehicle drives on, as a surface in the NED frame.
+
+use nalgebra::Vector3;
+
+/// A ground surface.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Ground {
+    /// A level plane at this down coordinate, metres.
+    Flat {
+        /// Down coordinate of the plane, metres.
+        down_m: f64,
+    },
+}
+
+impl Ground {
+    /// Down coordinate of the surface under a point, metres.
+    pub fn down_m(&self, _north_m: f64, _east_m: f64) -> f64 {
+        match self {
+            Self::Flat { down_m } => *down_m,
+        }
+    }
+
+    /// Distance along a ray (in lengths of `direction`) to the surface raised by `above_m`; `None`
+    /// where the ray does not come down on it (paper eq. 11 and 23, corrected).
+    pub fn intersect(&self, origin: &Vector3<f64>, direction: &Vector3<f64>, above_m: f64) -> Option<f64> {
+        match self {
+            Self::Flat { down_m } => {
+                let range = (down_m - above_m - origin.z) / direction.z;
+                (direction.z > 0.0 && range > 0.0 && range.is_finite()).then_some(range)
+            }
+        }
+    }
+
+    /// Slope ∂down/∂(north, east) under a point.
+    pub fn slope(&self, _north_m: f64, _east_m: f64) -> [f64; 2] {
+        match self {
+            Self::Flat { .. } => [0.0, 0.0],
+        }
+    }
+}

@@ -1,0 +1,1 @@
+//! The edge: clock, serial, camera, captures, store, link.

@@ -1,0 +1,27 @@
+//! Windhover watches an unmanned ground vehicle from a small helicopter.
+//!
+//! A recorded or live stream of serial bytes and camera frames goes in; where the vehicle is, where
+//! it points, how fast it drives and turns comes out, each with its covariance. `ARCHITECTURE.md`
+//! tells how the parts fit.
+//!
+//! A module names only modules listed above it here. Core (up to `pipeline`) turns values into
+//! values: it never reads a clock, logs, waits or touches a device. `io` moves events and records;
+//! `app` wires; `cli` talks to people. `tests/architecture.rs` holds this.
+
+// -- core: values in, values out
+pub mod align;
+pub mod calibrate;
+pub mod config;
+pub mod decode;
+pub mod detect;
+pub mod estimate;
+pub mod geo;
+pub mod msg;
+pub mod pipeline;
+pub mod simulate;
+pub mod time;
+// -- edge: devices, disk, network
+pub mod io;
+// -- wiring
+pub mod app;
+pub mod cli;

@@ -1,0 +1,104 @@
+//! What devices (or a capture of them) deliver, stamped on arrival.
+
+use std::sync::Arc;
+
+use crate::time::MonoTime;
+
+/// Where an event comes from.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub enum Source {
+    /// GPS receiver.
+    Gps,
+    /// Digital compass.
+    Compass,
+    /// Camera.
+    Camera,
+}
+
+impl Source {
+    /// Its name in logs.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Gps => "gps",
+            Self::Compass => "compass",
+            Self::Camera => "camera",
+        }
+    }
+}
+
+/// One thing heard, in the order it was heard.
+#[derive(Clone, Debug)]
+pub struct Event {
+    /// When it was heard, host time.
+    pub t_recv: MonoTime,
+    /// Position in the stream of events.
+    pub seq: u64,
+    /// What was heard.
+    pub body: EventBody,
+}
+
+/// What was heard.
+#[derive(Clone, Debug)]
+pub enum EventBody {
+    /// The bytes one read of the GPS line returned.
+    GnssBytes(Vec<u8>),
+    /// The bytes one read of the compass line returned.
+    CompassBytes(Vec<u8>),
+    /// One camera frame.
+    Frame(FramePayload),
+    /// Time passed: silence is an event too, so that time-outs replay.
+    Tick,
+    /// Something was lost before it could be recorded.
+    Dropped {
+        /// Whose.
+        source: Source,
+        /// How many messages.
+        count: u32,
+    },
+    /// A device answered.
+    SourceUp(Source),
+    /// A device went away.
+    SourceDown(Source),
+}
+
+/// How the bytes of a frame are to be read.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum FrameEncoding {
+    /// 8-bit grey.
+    Grey,
+    /// Packed 4:2:2, Y first.
+    Yuyv,
+    /// Packed 4:2:2, U first.
+    Uyvy,
+    /// Planar 4:2:0.
+    Nv12,
+    /// 24-bit RGB.
+    Rgb24,
+    /// 24-bit BGR.
+    Bgr24,
+    /// JPEG (also one frame of Motion JPEG).
+    Jpeg,
+    /// PNG.
+    Png,
+    /// An encoding this program does not read; the frame counts, but cannot be used.
+    Unknown,
+}
+
+/// A frame as the driver or the capture gave it.
+#[derive(Clone, Debug)]
+pub struct FramePayload {
+    /// Number of the frame since recording began, from 0, undecodable ones included.
+    pub index: u32,
+    /// The driver's exposure stamp, host time.
+    pub t_exposure: MonoTime,
+    /// How to read `data`.
+    pub encoding: FrameEncoding,
+    /// Width in pixels; 0 where the encoding tells.
+    pub width: u32,
+    /// Height in pixels; 0 where the encoding tells.
+    pub height: u32,
+    /// Bytes from one row to the next; 0 where the encoding tells.
+    pub stride: u32,
+    /// The bytes.
+    pub data: Arc<[u8]>,
+}

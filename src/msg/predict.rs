@@ -1,0 +1,32 @@
+//! What the filter expects of a frame before it is searched.
+
+use nalgebra::Vector2;
+
+use super::MarkerId;
+
+/// Where a marker should be in a frame.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct MarkerPrediction {
+    /// Which marker.
+    pub marker: MarkerId,
+    /// Its centre, pixels.
+    pub center_px: Vector2<f64>,
+    /// One-sigma of the centre, pixels (the larger axis).
+    pub sigma_px: f64,
+    /// Apparent size: a tag's mean edge, a disc's mean diameter, pixels.
+    pub size_px: f64,
+}
+
+/// What the filter expects of a frame.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct FramePrediction {
+    /// Markers that should be in view. A marker left out is not expected.
+    pub markers: Vec<MarkerPrediction>,
+    /// Whether some target is not held: the whole frame is to be searched at once.
+    pub search: bool,
+    /// Smallest and largest apparent tag edge to expect from the camera's height over the ground,
+    /// pixels; `None` where the height is not known.
+    pub size_range_px: Option<(f64, f64)>,
+    /// Circles (centre, radius, pixels) that vehicles cover: no ground features there.
+    pub occupied: Vec<(Vector2<f64>, f64)>,
+}

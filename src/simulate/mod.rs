@@ -1,0 +1,1 @@
+//! Simulated flights: motion, sensors, rendered frames.
