@@ -18,6 +18,7 @@ pub mod estimate;
 pub mod geo;
 pub mod msg;
 pub mod pipeline;
+pub mod plot;
 pub mod simulate;
 pub mod time;
 // -- edge: devices, disk, network

@@ -2,6 +2,7 @@
 
 mod check_config;
 mod error;
+mod montecarlo;
 
 pub use error::{CliError, CliResult};
 
@@ -21,6 +22,8 @@ pub struct Cli {
 enum Command {
     /// Say what is wrong with a configuration, or print the effective one
     CheckConfig(check_config::Args),
+    /// Predict how well the ground is located from here: the paper's error analysis
+    Montecarlo(montecarlo::Args),
 }
 
 /// Runs the command line of this process.
@@ -36,6 +39,7 @@ pub fn main() -> ExitCode {
     };
     let result = match cli.command {
         Command::CheckConfig(args) => check_config::run(&args),
+        Command::Montecarlo(args) => montecarlo::run(&args),
     };
     error::exit_code(result)
 }

@@ -66,7 +66,41 @@ impl Config {
         within("detector.max_hamming", f64::from(self.detector.max_hamming), 0.0, 3.0)?;
         within("detector.ground_features", self.detector.ground_features as f64, 0.0, 64.0)?;
         within("estimator.history_ms", self.estimator.history_ms, 500.0, 10_000.0)?;
-        within("estimator.smoother_lag_ms", self.estimator.smoother_lag_ms, 0.0, 5_000.0)
+        within("estimator.smoother_lag_ms", self.estimator.smoother_lag_ms, 0.0, 5_000.0)?;
+        self.check_montecarlo()
+    }
+
+    fn check_montecarlo(&self) -> Result<(), ConfigError> {
+        let mc = &self.montecarlo;
+        for (axis, value) in mc.position_ned_m.iter().enumerate() {
+            within(format!("montecarlo.position_ned_m[{axis}]"), *value, -20_000.0, 20_000.0)?;
+        }
+        for (axis, value) in mc.pixel.iter().flatten().enumerate() {
+            within(format!("montecarlo.pixel[{axis}]"), *value, -1e5, 1e5)?;
+        }
+        for (key, value, high) in [
+            ("heading_deg", mc.heading_deg, 360.0),
+            ("pitch_deg", mc.pitch_deg, 90.0),
+            ("roll_deg", mc.roll_deg, 180.0),
+            ("above_ground_m", mc.above_ground_m, 1_000.0),
+        ] {
+            within(format!("montecarlo.{key}"), value, -high, high)?;
+        }
+        for (key, value, high) in [
+            ("gps_horizontal_sigma_m", mc.gps_horizontal_sigma_m, 1_000.0),
+            ("gps_vertical_sigma_m", mc.gps_vertical_sigma_m, 1_000.0),
+            ("heading_sigma_deg", mc.heading_sigma_deg, 90.0),
+            ("pitch_sigma_deg", mc.pitch_sigma_deg, 90.0),
+            ("roll_sigma_deg", mc.roll_sigma_deg, 90.0),
+            ("pixel_sigma_px", mc.pixel_sigma_px, 1_000.0),
+            ("ground_sigma_m", mc.ground_sigma_m, 1_000.0),
+            ("mount_sigma_deg", mc.mount_sigma_deg, 90.0),
+            ("focal_sigma_px", mc.focal_sigma_px, 1_000.0),
+            ("principal_sigma_px", mc.principal_sigma_px, 1_000.0),
+        ] {
+            within(format!("montecarlo.{key}"), value, 0.0, high)?;
+        }
+        Ok(())
     }
 
     fn check_sensors(&self) -> Result<(), ConfigError> {

@@ -1,0 +1,141 @@
+//! `windhover montecarlo`
+
+use std::path::{Path, PathBuf};
+
+use serde_json::json;
+
+use super::{CliError, CliResult};
+use crate::app::config_file;
+use crate::calibrate::montecarlo::{Analysis, Setup};
+use crate::calibrate::{Overlay, scatter_svg};
+use crate::config::Config;
+use crate::plot;
+
+/// The configuration shipped with the program: the paper's camera.
+const SHIPPED: &str = include_str!("../../config/windhover.toml");
+
+/// Predict how well the ground is located: draw errors of GPS, compass, pixel and camera, run
+/// geo-positioning on each draw, and compare with the closed form.
+///
+/// Pose, pixel and error sigmas are the section [montecarlo] of the configuration; by default the
+/// paper's: the camera level, 10 m above ground, GPS 3 m (95 %), tilt 0.2 degrees.
+#[derive(clap::Args, Debug)]
+pub(super) struct Args {
+    /// Configuration with camera, mount and [montecarlo]; the paper's camera where absent
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Number of draws
+    #[arg(long, value_name = "N", default_value_t = 100_000, value_parser = clap::value_parser!(u64).range(2..=100_000_000))]
+    samples: u64,
+    /// Seed of the draws; the same seed gives the same figures
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// One JSON object on standard output
+    #[arg(long)]
+    json: bool,
+    /// Draw the scatter with its circles and ellipse
+    #[arg(long, value_name = "FILE.svg")]
+    plot: Option<PathBuf>,
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    let config = match &args.config {
+        Some(path) => config_file::load(path).map_err(CliError::config)?,
+        None => Config::parse(SHIPPED).map_err(CliError::config)?,
+    };
+    let setup = Setup::from_config(&config);
+    let analysis = setup
+        .run(args.samples as usize, args.seed)
+        .map_err(|e| CliError::config(format!("[montecarlo] pose and pixel: {e}")))?;
+    if let Some(path) = &args.plot {
+        write_plot(path, &setup, &analysis, None)?;
+    }
+    if args.json {
+        println!("{}", as_json(&setup, &analysis, args.seed));
+    } else {
+        print_text(&setup, &analysis, args.seed);
+    }
+    Ok(())
+}
+
+fn write_plot(path: &Path, setup: &Setup, analysis: &Analysis, overlay: Option<&Overlay>) -> CliResult {
+    let p = setup.position_ned_m;
+    let title =
+        format!("Geo-positioning error, {} errors, {:.1} m above ground", setup.distribution.name(), -p.z);
+    let svg = plot::standalone(&scatter_svg(analysis, &title, overlay));
+    std::fs::write(path, svg).map_err(|e| CliError::failed(format!("cannot write {}: {e}", path.display())))
+}
+
+fn as_json(setup: &Setup, analysis: &Analysis, seed: u64) -> serde_json::Value {
+    let (sample, closed) = (&analysis.sample_m2, &analysis.closed_m2);
+    let budget: Vec<_> = analysis
+        .budget
+        .iter()
+        .map(|line| {
+            json!({
+                "source": line.source, "sigma": line.sigma, "sigma_n_m": line.north_m,
+                "sigma_e_m": line.east_m, "share": line.share,
+            })
+        })
+        .collect();
+    json!({
+        "sigma_n_m": sample[(0, 0)].sqrt(),
+        "sigma_e_m": sample[(1, 1)].sqrt(),
+        "cov_ne_m2": sample[(0, 1)],
+        "mean_n_m": analysis.mean_m.x,
+        "mean_e_m": analysis.mean_m.y,
+        "r50_m": analysis.r50_m,
+        "r95_m": analysis.r95_m,
+        "max_m": analysis.max_m,
+        "distribution": setup.distribution.name(),
+        "samples": analysis.errors_m.len() + analysis.missed,
+        "missed": analysis.missed,
+        "seed": seed,
+        "closed": {
+            "sigma_n_m": closed[(0, 0)].sqrt(),
+            "sigma_e_m": closed[(1, 1)].sqrt(),
+            "cov_ne_m2": closed[(0, 1)],
+        },
+        "budget": budget,
+    })
+}
+
+fn print_text(setup: &Setup, analysis: &Analysis, seed: u64) {
+    let p = setup.position_ned_m;
+    let [heading, pitch, roll] = setup.attitude_rad.map(f64::to_degrees);
+    let (sample, closed) = (&analysis.sample_m2, &analysis.closed_m2);
+    println!(
+        "camera at north {:.2} east {:.2} down {:.2} m, heading {heading:.1}°, pitch {pitch:.1}°, roll {roll:.1}°, pixel ({:.1}, {:.1})",
+        p.x, p.y, p.z, setup.pixel.x, setup.pixel.y
+    );
+    let drawn = analysis.errors_m.len() + analysis.missed;
+    println!("{drawn} draws, {} errors, seed {seed}", setup.distribution.name());
+    if analysis.missed > 0 {
+        println!("{} draws looked past the ground and are left out", analysis.missed);
+    }
+    println!("\n               north m    east m");
+    println!("sigma drawn   {:8.4}  {:8.4}", sample[(0, 0)].sqrt(), sample[(1, 1)].sqrt());
+    println!("sigma closed  {:8.4}  {:8.4}   (first order)", closed[(0, 0)].sqrt(), closed[(1, 1)].sqrt());
+    println!("mean          {:8.4}  {:8.4}", analysis.mean_m.x, analysis.mean_m.y);
+    println!(
+        "\n50 % within {:.3} m, 95 % within {:.3} m, worst {:.3} m",
+        analysis.r50_m, analysis.r95_m, analysis.max_m
+    );
+    println!("\nerror budget       one sigma   north m    east m   share of variance");
+    for line in &analysis.budget {
+        let (sigma, unit) = match line.source {
+            s if s.starts_with("gps") || s.starts_with("ground") => (line.sigma, "m"),
+            s if ["heading", "pitch", "roll"].contains(&s) || s.starts_with("mount") => {
+                (line.sigma.to_degrees(), "°")
+            }
+            _ => (line.sigma, "px"),
+        };
+        println!(
+            "{:<18} {sigma:8.3} {unit:<2} {:8.4}  {:8.4}   {:6.2} %",
+            line.source,
+            line.north_m,
+            line.east_m,
+            100.0 * line.share
+        );
+    }
+}

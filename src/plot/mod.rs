@@ -1,0 +1,14 @@
+//! Drawings as SVG text: charts of data, equal-scale maps, images of error. Values in, strings out.
+//!
+//! A chart names its inks by class, never by colour: [`standalone`] adds a style sheet that follows
+//! the reader's light or dark setting, and a page that embeds charts brings the same sheet once.
+
+mod chart;
+mod geometry;
+mod scale;
+mod style;
+
+pub use chart::{Chart, Ink, Mark};
+pub use geometry::{ellipse, thin};
+pub use scale::Scale;
+pub use style::{CHART_CSS, PALETTE_CSS, escape, standalone};
