@@ -1,1 +1,9 @@
 //! The edge: clock, serial, camera, captures, store, link.
+
+pub mod camera;
+pub mod clock;
+pub mod device;
+pub mod notify;
+pub mod power;
+pub mod pps;
+pub mod serial;

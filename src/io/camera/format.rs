@@ -1,0 +1,96 @@
+//! Pixel formats by their V4L2 names, and which of those offered is taken.
+
+use crate::config::PixelFormat;
+use crate::msg::FrameEncoding;
+
+/// A four-character code of V4L2.
+pub(super) type FourCc = [u8; 4];
+
+/// The code V4L2 knows a format by.
+pub(super) const fn fourcc(format: PixelFormat) -> FourCc {
+    match format {
+        PixelFormat::Grey => *b"GREY",
+        PixelFormat::Yuyv => *b"YUYV",
+        PixelFormat::Uyvy => *b"UYVY",
+        PixelFormat::Nv12 => *b"NV12",
+        PixelFormat::Mjpg => *b"MJPG",
+        PixelFormat::Rgb24 => *b"RGB3",
+    }
+}
+
+/// How frames of a V4L2 format are read; `None` where they are not understood.
+pub(super) const fn encoding(code: FourCc) -> Option<FrameEncoding> {
+    Some(match &code {
+        b"GREY" => FrameEncoding::Grey,
+        b"YUYV" => FrameEncoding::Yuyv,
+        b"UYVY" => FrameEncoding::Uyvy,
+        b"NV12" => FrameEncoding::Nv12,
+        b"RGB3" => FrameEncoding::Rgb24,
+        b"BGR3" => FrameEncoding::Bgr24,
+        b"MJPG" | b"JPEG" => FrameEncoding::Jpeg,
+        _ => return None,
+    })
+}
+
+/// Formats in the order they are preferred when what was asked for is not offered: those whose grey
+/// is read off directly first, lossy ones last.
+const PREFERENCE: [FourCc; 8] =
+    [*b"GREY", *b"NV12", *b"YUYV", *b"UYVY", *b"RGB3", *b"BGR3", *b"MJPG", *b"JPEG"];
+
+/// Which format to ask the driver for: `asked` where it is offered (or where the driver offers no
+/// list), else the preferred one of those understood; `None` where none is.
+pub(super) fn choose(asked: FourCc, offered: &[FourCc]) -> Option<FourCc> {
+    if offered.is_empty() || offered.contains(&asked) {
+        return Some(asked);
+    }
+    PREFERENCE.into_iter().find(|code| offered.contains(code))
+}
+
+/// A code as people write it.
+pub(super) fn name(code: FourCc) -> String {
+    code.iter().map(|&byte| if byte.is_ascii_graphic() { char::from(byte) } else { '.' }).collect()
+}
+
+/// The smallest frame of a format, bytes: with `stride` bytes from one row to the next. `None` for
+/// compressed formats, whose frames have any size.
+pub(super) fn frame_bytes(encoding: FrameEncoding, stride: usize, height: usize) -> Option<usize> {
+    match encoding {
+        FrameEncoding::Nv12 => Some(stride * height * 3 / 2),
+        FrameEncoding::Jpeg | FrameEncoding::Png | FrameEncoding::Unknown => None,
+        _ => Some(stride * height),
+    }
+}
+
+/// Bytes of a row without padding, for drivers that leave the stride out.
+pub(super) const fn packed_stride(encoding: FrameEncoding, width: u32) -> u32 {
+    match encoding {
+        FrameEncoding::Grey | FrameEncoding::Nv12 => width,
+        FrameEncoding::Yuyv | FrameEncoding::Uyvy => width * 2,
+        FrameEncoding::Rgb24 | FrameEncoding::Bgr24 => width * 3,
+        FrameEncoding::Jpeg | FrameEncoding::Png | FrameEncoding::Unknown => 0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_asked_for_comes_first() {
+        assert_eq!(choose(*b"YUYV", &[*b"GREY", *b"YUYV"]), Some(*b"YUYV"));
+        assert_eq!(choose(*b"GREY", &[*b"MJPG", *b"YUYV"]), Some(*b"YUYV"));
+        assert_eq!(choose(*b"GREY", &[*b"H264", *b"BA81"]), None);
+        assert_eq!(choose(*b"GREY", &[]), Some(*b"GREY"));
+    }
+
+    #[test]
+    fn every_configurable_format_is_understood() {
+        use PixelFormat::{Grey, Mjpg, Nv12, Rgb24, Uyvy, Yuyv};
+        for format in [Grey, Yuyv, Uyvy, Nv12, Mjpg, Rgb24] {
+            assert!(encoding(fourcc(format)).is_some(), "{format:?}");
+        }
+        assert_eq!(frame_bytes(FrameEncoding::Nv12, 1280, 1024), Some(1280 * 1024 * 3 / 2));
+        assert_eq!(frame_bytes(FrameEncoding::Jpeg, 0, 1024), None);
+        assert_eq!(name(*b"Y16\0"), "Y16.");
+    }
+}

@@ -1,0 +1,204 @@
+//! A recorded camera: the frames of a capture or a folder of images, delivered at their own pace.
+//!
+//! It stands in for the device in tests and measurements: everything after the V4L2 call is the same.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::CameraSettings;
+use crate::io::clock::HostClock;
+use crate::io::device::{Fault, FaultKind, NAP, NoteKind, RawFrame, Report, Stop};
+use crate::msg::FrameEncoding;
+use crate::time::{MonoTime, Span};
+
+/// A recorded frame and when it was delivered, both on the recording's own clock.
+struct Recorded {
+    t_recv: MonoTime,
+    frame: RawFrame,
+}
+
+/// Plays a recording until its end and beyond (`None` when the end of the program was asked for), or
+/// until it cannot be read.
+pub(super) fn play(
+    path: &str,
+    settings: &CameraSettings,
+    again: bool,
+    clock: HostClock,
+    stop: &Stop,
+    tell: &dyn Fn(Report),
+) -> Option<Fault> {
+    let frame_time = Span::from_s(1.0 / settings.fps);
+    let mut began = clock.now();
+    let mut told = false;
+    loop {
+        let frames = match open(Path::new(path)) {
+            Ok(frames) => frames,
+            Err(detail) => return Some(Fault::new(FaultKind::Missing, path, detail)),
+        };
+        if !std::mem::replace(&mut told, true) {
+            tell(Report::Up(format!("recording {path}")));
+        }
+        let mut played = Span::ZERO;
+        let mut first = None;
+        for recorded in frames {
+            let origin = *first.get_or_insert(recorded.t_recv);
+            played = recorded.t_recv - origin;
+            if !wait_until(began + played, clock, stop, tell) {
+                return None;
+            }
+            let mut frame = recorded.frame;
+            frame.t_exposure = began + (frame.t_exposure - origin);
+            tell(Report::Frame(clock.now(), frame));
+        }
+        if first.is_none() {
+            return Some(Fault::new(FaultKind::Unsuitable, path, "holds no camera frame"));
+        }
+        if !again {
+            tell(Report::Note(NoteKind::PlayedOut, 1, format!("{path} has played to its end")));
+            while !stop.asked() {
+                tell(Report::Beat);
+                std::thread::sleep(NAP);
+            }
+            return None;
+        }
+        began += played + frame_time;
+    }
+}
+
+/// Sleeps until `due`, answering meanwhile; whether to go on.
+fn wait_until(due: MonoTime, clock: HostClock, stop: &Stop, tell: &dyn Fn(Report)) -> bool {
+    loop {
+        tell(Report::Beat);
+        if stop.asked() {
+            return false;
+        }
+        let left = due - clock.now();
+        if left <= Span::ZERO {
+            return true;
+        }
+        std::thread::sleep(NAP.min(Duration::from_nanos(left.ns().unsigned_abs())));
+    }
+}
+
+fn open(path: &Path) -> Result<Box<dyn Iterator<Item = Recorded>>, String> {
+    Ok(Box::new(folder(path)?))
+}
+
+/// The list of a folder's images: `time_s,file`, a row an image, after a header row.
+const TIMES: &str = "times.csv";
+
+/// Images of a folder by its list; an image is read when it is due. Images that cannot be read are
+/// left out.
+fn folder(path: &Path) -> Result<impl Iterator<Item = Recorded> + use<>, String> {
+    let list = path.join(TIMES);
+    let text = std::fs::read_to_string(&list).map_err(|e| format!("cannot read {}: {e}", list.display()))?;
+    let mut images: Vec<(MonoTime, PathBuf)> = Vec::new();
+    for (number, line) in text.lines().enumerate().skip(1).filter(|(_, line)| !line.trim().is_empty()) {
+        let (time, file) = line.split_once(',').unwrap_or((line, ""));
+        let time: f64 = time
+            .trim()
+            .parse()
+            .map_err(|_| format!("{}, line {}: {time:?} is no time", list.display(), number + 1))?;
+        images.push((MonoTime::from_ns(0) + Span::from_s(time), path.join(file.trim())));
+    }
+    Ok(images.into_iter().filter_map(|(t, file)| Some(Recorded { t_recv: t, frame: image(t, &file)? })))
+}
+
+/// An image file as a frame: PGM as raw grey, JPEG and PNG as they are.
+fn image(t_exposure: MonoTime, file: &Path) -> Option<RawFrame> {
+    let data = std::fs::read(file).ok()?;
+    let extension = file.extension()?.to_str()?.to_ascii_lowercase();
+    let encoding = match extension.as_str() {
+        "pgm" => {
+            let (width, height, start) = pgm_header(&data)?;
+            let pixels = data.get(start..start.checked_add(width as usize * height as usize)?)?;
+            let data: Arc<[u8]> = Arc::from(pixels);
+            let encoding = FrameEncoding::Grey;
+            return Some(RawFrame { t_exposure, encoding, width, height, stride: width, data });
+        }
+        "jpg" | "jpeg" => FrameEncoding::Jpeg,
+        "png" => FrameEncoding::Png,
+        _ => FrameEncoding::Unknown,
+    };
+    Some(RawFrame { t_exposure, encoding, width: 0, height: 0, stride: 0, data: Arc::from(data) })
+}
+
+/// Width, height and first pixel of a binary 8-bit PGM (`P5`).
+fn pgm_header(data: &[u8]) -> Option<(u32, u32, usize)> {
+    let mut fields = Vec::new();
+    let mut at = 0;
+    while fields.len() < 4 {
+        while data.get(at)?.is_ascii_whitespace() {
+            at += 1;
+        }
+        let start = at;
+        while !data.get(at)?.is_ascii_whitespace() {
+            at += 1;
+        }
+        fields.push(std::str::from_utf8(&data[start..at]).ok()?);
+    }
+    let [magic, width, height, white] = fields.as_slice() else { return None };
+    let known = *magic == "P5" && *white == "255";
+    known.then_some((width.parse().ok()?, height.parse().ok()?, at + 1))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::RefCell;
+
+    use super::*;
+    use crate::config::PixelFormat;
+
+    #[test]
+    fn a_folder_plays_at_its_own_pace() {
+        // Given three images 40 ms apart, the last of them missing.
+        let folder = tempfile::tempdir().expect("a folder");
+        let pgm = [b"P5\n4 2\n255\n".as_slice(), &[7; 8]].concat();
+        std::fs::write(folder.path().join("a.pgm"), &pgm).expect("written");
+        std::fs::write(folder.path().join("b.jpg"), [0xff, 0xd8]).expect("written");
+        let list = "time_s,file\n100.00,a.pgm\n100.04,b.jpg\n100.08,c.jpg\n";
+        std::fs::write(folder.path().join(TIMES), list).expect("written");
+
+        // When it is played.
+        let settings = CameraSettings {
+            device: String::new(),
+            width: 4,
+            height: 2,
+            fps: 25.0,
+            pixel_format: PixelFormat::Grey,
+        };
+        let stop = Stop::default();
+        let frames = RefCell::new(Vec::new());
+        let fault = play(
+            &folder.path().to_string_lossy(),
+            &settings,
+            false,
+            HostClock::start(),
+            &stop,
+            &|r| match r {
+                Report::Frame(t, frame) => frames.borrow_mut().push((t, frame)),
+                Report::Note(NoteKind::PlayedOut, ..) => stop.ask(),
+                _ => {}
+            },
+        );
+
+        // Then two frames came, as far apart as they were recorded.
+        assert!(fault.is_none());
+        let frames = frames.into_inner();
+        assert_eq!(frames.len(), 2);
+        let apart = frames[1].1.t_exposure - frames[0].1.t_exposure;
+        assert!((apart - Span::from_ms(40.0)).abs() < Span::from_ms(0.001), "{apart:?}");
+        assert!(frames[1].0 >= frames[1].1.t_exposure);
+        assert_eq!((frames[0].1.encoding, frames[0].1.data.len()), (FrameEncoding::Grey, 8));
+        assert_eq!(frames[1].1.encoding, FrameEncoding::Jpeg);
+    }
+
+    #[test]
+    fn what_is_no_recording_is_told() {
+        assert!(open(Path::new("/nowhere/at/all")).is_err());
+        assert_eq!(pgm_header(b"P5 1280 1024 255\n..."), Some((1280, 1024, 17)));
+        assert_eq!(pgm_header(b"P2 1 1 255\n0"), None);
+        assert_eq!(pgm_header(b"P5 12"), None);
+    }
+}

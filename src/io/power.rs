@@ -1,0 +1,195 @@
+//! Temperature and supply voltage as the kernel offers them: hwmon and power_supply in sysfs.
+
+use std::path::{Path, PathBuf};
+
+/// What the kernel said of power and heat. `None` where it offers nothing.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct PowerReading {
+    /// Hottest temperature sensor, degrees Celsius.
+    pub temperature_c: Option<f64>,
+    /// Supply voltage, volts: the lowest of the supplies that are present.
+    pub voltage_v: Option<f64>,
+    /// Charge of the weakest battery, percent.
+    pub charge_percent: Option<f64>,
+    /// Whether a mains or external supply is there and off line.
+    pub mains_off: bool,
+}
+
+/// Reads sysfs below a root (`/sys`; tests give a folder that looks like it).
+#[derive(Clone, Debug)]
+pub struct PowerReader {
+    root: PathBuf,
+    voltage_file: Option<PathBuf>,
+}
+
+impl PowerReader {
+    /// A reader below `root`. `voltage_file`, where given, is read for the supply voltage instead of
+    /// everything found: a file that holds millivolts (hwmon `in*_input`) or microvolts
+    /// (power_supply `voltage_now`).
+    pub fn new(root: &Path, voltage_file: Option<PathBuf>) -> Self {
+        Self { root: root.to_owned(), voltage_file }
+    }
+
+    /// One reading; costs a few file reads of sysfs.
+    pub fn read(&self) -> PowerReading {
+        let mut reading = PowerReading::default();
+        self.read_hwmon(&mut reading);
+        self.read_supplies(&mut reading);
+        if let Some(file) = &self.voltage_file {
+            reading.voltage_v = voltage(file);
+        }
+        reading
+    }
+
+    fn read_hwmon(&self, reading: &mut PowerReading) {
+        let chips = children(&self.root.join("class/hwmon"));
+        for file in chips.iter().flat_map(|chip| children(chip)) {
+            let name = file_name(&file);
+            if name.starts_with("temp") && name.ends_with("_input") {
+                // A sensor that is not wired reads 0, or absurdly low or high.
+                let celsius = number(&file).map(|milli| milli / 1000.0);
+                let sane = celsius.filter(|c| (-60.0..=200.0).contains(c) && *c != 0.0);
+                reading.temperature_c = highest(reading.temperature_c, sane);
+            }
+        }
+    }
+
+    fn read_supplies(&self, reading: &mut PowerReading) {
+        for supply in children(&self.root.join("class/power_supply")) {
+            let kind = text(&supply.join("type")).unwrap_or_default();
+            if kind == "Mains" || kind == "USB" {
+                reading.mains_off |= number(&supply.join("online")) == Some(0.0);
+                continue;
+            }
+            if number(&supply.join("present")) == Some(0.0) {
+                continue;
+            }
+            reading.voltage_v = lowest(reading.voltage_v, voltage(&supply.join("voltage_now")));
+            reading.charge_percent = lowest(reading.charge_percent, number(&supply.join("capacity")));
+        }
+    }
+}
+
+/// Volts from a file of micro- or millivolts, by its name.
+fn voltage(file: &Path) -> Option<f64> {
+    let per_volt = if file_name(file).starts_with("voltage") { 1e6 } else { 1e3 };
+    number(file).map(|figure| figure / per_volt)
+}
+
+fn highest(a: Option<f64>, b: Option<f64>) -> Option<f64> {
+    a.into_iter().chain(b).reduce(f64::max)
+}
+
+fn lowest(a: Option<f64>, b: Option<f64>) -> Option<f64> {
+    a.into_iter().chain(b).reduce(f64::min)
+}
+
+fn children(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut paths: Vec<PathBuf> = entries.map(|entry| entry.path()).collect();
+    paths.sort();
+    paths
+}
+
+fn file_name(file: &Path) -> &str {
+    file.file_name().and_then(|name| name.to_str()).unwrap_or_default()
+}
+
+fn text(file: &Path) -> Option<String> {
+    std::fs::read_to_string(file).ok().map(|text| text.trim().to_owned())
+}
+
+fn number(file: &Path) -> Option<f64> {
+    text(file)?.parse().ok().filter(|figure: &f64| figure.is_finite())
+}
+
+/// Decides when power is going: a voltage under its threshold for a while, or mains off where asked.
+#[derive(Clone, Debug)]
+pub struct PowerWatch {
+    low_voltage_v: Option<f64>,
+    on_mains_off: bool,
+    low_for: u32,
+}
+
+/// Readings in a row that must be low: a motor's inrush pulls the supply down for a moment.
+const LOW_READINGS: u32 = 3;
+/// Rise over the threshold that ends the alarm, volts over volts.
+const RECOVERED: f64 = 1.02;
+
+/// What a reading means.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum PowerState {
+    /// Enough, or not known.
+    Good,
+    /// Going: save what is to be saved.
+    Going,
+}
+
+impl PowerWatch {
+    /// A watch with a threshold in volts (none: voltage is not watched), and whether mains going off
+    /// line counts.
+    pub const fn new(low_voltage_v: Option<f64>, on_mains_off: bool) -> Self {
+        Self { low_voltage_v, on_mains_off, low_for: 0 }
+    }
+
+    /// Takes a reading in, one a second.
+    pub fn judge(&mut self, reading: &PowerReading) -> PowerState {
+        let low = match (self.low_voltage_v, reading.voltage_v) {
+            (Some(limit), Some(volts)) if volts < limit => true,
+            (Some(limit), Some(volts)) => self.low_for >= LOW_READINGS && volts < limit * RECOVERED,
+            _ => false,
+        };
+        if low || (self.on_mains_off && reading.mains_off) {
+            self.low_for = self.low_for.saturating_add(1);
+        } else {
+            self.low_for = 0;
+        }
+        if self.low_for >= LOW_READINGS { PowerState::Going } else { PowerState::Good }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn write(root: &Path, file: &str, content: &str) {
+        let path = root.join(file);
+        std::fs::create_dir_all(path.parent().expect("below the root")).expect("created");
+        std::fs::write(path, content).expect("written");
+    }
+
+    #[test]
+    fn sysfs_is_read_and_absence_is_none() {
+        let root = tempfile::tempdir().expect("a folder");
+        let reader = PowerReader::new(root.path(), None);
+        assert_eq!(reader.read(), PowerReading::default());
+
+        write(root.path(), "class/hwmon/hwmon0/temp1_input", "41500\n");
+        write(root.path(), "class/hwmon/hwmon1/temp1_input", "63000\n");
+        write(root.path(), "class/hwmon/hwmon1/temp2_input", "-128000\n");
+        write(root.path(), "class/power_supply/BAT0/type", "Battery\n");
+        write(root.path(), "class/power_supply/BAT0/voltage_now", "11400000\n");
+        write(root.path(), "class/power_supply/BAT0/capacity", "57\n");
+        write(root.path(), "class/power_supply/AC/type", "Mains\n");
+        write(root.path(), "class/power_supply/AC/online", "0\n");
+        let reading = reader.read();
+        assert_eq!(reading.temperature_c, Some(63.0));
+        assert_eq!((reading.voltage_v, reading.charge_percent), (Some(11.4), Some(57.0)));
+        assert!(reading.mains_off);
+
+        write(root.path(), "class/hwmon/hwmon0/in1_input", "12100\n");
+        let named = PowerReader::new(root.path(), Some(root.path().join("class/hwmon/hwmon0/in1_input")));
+        assert_eq!(named.read().voltage_v, Some(12.1));
+    }
+
+    #[test]
+    fn power_goes_when_the_voltage_stays_low() {
+        let at = |volts| PowerReading { voltage_v: Some(volts), ..PowerReading::default() };
+        let mut watch = PowerWatch::new(Some(10.5), false);
+        let volts = [11.0, 10.0, 11.0, 10.4, 10.4, 10.4, 10.6, 10.8];
+        let going: Vec<bool> = volts.iter().map(|&v| watch.judge(&at(v)) == PowerState::Going).collect();
+        assert_eq!(going, [false, false, false, false, false, true, true, false]);
+        let mut unwatched = PowerWatch::new(None, false);
+        assert!((0..9).all(|_| unwatched.judge(&at(1.0)) == PowerState::Good));
+    }
+}

@@ -1,0 +1,157 @@
+//! Configures a Garmin receiver over its line and checks what it answers.
+//!
+//! Source: Garmin GPS 18x technical specifications, "Received NMEA 0183 sentences". An echo of a
+//! sentence means accepted; an echo with other values means refused.
+
+use super::GARMIN_ANSWER;
+use crate::time::{MonoTime, Span};
+
+/// What to do now.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub(super) enum Step {
+    /// Nothing.
+    Wait,
+    /// Write this sentence.
+    Send(String),
+    /// All done: so many settings were accepted.
+    Accepted(u32),
+    /// The receiver refused or ignored a setting.
+    Refused(String),
+}
+
+/// Sentences sent, in order: all sentences off; position averaging off and NMEA 2.30 mode indicators
+/// on (PGRMC1 fields 3 and 7: averaging would freeze a hovering helicopter); then those decoded on.
+/// Bodies without `$` and checksum. `PGRMO` is not echoed by every firmware, so only `PGRMC1` must
+/// be answered.
+const SENTENCES: [(&str, bool); 6] = [
+    ("PGRMO,,2", false),
+    ("PGRMC1,1,1,1,,,,2", true),
+    ("PGRMO,GPRMC,1", false),
+    ("PGRMO,GPGGA,1", false),
+    ("PGRMO,PGRME,1", false),
+    ("PGRMO,PGRMV,1", false),
+];
+
+/// Walks through the configuration, one sentence at a time.
+#[derive(Debug)]
+pub(super) struct GarminSetup {
+    next: usize,
+    asked: Option<MonoTime>,
+    heard: Vec<u8>,
+    accepted: u32,
+}
+
+impl GarminSetup {
+    pub(super) const fn new() -> Self {
+        Self { next: 0, asked: None, heard: Vec::new(), accepted: 0 }
+    }
+
+    /// Takes in what the receiver sends.
+    pub(super) fn heard(&mut self, bytes: &[u8]) {
+        const KEEP: usize = 2048;
+        self.heard.extend_from_slice(bytes);
+        let excess = self.heard.len().saturating_sub(KEEP);
+        self.heard.drain(..excess);
+    }
+
+    /// What to do at `now`.
+    pub(super) fn due(&mut self, now: MonoTime) -> Step {
+        let Some((body, must_answer)) = SENTENCES.get(self.next).copied() else {
+            return Step::Accepted(self.accepted);
+        };
+        let Some(asked) = self.asked else {
+            self.asked = Some(now);
+            self.heard.clear();
+            return Step::Send(sentence(body));
+        };
+        match self.answer(body) {
+            Some(true) => {
+                self.accepted += 1;
+                self.advance();
+                Step::Wait
+            }
+            Some(false) => Step::Refused(format!("the receiver answered {body} with other values")),
+            None if now - asked < Span::from_ns(GARMIN_ANSWER.as_nanos() as i64) => Step::Wait,
+            None if must_answer => {
+                Step::Refused(format!("the receiver did not answer {body}; is it a Garmin?"))
+            }
+            None => {
+                self.advance();
+                Step::Wait
+            }
+        }
+    }
+
+    fn advance(&mut self) {
+        self.next += 1;
+        self.asked = None;
+    }
+
+    /// Whether the receiver echoed `body` (with more fields at its end is fine), with other values,
+    /// or not at all (`None`).
+    fn answer(&self, body: &str) -> Option<bool> {
+        let text = String::from_utf8_lossy(&self.heard);
+        let name = body.split(',').next().unwrap_or(body);
+        let echo = text
+            .split('$')
+            .filter_map(|rest| rest.split_once('*').map(|(echo, _)| echo))
+            .find(|echo| echo.split(',').next() == Some(name))?;
+        let same = body
+            .split(',')
+            .zip(echo.split(',').chain(std::iter::repeat("")))
+            .all(|(asked, told)| asked.is_empty() || asked == told);
+        Some(same)
+    }
+}
+
+/// A sentence with its frame and checksum.
+fn sentence(body: &str) -> String {
+    let checksum = body.bytes().fold(0u8, |sum, byte| sum ^ byte);
+    format!("${body}*{checksum:02X}\r\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(ms: f64) -> MonoTime {
+        MonoTime::from_ns(0) + Span::from_ms(ms)
+    }
+
+    /// Runs the setup against a receiver that answers through `answer`.
+    fn run(answer: impl Fn(&str) -> Option<String>) -> Step {
+        let mut setup = GarminSetup::new();
+        for pass in 0..1000 {
+            match setup.due(at(f64::from(pass) * 50.0)) {
+                Step::Wait => {}
+                Step::Send(sentence) => {
+                    if let Some(echo) = answer(&sentence) {
+                        setup.heard(echo.as_bytes());
+                    }
+                }
+                end => return end,
+            }
+        }
+        panic!("the setup did not end");
+    }
+
+    #[test]
+    fn sentences_carry_their_checksum() {
+        assert_eq!(sentence("PGRMO,,2"), "$PGRMO,,2*75\r\n");
+    }
+
+    #[test]
+    fn echoes_are_checked() {
+        assert_eq!(run(|sentence| Some(sentence.to_owned())), Step::Accepted(6));
+        let silent = run(|_| None);
+        assert!(matches!(&silent, Step::Refused(why) if why.contains("did not answer PGRMC1")), "{silent:?}");
+        let other = run(|s| Some(s.replace("1,1,1,", "1,1,2,")));
+        assert!(matches!(&other, Step::Refused(why) if why.contains("other values")), "{other:?}");
+    }
+
+    #[test]
+    fn only_the_important_answer_is_required() {
+        let step = run(|s| s.starts_with("$PGRMC1").then(|| s.to_owned()));
+        assert_eq!(step, Step::Accepted(1));
+    }
+}

@@ -1,0 +1,132 @@
+//! The line over pseudo-terminals: what arrives, what goes away, what comes back.
+
+use std::fs::File;
+use std::io::Write;
+use std::os::fd::OwnedFd;
+use std::path::PathBuf;
+use std::sync::mpsc::{Receiver, channel};
+use std::time::Duration;
+
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+
+use super::*;
+
+/// The far end of a pseudo-terminal and the name of its near end.
+fn pty() -> (File, String) {
+    let far: OwnedFd = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a pseudo-terminal");
+    grantpt(&far).expect("granted");
+    unlockpt(&far).expect("unlocked");
+    let name = ptsname(&far, Vec::new()).expect("named").into_string().expect("ASCII");
+    (File::from(far), name)
+}
+
+/// A running line: its reports, and the switch that ends it.
+struct Line {
+    reports: Receiver<Report>,
+    stop: Stop,
+    thread: Option<std::thread::JoinHandle<()>>,
+}
+
+impl Line {
+    fn start(device: &str, configure_garmin: bool) -> Self {
+        let settings =
+            SerialSettings { device: device.to_owned(), baud: 38400, text: true, configure_garmin };
+        let (sender, reports) = channel();
+        let stop = Stop::default();
+        let thread = std::thread::spawn({
+            let stop = stop.clone();
+            move || {
+                run(&settings, HostClock::start(), &stop, &|report| {
+                    let _ = sender.send(report);
+                });
+            }
+        });
+        Self { reports, stop, thread: Some(thread) }
+    }
+
+    /// The first report that `wanted` takes, within three seconds.
+    fn wait<T>(&self, wanted: impl Fn(Report) -> Option<T>) -> T {
+        for _ in 0..300 {
+            if let Ok(report) = self.reports.recv_timeout(Duration::from_millis(100))
+                && let Some(found) = wanted(report)
+            {
+                return found;
+            }
+        }
+        panic!("the report did not come");
+    }
+
+    fn fault(&self) -> Fault {
+        self.wait(|report| if let Report::Down(fault) = report { Some(fault) } else { None })
+    }
+
+    fn up(&self) {
+        self.wait(|report| matches!(report, Report::Up(_)).then_some(()));
+    }
+}
+
+impl Drop for Line {
+    fn drop(&mut self) {
+        self.stop.ask();
+        if let Some(thread) = self.thread.take() {
+            thread.join().expect("the line's thread ends by itself");
+        }
+    }
+}
+
+#[test]
+fn bytes_arrive_and_a_lost_line_comes_back() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let link: PathBuf = folder.path().join("gps");
+    let (mut far, name) = pty();
+    std::os::unix::fs::symlink(&name, &link).expect("linked");
+
+    // Given a line by a stable name, when bytes are sent, then they are told.
+    let line = Line::start(&link.to_string_lossy(), false);
+    line.up();
+    far.write_all(b"$GPRMC").expect("sent");
+    let heard = line.wait(|r| if let Report::Bytes(_, bytes) = r { Some(bytes) } else { None });
+    assert_eq!(heard, b"$GPRMC");
+
+    // When the far end goes away, then it is unplugged, then missing.
+    std::fs::remove_file(&link).expect("unlinked");
+    drop(far);
+    assert_eq!(line.fault().kind, FaultKind::Unplugged);
+    assert_eq!(line.fault().kind, FaultKind::Missing);
+
+    // When it comes back under another number, then it is used again.
+    let (mut far, name) = pty();
+    std::os::unix::fs::symlink(&name, &link).expect("linked");
+    line.up();
+    far.write_all(b"again").expect("sent");
+    let heard = line.wait(|r| if let Report::Bytes(_, bytes) = r { Some(bytes) } else { None });
+    assert_eq!(heard, b"again");
+}
+
+#[test]
+fn a_held_port_is_busy_and_a_file_is_no_line() {
+    let (_far, name) = pty();
+    let held = TTYPort::open(&serialport::new(&name, 38400)).expect("opened");
+    let line = Line::start(&name, false);
+    assert_eq!(line.fault().kind, FaultKind::Busy);
+    drop(held);
+    line.up();
+
+    let file = tempfile::NamedTempFile::new().expect("a file");
+    let line = Line::start(&file.path().to_string_lossy(), false);
+    assert_eq!(line.fault().kind, FaultKind::Failed);
+}
+
+#[test]
+fn noise_tells_of_a_wrong_speed() {
+    let (mut far, name) = pty();
+    let line = Line::start(&name, false);
+    line.up();
+    let noise: Vec<u8> = (0..2000u32).map(|i| (i * 37 % 256) as u8).collect();
+    far.write_all(&noise).expect("sent");
+    let text = line.wait(|r| match r {
+        Report::Note(NoteKind::Garbled, _, text) => Some(text),
+        _ => None,
+    });
+    assert!(text.contains("38400 baud"), "{text}");
+}
