@@ -2,6 +2,7 @@
 
 mod check_config;
 mod error;
+mod keys;
 mod montecarlo;
 
 pub use error::{CliError, CliResult};
@@ -22,6 +23,8 @@ pub struct Cli {
 enum Command {
     /// Say what is wrong with a configuration, or print the effective one
     CheckConfig(check_config::Args),
+    /// Make the certificates with which payloads and ground stations know each other
+    Keys(keys::Args),
     /// Predict how well the ground is located from here: the paper's error analysis
     Montecarlo(montecarlo::Args),
 }
@@ -39,6 +42,7 @@ pub fn main() -> ExitCode {
     };
     let result = match cli.command {
         Command::CheckConfig(args) => check_config::run(&args),
+        Command::Keys(args) => keys::run(&args),
         Command::Montecarlo(args) => montecarlo::run(&args),
     };
     error::exit_code(result)

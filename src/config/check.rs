@@ -27,12 +27,12 @@ impl ConfigError {
     }
 }
 
-fn refuse(key: impl Into<String>, reason: impl Into<String>) -> Result<(), ConfigError> {
+pub(super) fn refuse(key: impl Into<String>, reason: impl Into<String>) -> Result<(), ConfigError> {
     Err(ConfigError::Value { key: key.into(), reason: reason.into() })
 }
 
 /// A figure must be finite and within bounds.
-fn within(key: impl Into<String>, value: f64, low: f64, high: f64) -> Result<(), ConfigError> {
+pub(super) fn within(key: impl Into<String>, value: f64, low: f64, high: f64) -> Result<(), ConfigError> {
     if value.is_finite() && (low..=high).contains(&value) {
         return Ok(());
     }
@@ -67,6 +67,8 @@ impl Config {
         within("detector.ground_features", self.detector.ground_features as f64, 0.0, 64.0)?;
         within("estimator.history_ms", self.estimator.history_ms, 500.0, 10_000.0)?;
         within("estimator.smoother_lag_ms", self.estimator.smoother_lag_ms, 0.0, 5_000.0)?;
+        self.link.check()?;
+        self.mavlink.check()?;
         self.check_montecarlo()
     }
 

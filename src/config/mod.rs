@@ -14,7 +14,7 @@ mod target;
 
 pub use check::ConfigError;
 pub use estimator::{DetectorConfig, EstimatorConfig};
-pub use link::LinkConfig;
+pub use link::{LinkConfig, MavlinkConfig};
 pub use log::LogConfig;
 pub use montecarlo::{Distribution, MonteCarloConfig};
 pub use sensors::{
@@ -55,6 +55,9 @@ pub struct Config {
     /// The wireless link.
     #[serde(default)]
     pub link: LinkConfig,
+    /// MAVLink for pilots' own ground stations.
+    #[serde(default)]
+    pub mavlink: MavlinkConfig,
     /// The operator's log.
     #[serde(default)]
     pub log: LogConfig,

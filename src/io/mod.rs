@@ -3,6 +3,7 @@
 pub mod camera;
 pub mod clock;
 pub mod device;
+pub mod link;
 pub mod notify;
 pub mod power;
 pub mod pps;
