@@ -251,7 +251,7 @@ mod defaults {
         0.05
     }
     pub(super) fn compass_latency_ms() -> f64 {
-        20.0
+        15.0
     }
     pub(super) fn heading_bias_sigma_deg() -> f64 {
         2.0

@@ -8,3 +8,8 @@ pub mod notify;
 pub mod power;
 pub mod pps;
 pub mod serial;
+pub mod capture;
+pub mod mcap_read;
+pub mod mcap_write;
+pub mod proto;
+pub mod records;

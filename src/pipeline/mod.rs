@@ -1,1 +1,5 @@
-//! The one path from events to outputs.
+//! The one path from events to outputs, live and in replay.
+
+mod output;
+
+pub use output::{Health, Notice, NoticeKind, Output, SourceHealth, TargetHealth};

@@ -1,0 +1,214 @@
+//! Captures: serial bytes and frames in and out of MCAP.
+
+use std::collections::BinaryHeap;
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::Path;
+use std::sync::Arc;
+
+use prost::Message as _;
+
+use super::mcap_read::{self, McapReader, RawMessage, ReadError};
+use super::mcap_write::{CONFIG_ATTACHMENT, McapWriter, WriteError};
+use super::proto::{foxglove, host_time, windhover};
+use super::records::{self, topic};
+use crate::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
+use crate::time::{MonoTime, Span};
+
+/// Messages are put in order of their log time over this span: writers of several threads do not
+/// keep it exactly.
+const REORDER: Span = Span::from_ns(1_000_000_000);
+
+/// One message of a capture: as recorded, and as the event it stands for, if any.
+#[derive(Clone, Debug)]
+pub struct CaptureItem {
+    /// As recorded.
+    pub raw: RawMessage,
+    /// What it stands for; `None` for topics that are not a source.
+    pub event: Option<Event>,
+}
+
+/// Events of a capture in the order they were heard.
+pub struct CaptureReader {
+    reader: McapReader,
+    waiting: BinaryHeap<Waiting>,
+    newest: MonoTime,
+    read: u64,
+    seq: u64,
+    frames: u32,
+    warnings: Vec<String>,
+}
+
+/// Orders the heap: earliest first, file order among equals.
+struct Waiting {
+    raw: RawMessage,
+    order: u64,
+}
+
+impl PartialEq for Waiting {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other).is_eq()
+    }
+}
+impl Eq for Waiting {}
+impl PartialOrd for Waiting {
+    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
+        Some(self.cmp(other))
+    }
+}
+impl Ord for Waiting {
+    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
+        (other.raw.log_time, other.order).cmp(&(self.raw.log_time, self.order))
+    }
+}
+
+/// The configuration attached to a recording, as text; `None` where there is none.
+pub fn attached_config(path: &Path) -> Result<Option<String>, ReadError> {
+    let found = mcap_read::attachment(path, CONFIG_ATTACHMENT)?;
+    Ok(found.map(|bytes| String::from_utf8_lossy(&bytes).into_owned()))
+}
+
+impl CaptureReader {
+    /// Opens a capture or flight: a file, or a directory of segments.
+    pub fn open(path: &Path) -> Result<Self, ReadError> {
+        Ok(Self {
+            reader: McapReader::open(path)?,
+            waiting: BinaryHeap::new(),
+            newest: MonoTime::from_ns(i64::MIN),
+            read: 0,
+            seq: 0,
+            frames: 0,
+            warnings: Vec::new(),
+        })
+    }
+
+    /// What was damaged or could not be understood, so far; taken.
+    pub fn take_warnings(&mut self) -> Vec<String> {
+        let mut all = self.reader.take_warnings();
+        all.append(&mut self.warnings);
+        all
+    }
+
+    /// Bytes read and bytes in all.
+    pub fn progress(&self) -> (u64, u64) {
+        self.reader.progress()
+    }
+
+    fn event(&mut self, raw: &RawMessage) -> Option<Event> {
+        let body = match self.body(raw) {
+            Ok(body) => body?,
+            Err(error) => {
+                self.warnings.push(format!(
+                    "a message on {} at {:?} is not {}: {error}",
+                    raw.channel.topic, raw.log_time, raw.channel.schema_name
+                ));
+                return None;
+            }
+        };
+        let seq = self.seq;
+        self.seq += 1;
+        Some(Event { t_recv: raw.log_time, seq, body })
+    }
+
+    fn body(&mut self, raw: &RawMessage) -> Result<Option<EventBody>, prost::DecodeError> {
+        Ok(match raw.channel.topic.as_str() {
+            topic::GPS_SERIAL => {
+                Some(EventBody::GnssBytes(windhover::SerialBytes::decode(&raw.data[..])?.data))
+            }
+            topic::COMPASS_SERIAL => {
+                Some(EventBody::CompassBytes(windhover::SerialBytes::decode(&raw.data[..])?.data))
+            }
+            topic::CAMERA_IMAGE => {
+                // A frame that does not even decode as a message still counts as one.
+                let index = self.frames;
+                self.frames = self.frames.saturating_add(1);
+                Some(EventBody::Frame(frame(raw, index)?))
+            }
+            topic::SOURCE_EVENT => source_event(&windhover::SourceEvent::decode(&raw.data[..])?),
+            _ => None,
+        })
+    }
+}
+
+/// A frame out of either image schema.
+fn frame(raw: &RawMessage, index: u32) -> Result<FramePayload, prost::DecodeError> {
+    if raw.channel.schema_name == "foxglove.RawImage" {
+        let image = foxglove::RawImage::decode(&raw.data[..])?;
+        return Ok(FramePayload {
+            index,
+            t_exposure: host_time(image.timestamp.as_ref()),
+            encoding: records::encoding_of_raw(&image.encoding),
+            width: image.width,
+            height: image.height,
+            stride: image.step,
+            data: Arc::from(image.data),
+        });
+    }
+    let image = foxglove::CompressedImage::decode(&raw.data[..])?;
+    let encoding = match image.format.to_ascii_lowercase().as_str() {
+        "jpeg" | "jpg" => FrameEncoding::Jpeg,
+        "png" => FrameEncoding::Png,
+        _ => FrameEncoding::Unknown,
+    };
+    Ok(FramePayload {
+        index,
+        t_exposure: host_time(image.timestamp.as_ref()),
+        encoding,
+        width: 0,
+        height: 0,
+        stride: 0,
+        data: Arc::from(image.data),
+    })
+}
+
+fn source_event(event: &windhover::SourceEvent) -> Option<EventBody> {
+    let source =
+        [Source::Gps, Source::Compass, Source::Camera].into_iter().find(|s| s.name() == event.source)?;
+    match event.what.as_str() {
+        "dropped" => Some(EventBody::Dropped { source, count: event.count }),
+        "up" => Some(EventBody::SourceUp(source)),
+        "down" => Some(EventBody::SourceDown(source)),
+        _ => None,
+    }
+}
+
+impl Iterator for CaptureReader {
+    type Item = CaptureItem;
+
+    fn next(&mut self) -> Option<CaptureItem> {
+        loop {
+            let due = self.waiting.peek().is_some_and(|first| self.newest - first.raw.log_time >= REORDER);
+            if !due && let Some(raw) = self.reader.next() {
+                self.newest = self.newest.max(raw.log_time);
+                self.waiting.push(Waiting { raw, order: self.read });
+                self.read += 1;
+                continue;
+            }
+            let raw = self.waiting.pop()?.raw;
+            let event = self.event(&raw);
+            return Some(CaptureItem { raw, event });
+        }
+    }
+}
+
+/// Writes a capture of events.
+pub struct CaptureWriter {
+    writer: McapWriter<BufWriter<File>>,
+}
+
+impl CaptureWriter {
+    /// Creates a capture with its configuration attached.
+    pub fn create(path: &Path, config_toml: &str, began: MonoTime) -> Result<Self, WriteError> {
+        Ok(Self { writer: McapWriter::create(path, config_toml, began)? })
+    }
+
+    /// Writes an event; ticks are not recorded.
+    pub fn write(&mut self, event: &Event) -> Result<(), WriteError> {
+        records::of_event(event).map_or(Ok(()), |record| self.writer.write(&record))
+    }
+
+    /// Ends the capture.
+    pub fn finish(self) -> Result<(), WriteError> {
+        self.writer.finish().map(drop)
+    }
+}

@@ -1,0 +1,148 @@
+//! Writing MCAP files: channels and schemas registered as they come, one chunk a second.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
+use std::io::{BufWriter, Seek, Write};
+use std::path::{Path, PathBuf};
+
+use mcap::records::MessageHeader;
+use mcap::{Attachment, Compression, WriteOptions};
+
+use super::mcap_read::ChannelInfo;
+use super::records::Record;
+use crate::time::{MonoTime, Span};
+
+/// Name of the configuration's attachment.
+pub const CONFIG_ATTACHMENT: &str = "config.toml";
+
+/// Why a recording could not be written.
+#[derive(Debug, thiserror::Error)]
+pub enum WriteError {
+    /// The system refused.
+    #[error("cannot write {}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The MCAP writer refused.
+    #[error("cannot write the recording: {0}")]
+    Mcap(#[from] mcap::McapError),
+}
+
+/// Writes one MCAP file of [`Record`]s.
+pub struct McapWriter<W: Write + Seek> {
+    writer: mcap::Writer<W>,
+    channels: HashMap<(String, String), u16>,
+    sequence: u32,
+    chunk_began: Option<MonoTime>,
+}
+
+impl McapWriter<BufWriter<File>> {
+    /// Creates a file with its configuration attached.
+    pub fn create(path: &Path, config_toml: &str, began: MonoTime) -> Result<Self, WriteError> {
+        let file = File::create(path).map_err(|source| WriteError::Io { path: path.to_owned(), source })?;
+        Self::new(BufWriter::with_capacity(1 << 16, file), config_toml, began)
+    }
+}
+
+impl<W: Write + Seek> McapWriter<W> {
+    /// Begins a recording on any seekable output. `config_toml` becomes the attachment
+    /// [`CONFIG_ATTACHMENT`]; versions go into the metadata record `windhover`.
+    pub fn new(output: W, config_toml: &str, began: MonoTime) -> Result<Self, WriteError> {
+        let options = WriteOptions::new()
+            .compression(Some(Compression::Lz4))
+            .compression_threads(0)
+            .chunk_size(None)
+            .library(concat!("windhover ", env!("CARGO_PKG_VERSION")));
+        let mut writer = options.create(output)?;
+        let t = unsigned(began);
+        writer.attach(&Attachment {
+            log_time: t,
+            create_time: t,
+            name: CONFIG_ATTACHMENT.into(),
+            media_type: "application/toml".into(),
+            data: config_toml.as_bytes().into(),
+        })?;
+        let mut versions = BTreeMap::new();
+        versions.insert("version".to_owned(), env!("CARGO_PKG_VERSION").to_owned());
+        versions.insert("magnetic_model".to_owned(), "WMM2025".to_owned());
+        writer.write_metadata(&mcap::records::Metadata { name: "windhover".into(), metadata: versions })?;
+        Ok(Self { writer, channels: HashMap::new(), sequence: 0, chunk_began: None })
+    }
+
+    /// Writes a record; closes the chunk when its log time is a second past the chunk's first.
+    pub fn write(&mut self, record: &Record) -> Result<(), WriteError> {
+        let key = (record.topic.as_ref(), record.schema.name());
+        let channel = self.channel(key, || ChannelInfo {
+            topic: record.topic.to_string(),
+            message_encoding: "protobuf".into(),
+            schema_name: record.schema.name().into(),
+            schema_encoding: "protobuf".into(),
+            schema_data: record.schema.descriptor(),
+        })?;
+        self.write_message(channel, record.log_time, record.publish_time, &record.data)
+    }
+
+    /// Writes a message of another recording as it is.
+    pub fn copy(&mut self, message: &super::mcap_read::RawMessage) -> Result<(), WriteError> {
+        let key = (message.channel.topic.as_str(), message.channel.schema_name.as_str());
+        let channel = self.channel(key, || (*message.channel).clone())?;
+        self.write_message(channel, message.log_time, message.publish_time, &message.data)
+    }
+
+    fn channel(&mut self, key: (&str, &str), info: impl FnOnce() -> ChannelInfo) -> Result<u16, WriteError> {
+        let owned = (key.0.to_owned(), key.1.to_owned());
+        if let Some(id) = self.channels.get(&owned) {
+            return Ok(*id);
+        }
+        let info = info();
+        let schema = if info.schema_name.is_empty() {
+            0
+        } else {
+            self.writer.add_schema(&info.schema_name, &info.schema_encoding, &info.schema_data)?
+        };
+        let id = self.writer.add_channel(schema, &info.topic, &info.message_encoding, &BTreeMap::new())?;
+        self.channels.insert(owned, id);
+        Ok(id)
+    }
+
+    fn write_message(
+        &mut self,
+        channel_id: u16,
+        log_time: MonoTime,
+        publish_time: MonoTime,
+        data: &[u8],
+    ) -> Result<(), WriteError> {
+        let began = *self.chunk_began.get_or_insert(log_time);
+        if (log_time - began).abs() >= Span::from_s(1.0) {
+            self.flush()?;
+            self.chunk_began = Some(log_time);
+        }
+        let header = MessageHeader {
+            channel_id,
+            sequence: self.sequence,
+            log_time: unsigned(log_time),
+            publish_time: unsigned(publish_time),
+        };
+        self.sequence = self.sequence.wrapping_add(1);
+        Ok(self.writer.write_to_known_channel(&header, data)?)
+    }
+
+    /// Ends the chunk and hands everything to the output.
+    pub fn flush(&mut self) -> Result<(), WriteError> {
+        Ok(self.writer.flush()?)
+    }
+
+    /// Ends the recording: index, statistics, closing magic; gives the output back.
+    pub fn finish(mut self) -> Result<W, WriteError> {
+        self.writer.finish()?;
+        Ok(self.writer.into_inner())
+    }
+}
+
+/// MCAP times are unsigned; before zero is zero.
+fn unsigned(t: MonoTime) -> u64 {
+    u64::try_from(t.ns()).unwrap_or(0)
+}

@@ -1,0 +1,29 @@
+//! What is kept: events and outputs as protobuf messages on named topics.
+
+mod inputs;
+mod outputs;
+mod schema;
+pub mod topic;
+
+pub use inputs::{encoding_of_raw, of_event};
+pub use outputs::{Recorder, detections, health, ownship, target_state};
+pub use schema::Schema;
+
+use std::borrow::Cow;
+
+use crate::time::MonoTime;
+
+/// One message to be kept or sent.
+#[derive(Clone, Debug)]
+pub struct Record {
+    /// Topic.
+    pub topic: Cow<'static, str>,
+    /// Schema of `data`.
+    pub schema: Schema,
+    /// Log clock: when the event that caused it was heard, host time.
+    pub log_time: MonoTime,
+    /// When it was true, host time.
+    pub publish_time: MonoTime,
+    /// The protobuf message.
+    pub data: Vec<u8>,
+}

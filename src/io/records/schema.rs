@@ -1,0 +1,73 @@
+//! The schemas of what is kept.
+
+use crate::io::proto;
+
+/// A protobuf schema.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub enum Schema {
+    /// `windhover.SerialBytes`
+    SerialBytes,
+    /// `windhover.SourceEvent`
+    SourceEvent,
+    /// `foxglove.CompressedImage`
+    CompressedImage,
+    /// `foxglove.RawImage`
+    RawImage,
+    /// `foxglove.LocationFix`
+    LocationFix,
+    /// `foxglove.FrameTransform`
+    FrameTransform,
+    /// `foxglove.CameraCalibration`
+    CameraCalibration,
+    /// `foxglove.ImageAnnotations`
+    ImageAnnotations,
+    /// `foxglove.Log`
+    Log,
+    /// `windhover.TargetState`
+    TargetState,
+    /// `windhover.Ownship`
+    Ownship,
+    /// `windhover.Datum`
+    Datum,
+    /// `windhover.Detections`
+    Detections,
+    /// `windhover.GnssEpoch`
+    GnssEpoch,
+    /// `windhover.Attitude`
+    Attitude,
+    /// `windhover.Fusion`
+    Fusion,
+    /// `windhover.Health`
+    Health,
+}
+
+impl Schema {
+    /// Its full name.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::SerialBytes => "windhover.SerialBytes",
+            Self::SourceEvent => "windhover.SourceEvent",
+            Self::CompressedImage => "foxglove.CompressedImage",
+            Self::RawImage => "foxglove.RawImage",
+            Self::LocationFix => "foxglove.LocationFix",
+            Self::FrameTransform => "foxglove.FrameTransform",
+            Self::CameraCalibration => "foxglove.CameraCalibration",
+            Self::ImageAnnotations => "foxglove.ImageAnnotations",
+            Self::Log => "foxglove.Log",
+            Self::TargetState => "windhover.TargetState",
+            Self::Ownship => "windhover.Ownship",
+            Self::Datum => "windhover.Datum",
+            Self::Detections => "windhover.Detections",
+            Self::GnssEpoch => "windhover.GnssEpoch",
+            Self::Attitude => "windhover.Attitude",
+            Self::Fusion => "windhover.Fusion",
+            Self::Health => "windhover.Health",
+        }
+    }
+
+    /// The descriptor set that goes into a file beside messages of this schema.
+    pub fn descriptor(self) -> Vec<u8> {
+        let package = self.name().split_once('.').map_or("", |(package, _)| package);
+        proto::schema_of_package(package)
+    }
+}

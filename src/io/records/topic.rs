@@ -1,0 +1,73 @@
+//! Topic names.
+
+/// Bytes of the GPS line.
+pub const GPS_SERIAL: &str = "/gps/serial";
+/// Bytes of the compass line.
+pub const COMPASS_SERIAL: &str = "/compass/serial";
+/// Camera frames.
+pub const CAMERA_IMAGE: &str = "/camera/image";
+/// Losses, arrivals and departures of devices.
+pub const SOURCE_EVENT: &str = "/source/event";
+/// Position fixes for maps.
+pub const GPS_FIX: &str = "/gps/fix";
+/// GPS epochs, whole.
+pub const GPS_EPOCH: &str = "/gps/epoch";
+/// Compass samples.
+pub const COMPASS_ATTITUDE: &str = "/compass/attitude";
+/// Transforms.
+pub const TF: &str = "/tf";
+/// Intrinsics.
+pub const CAMERA_CALIBRATION: &str = "/camera/calibration";
+/// Overlays for viewers.
+pub const CAMERA_ANNOTATIONS: &str = "/camera/annotations";
+/// Markers and features, whole.
+pub const CAMERA_DETECTIONS: &str = "/camera/detections";
+/// Origin of the NED frame.
+pub const DATUM: &str = "/datum";
+/// The helicopter's own state.
+pub const OWNSHIP: &str = "/ownship/state";
+/// What became of each measurement.
+pub const FUSION: &str = "/fusion";
+/// Operator's notices.
+pub const LOG: &str = "/log";
+/// Health, once a second.
+pub const HEALTH: &str = "/health";
+
+/// `/target/NAME/location`
+pub fn target_location(name: &str) -> String {
+    format!("/target/{name}/location")
+}
+
+/// `/target/NAME/state`: as known in real time.
+pub fn target_state(name: &str) -> String {
+    format!("/target/{name}/state")
+}
+
+/// `/target/NAME/smoothed`: from the fixed-lag smoother.
+pub fn target_smoothed(name: &str) -> String {
+    format!("/target/{name}/smoothed")
+}
+
+/// `/target/NAME/paper`: by the paper's method.
+pub fn target_paper(name: &str) -> String {
+    format!("/target/{name}/paper")
+}
+
+/// Whether a topic is written by the pipeline itself, and so is made anew by a replay.
+pub fn is_output(topic: &str) -> bool {
+    const OUTPUTS: [&str; 12] = [
+        GPS_FIX,
+        GPS_EPOCH,
+        COMPASS_ATTITUDE,
+        TF,
+        CAMERA_CALIBRATION,
+        CAMERA_ANNOTATIONS,
+        CAMERA_DETECTIONS,
+        DATUM,
+        OWNSHIP,
+        FUSION,
+        LOG,
+        HEALTH,
+    ];
+    OUTPUTS.contains(&topic) || topic.starts_with("/target/")
+}
