@@ -1,15 +1,15 @@
 //! The edge: clock, serial, camera, captures, store, link.
 
 pub mod camera;
+pub mod capture;
 pub mod clock;
 pub mod device;
 pub mod link;
+pub mod mcap_read;
+pub mod mcap_write;
 pub mod notify;
 pub mod power;
 pub mod pps;
-pub mod serial;
-pub mod capture;
-pub mod mcap_read;
-pub mod mcap_write;
 pub mod proto;
 pub mod records;
+pub mod serial;
