@@ -240,7 +240,8 @@ mod tests {
         assert_eq!(decode(&rgb, true).unwrap().rgb.unwrap().data, [250, 10, 10]);
         let bgr = payload(FrameEncoding::Bgr24, 1, 1, 0, vec![10, 10, 250]);
         assert_eq!(decode(&bgr, true).unwrap().rgb.unwrap().data, [250, 10, 10]);
-        let red = decode(&payload(FrameEncoding::Nv12, 2, 2, 0, vec![81, 81, 81, 81, 90, 240]), true).unwrap();
+        let red =
+            decode(&payload(FrameEncoding::Nv12, 2, 2, 0, vec![81, 81, 81, 81, 90, 240]), true).unwrap();
         let data = red.rgb.unwrap().data;
         assert!(data[0] > 200 && data[1] < 40 && data[2] < 40, "{data:?}");
     }
