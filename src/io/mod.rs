@@ -13,3 +13,4 @@ pub mod pps;
 pub mod proto;
 pub mod records;
 pub mod serial;
+pub mod store;
