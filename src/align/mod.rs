@@ -1,1 +1,5 @@
-//! Measurements in order of validity, whatever the order of their arrival.
+//! Measurements kept in order of the time at which they were true, whatever the order they came in.
+
+mod history;
+
+pub use history::{Entry, History, Stamp};

@@ -65,8 +65,7 @@ impl Config {
         within("detector.min_px", self.detector.min_px, 8.0, 1_000.0)?;
         within("detector.max_hamming", f64::from(self.detector.max_hamming), 0.0, 3.0)?;
         within("detector.ground_features", self.detector.ground_features as f64, 0.0, 64.0)?;
-        within("estimator.history_ms", self.estimator.history_ms, 500.0, 10_000.0)?;
-        within("estimator.smoother_lag_ms", self.estimator.smoother_lag_ms, 0.0, 5_000.0)?;
+        self.check_estimator()?;
         self.link.check()?;
         self.mavlink.check()?;
         self.check_montecarlo()
@@ -101,6 +100,32 @@ impl Config {
             ("principal_sigma_px", mc.principal_sigma_px, 1_000.0),
         ] {
             within(format!("montecarlo.{key}"), value, 0.0, high)?;
+        }
+        Ok(())
+    }
+
+    fn check_estimator(&self) -> Result<(), ConfigError> {
+        let e = &self.estimator;
+        within("estimator.history_ms", e.history_ms, 500.0, 10_000.0)?;
+        within("estimator.smoother_lag_ms", e.smoother_lag_ms, 0.0, 2_000.0)?;
+        within("estimator.lost_after_s", e.lost_after_s, 0.1, 600.0)?;
+        within("estimator.learn_s", e.learn_s, 1.0, 1e4)?;
+        within("estimator.gate_probability", e.gate_probability, 0.5, 0.999_999)?;
+        within("estimator.rejections_to_restart", f64::from(e.rejections_to_restart), 1.0, 1_000.0)?;
+        within("estimator.features", e.features as f64, 0.0, 32.0)?;
+        within("estimator.feature_sigma_factor", e.feature_sigma_factor, 0.1, 100.0)?;
+        within("estimator.marker_noise_px", e.marker_noise_px, 0.0, 100.0)?;
+        within("estimator.force_tau_s", e.force_tau_s, 0.01, 1e4)?;
+        for (key, value) in [
+            ("tilt_rate_walk", e.tilt_rate_walk),
+            ("yaw_rate_walk", e.yaw_rate_walk),
+            ("side_force_mps2", e.side_force_mps2),
+            ("thrust_mps2", e.thrust_mps2),
+            ("target_speed_walk", e.target_speed_walk),
+            ("target_yaw_rate_walk", e.target_yaw_rate_walk),
+            ("target_slip_walk", e.target_slip_walk),
+        ] {
+            within(format!("estimator.{key}"), value, 1e-6, 1e3)?;
         }
         Ok(())
     }

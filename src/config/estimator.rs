@@ -20,7 +20,8 @@ impl Default for DetectorConfig {
     }
 }
 
-/// `[estimator]`
+/// `[estimator]`: the joint filter. Every intensity is where learning starts, not where it ends: with
+/// `learn` the filter fits them to the flight.
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct EstimatorConfig {
@@ -28,10 +29,62 @@ pub struct EstimatorConfig {
     pub history_ms: f64,
     /// Lag of the smoothed output, ms.
     pub smoother_lag_ms: f64,
+    /// A target not seen for this long is lost, seconds.
+    pub lost_after_s: f64,
+    /// Whether motion intensities, tilt noise and heading noise are fitted in flight.
+    pub learn: bool,
+    /// Time over which they are fitted, seconds.
+    pub learn_s: f64,
+    /// Probability that a good measurement passes the gate at full weight.
+    pub gate_probability: f64,
+    /// Measurements in a row outside the gate after which a state is started again.
+    pub rejections_to_restart: u32,
+    /// Ground features used at once.
+    pub features: usize,
+    /// Factor on the pixel sigma of ground features: hovering, a filter that believes them in full
+    /// becomes overconfident.
+    pub feature_sigma_factor: f64,
+    /// One-sigma added to every marker pixel for what the detector cannot know (lens, exposure time), px.
+    pub marker_noise_px: f64,
+    /// Random walk of the aircraft's roll and pitch rates, rad/s per √s.
+    pub tilt_rate_walk: f64,
+    /// Random walk of the aircraft's yaw rate, rad/s per √s.
+    pub yaw_rate_walk: f64,
+    /// One-sigma of the specific force across the rotor axis (drag, gusts), m/s².
+    pub side_force_mps2: f64,
+    /// One-sigma of the thrust about the weight, m/s².
+    pub thrust_mps2: f64,
+    /// Correlation time of both forces, seconds.
+    pub force_tau_s: f64,
+    /// Random walk of the ground vehicle's speed, m/s per √s.
+    pub target_speed_walk: f64,
+    /// Random walk of the ground vehicle's yaw rate, rad/s per √s.
+    pub target_yaw_rate_walk: f64,
+    /// Random walk of the ground vehicle's position across its heading (side slip), m per √s.
+    pub target_slip_walk: f64,
 }
 
 impl Default for EstimatorConfig {
     fn default() -> Self {
-        Self { history_ms: 1000.0, smoother_lag_ms: 500.0 }
+        Self {
+            history_ms: 1000.0,
+            smoother_lag_ms: 500.0,
+            lost_after_s: 8.0,
+            learn: true,
+            learn_s: 6.0,
+            gate_probability: 0.999,
+            rejections_to_restart: 5,
+            features: 8,
+            feature_sigma_factor: 2.0,
+            marker_noise_px: 0.1,
+            tilt_rate_walk: 0.4,
+            yaw_rate_walk: 0.15,
+            side_force_mps2: 0.4,
+            thrust_mps2: 0.5,
+            force_tau_s: 1.0,
+            target_speed_walk: 0.5,
+            target_yaw_rate_walk: 0.25,
+            target_slip_walk: 0.01,
+        }
     }
 }

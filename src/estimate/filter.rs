@@ -1,0 +1,273 @@
+//! The estimator as the pipeline sees it: measurements in whatever order they come, estimates out.
+
+use crate::align::{History, Stamp};
+use crate::config::Config;
+use crate::msg::{
+    AttitudeSample, Disposition, FrameObservations, FramePrediction, FusionResult, FusionSource, GnssEpoch,
+    Ownship, Stamped, TargetEstimate,
+};
+use crate::time::{MonoTime, Span};
+
+use super::Site;
+use super::core::{AnyMeasurement, Core, Kind};
+use super::ownship::start;
+use super::state::State;
+
+/// What the estimator tells.
+#[derive(Clone, PartialEq, Debug)]
+pub enum EstimatorOutput {
+    /// A target at a frame, as known when the frame had been looked at.
+    Estimate(TargetEstimate),
+    /// A target at an earlier frame, with what was measured up to the smoother's lag after it.
+    Smoothed(TargetEstimate),
+    /// The helicopter at a frame.
+    Ownship(Ownship),
+    /// What became of a measurement.
+    Fusion(FusionResult),
+    /// The filter started again.
+    Reset {
+        /// Why.
+        reason: &'static str,
+    },
+}
+
+/// The joint filter with its history of measurements.
+#[derive(Clone, Debug)]
+pub struct Estimator {
+    core: Core,
+    history: History<AnyMeasurement, State>,
+    /// The last compass reading heard before there was a state.
+    compass: Option<Stamped<AttitudeSample>>,
+    lag: Span,
+    /// Exposure time of the last frame whose smoothed estimate has been told.
+    smoothed_to: Option<MonoTime>,
+}
+
+/// Without any measurement for so long the state is worth nothing.
+const SILENCE: Span = Span::from_ns(60_000_000_000);
+/// A compass reading this old still starts the filter.
+const COMPASS_AGE: Span = Span::from_ns(1_000_000_000);
+/// Most measurements in the history: three devices at 100 Hz over ten seconds.
+const CAPACITY: usize = 3_000;
+/// Means beyond these are no flight: metres from the datum, metres a second.
+const ABSURD: (f64, f64) = (1e6, 500.0);
+
+impl Estimator {
+    /// An estimator that knows nothing yet.
+    pub fn new(config: &Config, site: &Site) -> Self {
+        let core = Core::new(config, site);
+        let span = Span::from_ms(config.estimator.history_ms);
+        Self {
+            history: History::new(span, CAPACITY, core.state.clone(), MonoTime::default()),
+            core,
+            compass: None,
+            lag: Span::from_ms(config.estimator.smoother_lag_ms),
+            smoothed_to: None,
+        }
+    }
+
+    /// Whether the helicopter's own state is known.
+    pub fn is_started(&self) -> bool {
+        self.core.state.alive
+    }
+
+    /// Takes a GPS epoch; `t_valid` has the configured latency taken off.
+    pub fn gnss(&mut self, epoch: &Stamped<GnssEpoch>, out: &mut Vec<EstimatorOutput>) {
+        if !self.core.state.alive && !self.start(epoch, out) {
+            self.refused(FusionSource::GpsPosition, epoch.t_valid, Disposition::NoOwnship, out);
+            return;
+        }
+        let value = epoch.value;
+        self.take(stamp_of(epoch), FusionSource::GpsPosition, out, |m| {
+            m.kind = Kind::Gnss;
+            m.gnss = value;
+        });
+        self.tell_smoothed(out);
+    }
+
+    /// Takes a compass reading; `t_valid` has the configured latency taken off.
+    pub fn attitude(&mut self, sample: &Stamped<AttitudeSample>, out: &mut Vec<EstimatorOutput>) {
+        if !self.core.state.alive {
+            if sample.value.heading.is_some() {
+                self.compass = Some(*sample);
+            }
+            self.refused(FusionSource::CompassHeading, sample.t_valid, Disposition::NoOwnship, out);
+            return;
+        }
+        let value = sample.value;
+        self.take(stamp_of(sample), FusionSource::CompassHeading, out, |m| {
+            m.kind = Kind::Attitude;
+            m.attitude = value;
+        });
+        self.tell_smoothed(out);
+    }
+
+    /// Takes what a frame showed, and tells one estimate a target and the helicopter's own state at
+    /// the frame's exposure.
+    pub fn frame(&mut self, frame: &Stamped<FrameObservations>, out: &mut Vec<EstimatorOutput>) {
+        let (t, number) = (frame.t_valid, frame.value.frame);
+        let taken = if self.core.state.alive {
+            self.take(stamp_of(frame), FusionSource::Marker, out, |m| {
+                m.kind = Kind::Frame;
+                m.frame.frame = number;
+                m.frame.markers.clone_from(&frame.value.markers);
+                m.frame.features.clone_from(&frame.value.features);
+            })
+        } else {
+            self.refused(FusionSource::Marker, t, Disposition::NoOwnship, out);
+            None
+        };
+        // The state after this frame; where it was not taken, the newest one.
+        let state = match taken {
+            Some(index) => self.history.before(index + 1),
+            None => &self.core.state,
+        };
+        for target in 0..state.targets.len() {
+            out.push(EstimatorOutput::Estimate(state.estimate(&self.core.models, target, number, t)));
+        }
+        if taken.is_some() {
+            out.push(EstimatorOutput::Ownship(state.ownship(&self.core.models, number, t)));
+        }
+        self.tell_smoothed(out);
+    }
+
+    /// Lets time pass: tells smoothed estimates that are due, and starts again after a long silence.
+    pub fn tick(&mut self, now: MonoTime, out: &mut Vec<EstimatorOutput>) {
+        if self.core.state.alive && now - self.core.state.t > SILENCE {
+            self.tell_smoothed_until(None, out);
+            self.reset("nothing was heard for a minute", out);
+        } else {
+            self.tell_smoothed_until(Some(now - self.lag), out);
+        }
+    }
+
+    /// Tells every smoothed estimate still owed: the flight is over.
+    pub fn finish(&mut self, out: &mut Vec<EstimatorOutput>) {
+        self.tell_smoothed_until(None, out);
+    }
+
+    /// What a frame exposed at `t` should show.
+    pub fn predict(&self, t: MonoTime) -> FramePrediction {
+        let ahead = t - self.core.state.t;
+        if !self.core.state.alive || ahead.s() > 2.0 {
+            return FramePrediction { search: true, ..FramePrediction::default() };
+        }
+        let mut state = self.core.state.without_copies();
+        state.propagate(t, &self.core.models);
+        state.expect(&self.core.models)
+    }
+
+    fn start(&mut self, epoch: &Stamped<GnssEpoch>, out: &mut Vec<EstimatorOutput>) -> bool {
+        let Some(compass) = self.compass.filter(|c| (epoch.t_valid - c.t_valid).abs() <= COMPASS_AGE) else {
+            return false;
+        };
+        let core = &mut self.core;
+        core.state.learnt.copy_from(&core.learning.start);
+        if !start(&mut core.state, epoch.t_valid, &epoch.value, &compass.value, &core.models) {
+            return false;
+        }
+        let state = &self.core.state;
+        self.history.restart(epoch.t_valid, |base| base.copy_from(state));
+        // The reading that gave the first heading ties heading to the compass's bias.
+        let stamp = Stamp { t_valid: epoch.t_valid, t_recv: epoch.t_recv, seq: 0 };
+        self.take(stamp, FusionSource::CompassHeading, out, |m| {
+            m.kind = Kind::Attitude;
+            m.attitude = compass.value;
+        });
+        true
+    }
+
+    /// Puts a measurement in its place and fuses it and everything after it; gives its index.
+    fn take(
+        &mut self,
+        stamp: Stamp,
+        source: FusionSource,
+        out: &mut Vec<EstimatorOutput>,
+        fill: impl FnOnce(&mut AnyMeasurement),
+    ) -> Option<usize> {
+        if let Err(disposition) = self.history.admit(stamp) {
+            self.refused(source, stamp.t_valid, disposition, out);
+            return None;
+        }
+        let at = self.history.insert(stamp, fill);
+        if at + 1 < self.history.len() {
+            self.core.state.copy_from(self.history.before(at));
+        }
+        for index in at..self.history.len() {
+            let entry = self.history.entry_mut(index);
+            self.core.reporting = index == at;
+            self.core.process(entry.stamp.t_valid, &entry.value);
+            entry.after.copy_from(&self.core.state);
+        }
+        out.extend(self.core.results.drain(..).map(EstimatorOutput::Fusion));
+        if !self.is_reasonable() {
+            self.reset("the state was no longer a number within reason", out);
+            return None;
+        }
+        let before = self.history.len();
+        self.history.trim();
+        let gone = before - self.history.len();
+        // A measurement true just within the history may be trimmed at once; its state is the base then.
+        (at >= gone).then(|| at - gone)
+    }
+
+    fn is_reasonable(&self) -> bool {
+        let (state, own) = (&self.core.state, &self.core.state.own);
+        state.is_sound() && own.position.norm() < ABSURD.0 && own.velocity.norm() < ABSURD.1
+    }
+
+    fn reset(&mut self, reason: &'static str, out: &mut Vec<EstimatorOutput>) {
+        let core = &mut self.core;
+        core.state.alive = false;
+        core.state.own = Default::default();
+        core.state.targets.fill(Default::default());
+        core.state.features.fill(Default::default());
+        core.state.echoes.iter_mut().for_each(|echo| echo.live = false);
+        core.state.probe.live = false;
+        core.state.cov.fill(0.0);
+        self.compass = None;
+        let t = core.state.t;
+        self.history.restart(t, |_| {});
+        out.push(EstimatorOutput::Reset { reason });
+    }
+
+    fn tell_smoothed(&mut self, out: &mut Vec<EstimatorOutput>) {
+        self.tell_smoothed_until(Some(self.core.state.t - self.lag), out);
+    }
+
+    /// Tells the smoothed estimates of frames exposed no later than `until` (all of them for `None`)
+    /// that have not been told yet, in their order.
+    fn tell_smoothed_until(&mut self, until: Option<MonoTime>, out: &mut Vec<EstimatorOutput>) {
+        loop {
+            let told = self.smoothed_to;
+            let due = |t: MonoTime| until.is_none_or(|u| t <= u) && told.is_none_or(|s| t > s);
+            let echoes = self.core.state.echoes.iter().filter(|e| e.live && due(e.t));
+            let Some(echo) = echoes.min_by_key(|e| e.t) else { return };
+            for target in 0..self.core.state.targets.len() {
+                out.push(EstimatorOutput::Smoothed(echo.estimate(&self.core.models, target)));
+            }
+            self.smoothed_to = Some(echo.t);
+        }
+    }
+
+    fn refused(
+        &self,
+        source: FusionSource,
+        t_valid: MonoTime,
+        disposition: Disposition,
+        out: &mut Vec<EstimatorOutput>,
+    ) {
+        out.push(EstimatorOutput::Fusion(FusionResult {
+            t_valid,
+            source,
+            disposition,
+            innovation: [0.0; 3],
+            dimension: 0,
+            test_ratio: f64::NAN,
+        }));
+    }
+}
+
+fn stamp_of<T>(stamped: &Stamped<T>) -> Stamp {
+    Stamp { t_valid: stamped.t_valid, t_recv: stamped.t_recv, seq: stamped.seq }
+}

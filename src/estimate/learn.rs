@@ -1,0 +1,161 @@
+//! Intensities fitted in flight.
+//!
+//! By the tower rule the posterior expectation of a squared increment has the prior's mean where the
+//! prior's intensity is right: `E[(x_t − φ x_s)² | data]` averages to `q`-times-what-`q`-does over the
+//! interval. The filter holds `x_t`, the smoothed `x_s` and their covariance, so the expectation is at
+//! hand, and a sliding mean of it is the fit (expectation maximisation with forgetting).
+
+use crate::time::{MonoTime, Span};
+
+use super::models::Models;
+use super::state::{Echo, State, at};
+
+/// What is fitted.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Learnt {
+    /// Intensities of speed and yaw rate walk per target, (m/s)²/s and (rad/s)²/s.
+    pub(super) target_q: Vec<[f64; 2]>,
+    /// Intensity of roll and pitch rate walk, (rad/s)²/s.
+    pub(super) tilt_rate_q: f64,
+    /// Intensity of yaw rate walk, (rad/s)²/s.
+    pub(super) yaw_rate_q: f64,
+    /// Variance of the force across the rotor axis, (m/s²)².
+    pub(super) side_force_var: f64,
+    /// Variance of the thrust about the weight, (m/s²)².
+    pub(super) thrust_var: f64,
+    /// Variance of a tilt reading, rad².
+    pub(super) tilt_var: f64,
+    /// Variance of a heading reading, rad².
+    pub(super) heading_var: f64,
+    /// When the targets' intensities were last fitted.
+    pub(super) t_target: MonoTime,
+}
+
+/// Limits of what is learnt, as factors on the configured standard deviation.
+const LEAST: f64 = 0.05;
+const MOST: f64 = 5.0;
+
+/// The configured values and how fast to leave them.
+#[derive(Clone, Debug)]
+pub(super) struct Learning {
+    pub(super) on: bool,
+    pub(super) over_s: f64,
+    /// Interval of the increments looked at.
+    pub(super) interval: Span,
+    pub(super) start: Learnt,
+}
+
+impl Learnt {
+    /// Copies without allocating where the sizes match.
+    pub(super) fn copy_from(&mut self, other: &Self) {
+        self.target_q.clone_from(&other.target_q);
+        self.tilt_rate_q = other.tilt_rate_q;
+        self.yaw_rate_q = other.yaw_rate_q;
+        self.side_force_var = other.side_force_var;
+        self.thrust_var = other.thrust_var;
+        self.tilt_var = other.tilt_var;
+        self.heading_var = other.heading_var;
+        self.t_target = other.t_target;
+    }
+}
+
+impl State {
+    /// Fits from the probe and from the target copy that is `interval` old.
+    pub(super) fn learn(&mut self, models: &Models, learning: &Learning) {
+        if !learning.on {
+            return;
+        }
+        if self.probe.live && self.t - self.probe.t >= learning.interval {
+            self.learn_own(models, learning);
+            self.probe.live = false;
+        }
+        if !self.probe.live {
+            self.echo_own();
+        }
+    }
+
+    fn learn_own(&mut self, models: &Models, learning: &Learning) {
+        let age_s = (self.t - self.probe.t).s();
+        let gain = (age_s / learning.over_s).min(0.5);
+        let rate_decay = (-age_s / models.tau.rate_s).exp();
+        let force_decay = (-age_s / models.tau.force_s).exp();
+        let weight = -super::state::GRAVITY;
+        let own = self.own;
+        let now = [own.rate.x, own.rate.y, own.rate.z, own.force.x, own.force.y, own.force.z - weight];
+        let mut squares = [0.0; 6];
+        for (i, square) in squares.iter_mut().enumerate() {
+            let decay = if i < 3 { rate_decay } else { force_decay };
+            let then = self.probe.mean[i] - if i == 5 { weight } else { 0.0 };
+            let expected =
+                increment(&self.probe, i, self.cov.at(at::RATE + i, at::RATE + i), at::RATE + i, decay);
+            *square = ((now[i] - decay * then).powi(2) + expected) / (1.0 - decay * decay);
+        }
+        let per_s = 2.0 / models.tau.rate_s;
+        let (l, s) = (&mut self.learnt, &learning.start);
+        blend(&mut l.tilt_rate_q, 0.5 * (squares[0] + squares[1]) * per_s, gain, s.tilt_rate_q);
+        blend(&mut l.yaw_rate_q, squares[2] * per_s, gain, s.yaw_rate_q);
+        blend(&mut l.side_force_var, 0.5 * (squares[3] + squares[4]), gain, s.side_force_var);
+        blend(&mut l.thrust_var, squares[5], gain, s.thrust_var);
+    }
+
+    /// Fits the targets' intensities from the copy that is closest to `interval` old. Call once a
+    /// frame, after its fusion.
+    pub(super) fn learn_targets(&mut self, learning: &Learning) {
+        if !learning.on {
+            return;
+        }
+        let (now, interval) = (self.t, learning.interval);
+        let old_enough = |e: &Echo| e.live && now - e.t >= Span::from_ns(interval.ns() * 4 / 5);
+        let Some(slot) =
+            (0..self.echoes.len()).filter(|i| old_enough(&self.echoes[*i])).max_by_key(|i| self.echoes[*i].t)
+        else {
+            return;
+        };
+        let since = (now - self.learnt.t_target).s().clamp(0.0, 0.2);
+        self.learnt.t_target = now;
+        let gain = since / learning.over_s;
+        let echo = &self.echoes[slot];
+        let age_s = (now - echo.t).s();
+        for (i, target) in self.targets.iter().enumerate() {
+            // A target started again since then has nothing in common with its copy.
+            let same = target.held && target.seen > 2 && echo.status[i] != crate::msg::TrackStatus::Lost;
+            if !same || target.last_seen < now {
+                continue;
+            }
+            for (k, which) in [3, 4].into_iter().enumerate() {
+                let (column, row) = (at::OWN + at::TARGET * i + which, at::TARGET * i + which);
+                let spread = increment(echo, row, self.cov.at(column, column), column, 1.0);
+                let square = (target.mean[which] - echo.mean[row]).powi(2) + spread;
+                blend(&mut self.learnt.target_q[i][k], square / age_s, gain, learning.start.target_q[i][k]);
+            }
+        }
+    }
+}
+
+/// Variance of `x_now − decay · x_then`.
+fn increment(echo: &Echo, row: usize, var_now: f64, column: usize, decay: f64) -> f64 {
+    var_now + decay * decay * echo.cov.at(row, row) - 2.0 * decay * echo.cross.at(row, column)
+}
+
+/// Moves `value` toward `sample`, within the limits about `start`.
+fn blend(value: &mut f64, sample: f64, gain: f64, start: f64) {
+    if sample.is_finite() {
+        *value = (*value + gain * (sample - *value)).clamp(start * LEAST * LEAST, start * MOST * MOST);
+    }
+}
+
+/// Moves a measurement's variance toward what its residual after fusion shows:
+/// `E[(z − h)² | data] = (R/S r)² + R (1 − R/S)`.
+pub(super) fn blend_noise(
+    value: &mut f64,
+    residual: f64,
+    innovation_var: f64,
+    gain: f64,
+    limits: (f64, f64),
+) {
+    let share = *value / innovation_var.max(*value);
+    let sample = (share * residual).powi(2) + *value * (1.0 - share);
+    if sample.is_finite() {
+        *value = (*value + gain * (sample - *value)).clamp(limits.0, limits.1);
+    }
+}

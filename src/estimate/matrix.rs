@@ -1,0 +1,158 @@
+//! Dense row-major storage with the few operations the filter needs; nothing here allocates once made.
+
+/// Rows of equal length in one block.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Grid {
+    cols: usize,
+    data: Vec<f64>,
+}
+
+impl Grid {
+    pub(super) fn zeros(rows: usize, cols: usize) -> Self {
+        Self { cols, data: vec![0.0; rows * cols] }
+    }
+
+    pub(super) fn rows(&self) -> usize {
+        self.data.len().checked_div(self.cols).unwrap_or(0)
+    }
+
+    pub(super) fn row(&self, i: usize) -> &[f64] {
+        &self.data[i * self.cols..(i + 1) * self.cols]
+    }
+
+    pub(super) fn row_mut(&mut self, i: usize) -> &mut [f64] {
+        &mut self.data[i * self.cols..(i + 1) * self.cols]
+    }
+
+    pub(super) fn at(&self, i: usize, j: usize) -> f64 {
+        self.data[i * self.cols + j]
+    }
+
+    pub(super) fn add(&mut self, i: usize, j: usize, value: f64) {
+        self.data[i * self.cols + j] += value;
+    }
+
+    pub(super) fn set(&mut self, i: usize, j: usize, value: f64) {
+        self.data[i * self.cols + j] = value;
+    }
+
+    pub(super) fn fill(&mut self, value: f64) {
+        self.data.fill(value);
+    }
+
+    /// `row[to] += a row[from]`, `from` before `to`.
+    pub(super) fn add_row(&mut self, to: usize, a: f64, from: usize) {
+        let (head, tail) = self.data.split_at_mut(to * self.cols);
+        axpy(&mut tail[..self.cols], a, &head[from * self.cols..(from + 1) * self.cols]);
+    }
+
+    /// Copies without allocating where the sizes match.
+    pub(super) fn copy_from(&mut self, other: &Self) {
+        self.cols = other.cols;
+        self.data.clone_from(&other.data);
+    }
+
+    /// Transposes a square grid in place.
+    pub(super) fn transpose(&mut self) {
+        for i in 0..self.cols {
+            for j in 0..i {
+                self.data.swap(i * self.cols + j, j * self.cols + i);
+            }
+        }
+    }
+
+    /// Forgets everything about `len` states from `start`: their rows and columns of a square grid.
+    pub(super) fn forget(&mut self, start: usize, len: usize) {
+        for i in start..start + len {
+            self.row_mut(i).fill(0.0);
+        }
+        for i in 0..self.rows() {
+            self.row_mut(i)[start..start + len].fill(0.0);
+        }
+    }
+}
+
+/// `y += a x`
+pub(super) fn axpy(y: &mut [f64], a: f64, x: &[f64]) {
+    for (y, x) in y.iter_mut().zip(x) {
+        *y += a * x;
+    }
+}
+
+/// Most components of one measurement.
+pub(super) const MAX_MEASURED: usize = 8;
+
+/// A small square matrix.
+pub(super) type Small = [[f64; MAX_MEASURED]; MAX_MEASURED];
+
+/// Lower Cholesky factor in place of the leading `m` rows; `false` where not positive definite.
+pub(super) fn cholesky(s: &mut Small, m: usize) -> bool {
+    for i in 0..m {
+        for j in 0..=i {
+            let mut sum = s[i][j];
+            for k in 0..j {
+                sum -= s[i][k] * s[j][k];
+            }
+            if i == j {
+                if !(sum > 0.0 && sum.is_finite()) {
+                    return false;
+                }
+                s[i][i] = sum.sqrt();
+            } else {
+                s[i][j] = sum / s[j][j];
+            }
+        }
+    }
+    true
+}
+
+/// Solves `L y = b` in place.
+pub(super) fn forward(l: &Small, m: usize, b: &mut [f64; MAX_MEASURED]) {
+    for i in 0..m {
+        for k in 0..i {
+            b[i] -= l[i][k] * b[k];
+        }
+        b[i] /= l[i][i];
+    }
+}
+
+/// The value that a chi-square variable of `m` degrees stays below with probability `p`, by the
+/// Wilson–Hilferty approximation (good to 1 % here).
+pub(super) fn chi_square_quantile(p: f64, m: usize) -> f64 {
+    let k = 2.0 / (9.0 * m as f64);
+    m as f64 * (1.0 - k + normal_quantile(p) * k.sqrt()).powi(3)
+}
+
+/// Normal quantile for `p` ≥ 0.5 (Abramowitz and Stegun 26.2.23, error below 4.5e-4).
+fn normal_quantile(p: f64) -> f64 {
+    let t = (-2.0 * (1.0 - p).ln()).sqrt();
+    t - (2.515_517 + t * (0.802_853 + t * 0.010_328))
+        / (1.0 + t * (1.432_788 + t * (0.189_269 + t * 0.001_308)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quantiles_match_tables() {
+        for (p, m, want) in [(0.99, 2, 9.210), (0.999, 8, 26.12), (0.95, 3, 7.815)] {
+            let got = chi_square_quantile(p, m);
+            assert!((got / want - 1.0).abs() < 0.015, "{p} {m}: {got} for {want}");
+        }
+    }
+
+    #[test]
+    fn cholesky_solves_and_refuses() {
+        let mut s = [[0.0; MAX_MEASURED]; MAX_MEASURED];
+        (s[0][0], s[1][0], s[0][1], s[1][1]) = (4.0, 2.0, 2.0, 3.0);
+        assert!(cholesky(&mut s, 2));
+        let mut b = [0.0; MAX_MEASURED];
+        (b[0], b[1]) = (2.0, 5.0);
+        forward(&s, 2, &mut b);
+        // L = [2 0; 1 √2], so y = (1, 4/√2).
+        assert!((b[0] - 1.0).abs() < 1e-12 && (b[1] - 4.0 / 2f64.sqrt()).abs() < 1e-12);
+        let mut singular = [[0.0; MAX_MEASURED]; MAX_MEASURED];
+        assert!(!cholesky(&mut singular, 2));
+    }
+}

@@ -1,0 +1,309 @@
+//! The helicopter's own sensors: GPS position and velocity, compass heading and tilt.
+
+use nalgebra::{Matrix3, Rotation3, Vector3};
+
+use crate::geo::{Geodetic, ned_from_body_321, skew, tilt_from_down, wrap_angle};
+use crate::msg::{AttitudeSample, Disposition, FixKind, FusionSource, GnssEpoch};
+use crate::time::MonoTime;
+
+use super::core::Core;
+use super::learn::blend_noise;
+use super::models::Models;
+use super::state::{Own, Rejections, State, at};
+use super::update::Measurement;
+
+/// What an epoch measures, metres and metres a second in NED.
+struct GnssValues {
+    position: Option<Vector3<f64>>,
+    has_height: bool,
+    velocity: Option<Vector3<f64>>,
+    has_down: bool,
+}
+
+fn values(epoch: &GnssEpoch, models: &Models) -> GnssValues {
+    let with_fix = epoch.fix != FixKind::None;
+    let has_height = epoch.fix != FixKind::TwoD && epoch.alt_msl_m.is_some();
+    let height_m = epoch.alt_msl_m.unwrap_or(0.0) + epoch.geoid_m.unwrap_or(0.0);
+    let height_m = if has_height { height_m } else { models.frame.datum().height_m };
+    let position = epoch
+        .lat_deg
+        .zip(epoch.lon_deg)
+        .filter(|_| with_fix)
+        .map(|(lat_deg, lon_deg)| models.frame.ned(Geodetic { lat_deg, lon_deg, height_m }));
+    let from_course = || {
+        let (speed, course) = (epoch.speed_mps?, epoch.course_deg?.to_radians());
+        Some(Vector3::new(speed * course.cos(), speed * course.sin(), 0.0))
+    };
+    let velocity = epoch.vel_ned_mps.or_else(from_course).filter(|_| with_fix);
+    let has_down = epoch.vel_ned_mps.is_some() && epoch.vel_has_down;
+    GnssValues { position, has_height, velocity, has_down }
+}
+
+/// Farthest from the datum that a position can be meant, m: the tangent plane ends somewhere.
+const FARTHEST_M: f64 = 2.0e5;
+/// Fastest a helicopter can be meant to fly, m/s.
+const FASTEST_MPS: f64 = 150.0;
+
+impl Core {
+    /// Fuses one epoch.
+    pub(super) fn fuse_gnss(&mut self, epoch: &GnssEpoch) {
+        let seen = values(epoch, &self.models);
+        match seen.velocity {
+            Some(v) if v.norm() < FASTEST_MPS => self.fuse_gps_velocity(&v, seen.has_down),
+            Some(_) => self.refuse(FusionSource::GpsVelocity, Disposition::Invalid),
+            None => {}
+        }
+        match seen.position {
+            Some(p) if p.norm() < FARTHEST_M => self.fuse_gps_position(&p, seen.has_height),
+            Some(_) => self.refuse(FusionSource::GpsPosition, Disposition::Invalid),
+            None => {}
+        }
+    }
+
+    /// `z = p + R l + b − v τ + ½ a τ²`, with the antenna's velocity v and the delay τ.
+    fn fuse_gps_position(&mut self, position: &Vector3<f64>, has_height: bool) {
+        let (own, models) = (&self.state.own, &self.models);
+        let m = if has_height { 3 } else { 2 };
+        let arm = own.ned_from_body * models.antenna_at;
+        let velocity = antenna_velocity(own, models);
+        let tau = own.gps_delay_s;
+        let expected =
+            own.position + arm + own.gps_bias - velocity * tau + own.acceleration() * (0.5 * tau * tau);
+        let z = &mut self.z;
+        z.begin(m);
+        let p = z.columns(at::POSITION, 3);
+        let v = z.columns(at::VELOCITY, 3);
+        let attitude = z.columns(at::ATTITUDE, 3);
+        let bias = z.columns(at::GPS_BIAS, 3);
+        let delay = z.columns(at::GPS_DELAY, 1);
+        let d_attitude = -skew(&arm);
+        let d_delay = -velocity + own.acceleration() * tau;
+        for i in 0..m {
+            z.residual[i] = position[i] - expected[i];
+            z.set(i, p + i, 1.0);
+            z.set(i, v + i, -tau);
+            z.set(i, bias + i, 1.0);
+            z.set(i, delay, d_delay[i]);
+            set_row(z, i, attitude, &d_attitude);
+            z.noise[i][i] = models.gps_noise_var * if i == 2 { 4.0 } else { 1.0 };
+        }
+        let outcome = self.fuse_gated(FusionSource::GpsPosition);
+        self.state.rejections.gps_position = counted(self.state.rejections.gps_position, outcome.ratio);
+        if self.state.rejections.gps_position >= self.restart_after {
+            self.state.rejections.gps_position = 0;
+            // The receiver's error has jumped: its bias is unknown again, position is not.
+            let variances: [f64; 3] = (self.models.gps_bias_var * 25.0).into();
+            self.state.renew(at::GPS_BIAS, &variances);
+        }
+    }
+
+    /// `z = v + R (ω × l) − a τ`
+    fn fuse_gps_velocity(&mut self, velocity: &Vector3<f64>, has_down: bool) {
+        let (own, models) = (&self.state.own, &self.models);
+        let m = if has_down { 3 } else { 2 };
+        let tau = own.gps_delay_s;
+        let acceleration = own.acceleration();
+        let expected = antenna_velocity(own, models) - acceleration * tau;
+        let swing = own.ned_from_body * own.rate.cross(&models.antenna_at);
+        let d_rate = -own.rotation() * skew(&models.antenna_at);
+        let d_attitude = -skew(&swing) + skew(&(own.ned_from_body * own.force)) * tau;
+        let d_force = -own.rotation() * tau;
+        let z = &mut self.z;
+        z.begin(m);
+        let v = z.columns(at::VELOCITY, 3);
+        let attitude = z.columns(at::ATTITUDE, 3);
+        let rate = z.columns(at::RATE, 3);
+        let force = z.columns(at::FORCE, 3);
+        let delay = z.columns(at::GPS_DELAY, 1);
+        for i in 0..m {
+            z.residual[i] = velocity[i] - expected[i];
+            z.set(i, v + i, 1.0);
+            set_row(z, i, attitude, &d_attitude);
+            set_row(z, i, rate, &d_rate);
+            set_row(z, i, force, &d_force);
+            z.set(i, delay, -acceleration[i]);
+            z.noise[i][i] = models.gps_velocity_var;
+        }
+        let outcome = self.fuse_gated(FusionSource::GpsVelocity);
+        self.state.rejections.gps_velocity = counted(self.state.rejections.gps_velocity, outcome.ratio);
+        if self.state.rejections.gps_velocity >= self.restart_after {
+            self.state.rejections.gps_velocity = 0;
+            self.state.renew(at::VELOCITY, &[4.0; 3]);
+            self.state.own.velocity = *velocity;
+        }
+    }
+
+    /// Fuses one compass reading.
+    pub(super) fn fuse_attitude(&mut self, sample: &AttitudeSample) {
+        if let Some(heading) = sample.heading {
+            self.fuse_heading(true_heading(heading, sample.heading_is_true, &self.models));
+        }
+        if let Some(tilt) = sample.tilt {
+            let tilt = crate::geo::Tilt {
+                pitch: tilt.pitch - self.models.pitch_offset,
+                roll: tilt.roll - self.models.roll_offset,
+            };
+            match self.models.convention.down_in_body(tilt) {
+                Some(down) => self.fuse_tilt(&down),
+                None => self.refuse(FusionSource::CompassTilt, Disposition::Invalid),
+            }
+        }
+    }
+
+    /// `z = ψ + b`, where ψ is the azimuth of the body's x axis x: for a small rotation ε about NED,
+    /// `δψ = ε_D − (x_N x_D ε_N + x_E x_D ε_E)/(x_N² + x_E²)`.
+    fn fuse_heading(&mut self, heading: f64) {
+        let own = &self.state.own;
+        let x = own.rotation().column(0).into_owned();
+        let level2 = x.x * x.x + x.y * x.y;
+        let z = &mut self.z;
+        z.begin(1);
+        let attitude = z.columns(at::ATTITUDE, 3);
+        let bias = z.columns(at::HEADING_BIAS, 1);
+        z.residual[0] = wrap_angle(heading - x.y.atan2(x.x) - own.heading_bias);
+        z.set(0, attitude, -x.x * x.z / level2);
+        z.set(0, attitude + 1, -x.y * x.z / level2);
+        z.set(0, attitude + 2, 1.0);
+        z.set(0, bias, 1.0);
+        z.noise[0][0] = self.state.learnt.heading_var;
+        let residual = z.residual[0];
+        let outcome = self.fuse_gated(FusionSource::CompassHeading);
+        if self.learning.on && outcome.ratio < 4.0 {
+            let start = self.learning.start.heading_var;
+            let gain = SAMPLE_GAIN_S / self.learning.over_s;
+            let value = &mut self.state.learnt.heading_var;
+            blend_noise(value, residual, outcome.innovation_var[0], gain, (0.25 * start, 36.0 * start));
+        }
+        self.state.rejections.heading = counted(self.state.rejections.heading, outcome.ratio);
+        if self.state.rejections.heading >= 6 * self.restart_after {
+            self.state.rejections.heading = 0;
+            self.state.renew(at::HEADING_BIAS, &[9.0 * self.models.heading_bias_var]);
+        }
+    }
+
+    /// `z = k (−d₁, d₂) + b`, where d is down in the body frame and k how much of the tilt the
+    /// sensor reads: 1 on the ground, little on a rotorcraft, whose tilt sensor feels specific force.
+    fn fuse_tilt(&mut self, down: &Vector3<f64>) {
+        let own = &self.state.own;
+        let inverse: Matrix3<f64> = own.rotation().transpose();
+        let d = inverse.column(2).into_owned();
+        let d_attitude = inverse * skew(&Vector3::z());
+        let k = own.tilt_gain;
+        let z = &mut self.z;
+        z.begin(2);
+        let attitude = z.columns(at::ATTITUDE, 3);
+        let gain = z.columns(at::TILT_GAIN, 1);
+        let bias = z.columns(at::TILT_BIAS, 2);
+        for (i, sign) in [-1.0, 1.0].into_iter().enumerate() {
+            z.residual[i] = sign * down[i] - k * sign * d[i] - own.tilt_bias[i];
+            for j in 0..3 {
+                z.set(i, attitude + j, k * sign * d_attitude[(i, j)]);
+            }
+            z.set(i, gain, sign * d[i]);
+            z.set(i, bias + i, 1.0);
+            z.noise[i][i] = self.state.learnt.tilt_var;
+        }
+        let residual = [z.residual[0], z.residual[1]];
+        let outcome = self.fuse_gated(FusionSource::CompassTilt);
+        if self.learning.on && outcome.ratio < 4.0 {
+            let start = self.learning.start.tilt_var;
+            let gain = 0.5 * SAMPLE_GAIN_S / self.learning.over_s;
+            let value = &mut self.state.learnt.tilt_var;
+            for i in 0..2 {
+                blend_noise(
+                    value,
+                    residual[i],
+                    outcome.innovation_var[i],
+                    gain,
+                    (0.25 * start, 400.0 * start),
+                );
+            }
+        }
+        self.state.rejections.tilt = counted(self.state.rejections.tilt, outcome.ratio);
+        if self.state.rejections.tilt >= 6 * self.restart_after {
+            self.state.rejections.tilt = 0;
+            self.state.learnt.tilt_var *= 16.0;
+            self.state.renew(at::TILT_GAIN, &[0.25]);
+        }
+    }
+}
+
+/// What one compass reading counts in a sliding mean, s: the interval of a 30 Hz compass.
+const SAMPLE_GAIN_S: f64 = 1.0 / 30.0;
+
+fn antenna_velocity(own: &Own, models: &Models) -> Vector3<f64> {
+    own.velocity + own.ned_from_body * own.rate.cross(&models.antenna_at)
+}
+
+fn set_row(z: &mut Measurement, i: usize, first: usize, d: &Matrix3<f64>) {
+    for j in 0..3 {
+        z.set(i, first + j, d[(i, j)]);
+    }
+}
+
+fn counted(so_far: u32, ratio: f64) -> u32 {
+    if ratio <= 1.0 { 0 } else { so_far + 1 }
+}
+
+/// True heading of the aircraft from what the device reports.
+pub(super) fn true_heading(heading: f64, is_true: bool, models: &Models) -> f64 {
+    heading + if is_true { 0.0 } else { models.declination } + models.yaw_offset
+}
+
+/// Starts the helicopter's state from a fix and a compass reading; `false` where the fix has no
+/// position.
+pub(super) fn start(
+    state: &mut State,
+    t: MonoTime,
+    epoch: &GnssEpoch,
+    compass: &AttitudeSample,
+    models: &Models,
+) -> bool {
+    let seen = values(epoch, models);
+    let (Some(position), Some(heading)) = (seen.position.filter(|p| p.norm() < FARTHEST_M), compass.heading)
+    else {
+        return false;
+    };
+    let down = compass.tilt.and_then(|tilt| models.convention.down_in_body(tilt));
+    let (pitch, roll) = down.map_or((0.0, 0.0), |d| tilt_from_down(&d));
+    let heading = true_heading(heading, compass.heading_is_true, models);
+    let attitude: Rotation3<f64> = ned_from_body_321(heading, pitch, roll);
+    let velocity = seen.velocity.filter(|v| v.norm() < FASTEST_MPS);
+    state.own = Own {
+        position: position - attitude * models.antenna_at,
+        velocity: velocity.unwrap_or_default(),
+        ned_from_body: attitude,
+        ..Own::default()
+    };
+    state.t = t;
+    state.alive = true;
+    state.rejections = Rejections::default();
+    state.targets.fill(Default::default());
+    state.features.fill(Default::default());
+    state.cov.fill(0.0);
+    state.probe.live = false;
+    state.echoes.iter_mut().for_each(|echo| echo.live = false);
+    let mut variances = [0.0; at::OWN];
+    // Position and heading start wide and are tied to the sensors' biases by the first updates.
+    variances[at::POSITION..at::POSITION + 3].fill(1e4);
+    variances[at::VELOCITY..at::VELOCITY + 3].fill(if velocity.is_some() { 1.0 } else { 100.0 });
+    variances[at::ATTITUDE..at::ATTITUDE + 2].fill(START_TILT.powi(2));
+    variances[at::ATTITUDE + 2] = 0.5;
+    variances[at::RATE..at::RATE + 3].fill(0.3 * 0.3);
+    variances[at::FORCE..at::FORCE + 2].fill(state.learnt.side_force_var);
+    variances[at::FORCE + 2] = state.learnt.thrust_var;
+    variances[at::GPS_BIAS..at::GPS_BIAS + 3].copy_from_slice(models.gps_bias_var.as_slice());
+    variances[at::HEADING_BIAS] = models.heading_bias_var;
+    variances[at::TILT_GAIN] = START_TILT_GAIN.powi(2);
+    variances[at::TILT_BIAS..at::TILT_BIAS + 2].fill(0.005 * 0.005);
+    variances[at::GPS_DELAY] = models.gps_delay_var;
+    for (i, variance) in variances.into_iter().enumerate() {
+        state.cov.set(i, i, variance);
+    }
+    true
+}
+
+/// Tilt at the start, one sigma, rad: what a helicopter may fly with whatever its compass says.
+const START_TILT: f64 = 0.1;
+/// How far from 1 the share of tilt read may be at the start, one sigma.
+const START_TILT_GAIN: f64 = 0.5;

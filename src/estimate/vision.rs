@@ -1,0 +1,348 @@
+//! A frame: markers on vehicles and ground features, as raw pixels through the whole camera model.
+
+use nalgebra::{Matrix2, Matrix2x3, Vector2, Vector3};
+
+use crate::config::TargetModel;
+use crate::geo::{locate, skew, wrap_angle};
+use crate::msg::{Disposition, FeatureTrack, FrameObservations, FusionSource, MarkerDetection, TrackStatus};
+
+use super::core::Core;
+use super::models::Models;
+use super::state::{Own, State, Target, at};
+use super::track::started;
+use super::update::Measurement;
+
+/// A point of the world in the image, with its derivatives.
+pub(super) struct PointView {
+    pub(super) px: Vector2<f64>,
+    /// ∂px/∂(point in NED).
+    pub(super) d_point: Matrix2x3<f64>,
+    /// ∂px/∂(attitude error).
+    pub(super) d_attitude: Matrix2x3<f64>,
+}
+
+/// Projects a point given in NED.
+pub(super) fn view(own: &Own, models: &Models, point: &Vector3<f64>) -> Option<PointView> {
+    let from_us = point - own.position;
+    let camera_from_ned = models.camera_from_body * own.rotation().transpose();
+    let in_camera = camera_from_ned * from_us - models.camera_from_body * models.camera_at;
+    let seen = models.camera.project(&in_camera)?;
+    let d_point = seen.d_point * camera_from_ned;
+    Some(PointView { px: seen.px, d_point, d_attitude: d_point * skew(&from_us) })
+}
+
+/// A point of a target in NED, and ∂point/∂(north, east, heading).
+pub(super) fn target_point(
+    mean: &[f64; at::TARGET],
+    models: &Models,
+    point: &Vector3<f64>,
+) -> (Vector3<f64>, [Vector3<f64>; 3]) {
+    let [north, east, heading, ..] = *mean;
+    let (s, c) = heading.sin_cos();
+    let [slope_n, slope_e] = models.ground.slope(north, east);
+    let down = models.ground.down_m(north, east);
+    let turned = Vector3::new(c * point.x - s * point.y, s * point.x + c * point.y, point.z);
+    let derivatives = [
+        Vector3::new(1.0, 0.0, slope_n),
+        Vector3::new(0.0, 1.0, slope_e),
+        Vector3::new(-turned.y, turned.x, 0.0),
+    ];
+    (turned + Vector3::new(north, east, down), derivatives)
+}
+
+impl Core {
+    /// Fuses a frame's markers, then its ground features.
+    pub(super) fn fuse_frame(&mut self, frame: &FrameObservations) {
+        self.fuse_features(&frame.features);
+        for target in 0..self.state.targets.len() {
+            self.fuse_target(target, &frame.markers);
+        }
+        for detection in &frame.markers {
+            if self.models.find(detection.marker).is_none() {
+                self.refuse(FusionSource::Marker, Disposition::Unknown);
+            }
+        }
+        self.state.learn_targets(&self.learning);
+        self.state.echo_targets(frame.frame, self.keep_copies);
+    }
+
+    fn fuse_target(&mut self, index: usize, markers: &[MarkerDetection]) {
+        let mine = |d: &&MarkerDetection| self.models.find(d.marker).is_some_and(|(t, _)| t == index);
+        let count = markers.iter().filter(mine).count();
+        let t = self.state.t;
+        let target = &self.state.targets[index];
+        let away = target.held && t - target.last_seen > self.lost_after;
+        if count == 0 {
+            let lost_after = self.lost_after;
+            self.state.targets[index].unseen(t, lost_after);
+            return;
+        }
+        if !target.held || away {
+            self.start_target(index, markers);
+            return;
+        }
+        let mut good = 0;
+        for detection in markers {
+            if let Some((t, marker)) = self.models.find(detection.marker)
+                && t == index
+            {
+                good += usize::from(self.fuse_marker(index, marker, detection, true));
+            }
+        }
+        let restart_after = self.restart_after;
+        let target = &mut self.state.targets[index];
+        if good > 0 {
+            target.rejected = 0;
+            target.seen = target.seen.saturating_add(1);
+            target.last_seen = t;
+        } else {
+            target.rejected += 1;
+            let patience = if target.status == TrackStatus::Tracking { restart_after } else { 2 };
+            if target.rejected >= patience {
+                self.start_target(index, markers);
+                return;
+            }
+        }
+        self.state.settle(index);
+    }
+
+    /// Fuses one marker: a tag's four corners at once, or a disc's centre. Whether it was inside the
+    /// gate.
+    fn fuse_marker(&mut self, index: usize, marker: usize, seen: &MarkerDetection, gated: bool) -> bool {
+        let start = self.state.target_at(index);
+        let mean = self.state.targets[index].mean;
+        let model = &self.models.targets[index].markers[marker];
+        let floor = Matrix2::identity() * self.models.marker_var_px2;
+        let points: &[Vector3<f64>] = match (&model.corners, &seen.corners_px) {
+            (Some(corners), Some(_)) => corners,
+            _ => std::slice::from_ref(&model.center),
+        };
+        self.z.begin(2 * points.len());
+        let position = self.z.columns(at::POSITION, 3);
+        let attitude = self.z.columns(at::ATTITUDE, 3);
+        let pose = self.z.columns(start, 3);
+        for (i, point) in points.iter().enumerate() {
+            let (world, derivatives) = target_point(&mean, &self.models, point);
+            let Some(view) = view(&self.state.own, &self.models, &world) else {
+                self.refuse(FusionSource::Marker, Disposition::Invalid);
+                return false;
+            };
+            let (px, covariance) = match (points.len(), &seen.corners_px) {
+                (4, Some(corners)) => (corners[i], seen.corner_cov_px2[i]),
+                _ => (seen.center_px, seen.center_cov_px2),
+            };
+            set_point(&mut self.z, i, &(px - view.px), &view, position, attitude, &(covariance + floor));
+            for (k, d) in derivatives.iter().enumerate() {
+                let d = view.d_point * d;
+                self.z.set(2 * i, pose + k, d.x);
+                self.z.set(2 * i + 1, pose + k, d.y);
+            }
+        }
+        if gated {
+            return self.fuse_gated(FusionSource::Marker).ratio <= 1.0;
+        }
+        let outcome = self.work.fuse(&mut self.state, &mut self.z, None);
+        outcome.disposition == Disposition::Fused
+    }
+
+    /// Starts a target from the markers of one frame: where they lie on the ground, with a wide
+    /// prior that the same pixels then narrow, so that everything common with the helicopter's own
+    /// errors stands in the covariance.
+    fn start_target(&mut self, index: usize, markers: &[MarkerDetection]) {
+        let Some((mean, heading_known)) = guess(&self.state.own, &self.models, index, markers) else {
+            self.refuse(FusionSource::Marker, Disposition::Invalid);
+            return;
+        };
+        let start = self.state.target_at(index);
+        self.state.targets[index] = started(mean, self.state.t);
+        self.state.learnt.target_q[index] = self.learning.start.target_q[index];
+        let heading_var = if heading_known { 1.0 } else { UNKNOWN_HEADING.powi(2) };
+        let moving = self.models.targets[index].model != TargetModel::Static;
+        let (speed_var, rate_var) = if moving { (9.0, 1.0) } else { (0.0, 0.0) };
+        self.state.renew(start, &[900.0, 900.0, heading_var, speed_var, rate_var]);
+        for detection in markers {
+            if let Some((t, marker)) = self.models.find(detection.marker)
+                && t == index
+            {
+                self.fuse_marker(index, marker, detection, false);
+            }
+        }
+        self.state.settle(index);
+    }
+
+    /// Ground features: each a point of the ground that stays where it is.
+    fn fuse_features(&mut self, tracks: &[FeatureTrack]) {
+        for slot in 0..self.state.features.len() {
+            let Some(id) = self.state.features[slot].id else { continue };
+            match tracks.iter().find(|track| track.id == id) {
+                Some(track) => self.fuse_feature(slot, track, true),
+                None => self.drop_feature(slot),
+            }
+        }
+        for slot in 0..self.state.features.len() {
+            if self.state.features[slot].id.is_none()
+                && let Some(track) = next_feature(&self.state, &self.models, tracks)
+            {
+                self.start_feature(slot, &track);
+            }
+        }
+    }
+
+    fn start_feature(&mut self, slot: usize, track: &FeatureTrack) {
+        let own = &self.state.own;
+        let Some(found) = ground_point(own, &self.models, track.px, 0.0) else { return };
+        let feature = &mut self.state.features[slot];
+        feature.id = Some(track.id);
+        feature.mean = [found.x, found.y];
+        feature.rejected = 0;
+        let start = self.state.feature_at(slot);
+        self.state.renew(start, &[900.0; 2]);
+        self.fuse_feature(slot, track, false);
+    }
+
+    fn drop_feature(&mut self, slot: usize) {
+        self.state.features[slot].id = None;
+        let start = self.state.feature_at(slot);
+        self.state.renew(start, &[0.0; 2]);
+    }
+
+    fn fuse_feature(&mut self, slot: usize, track: &FeatureTrack, gated: bool) {
+        let start = self.state.feature_at(slot);
+        let [north, east] = self.state.features[slot].mean;
+        let world = Vector3::new(north, east, self.models.ground.down_m(north, east));
+        let Some(view) = view(&self.state.own, &self.models, &world) else {
+            self.drop_feature(slot);
+            return;
+        };
+        let [slope_n, slope_e] = self.models.ground.slope(north, east);
+        self.z.begin(2);
+        let position = self.z.columns(at::POSITION, 3);
+        let attitude = self.z.columns(at::ATTITUDE, 3);
+        let place = self.z.columns(start, 2);
+        let noise = Matrix2::identity() * (track.sigma_px.powi(2) * self.models.feature_factor2);
+        set_point(&mut self.z, 0, &(track.px - view.px), &view, position, attitude, &noise);
+        for (k, d) in [Vector3::new(1.0, 0.0, slope_n), Vector3::new(0.0, 1.0, slope_e)].iter().enumerate() {
+            let d = view.d_point * d;
+            self.z.set(0, place + k, d.x);
+            self.z.set(1, place + k, d.y);
+        }
+        if !gated {
+            self.work.fuse(&mut self.state, &mut self.z, None);
+            return;
+        }
+        if self.fuse_gated(FusionSource::Feature).ratio > 1.0 {
+            self.state.features[slot].rejected += 1;
+            if self.state.features[slot].rejected >= 2 {
+                self.drop_feature(slot);
+            }
+        } else {
+            self.state.features[slot].rejected = 0;
+        }
+    }
+}
+
+/// Heading quite unknown, one sigma of a uniform circle, rad.
+const UNKNOWN_HEADING: f64 = 1.8;
+/// Farthest that a ray is followed to the ground, m.
+const FARTHEST_M: f64 = 1_000.0;
+
+fn set_point(
+    z: &mut Measurement,
+    i: usize,
+    residual: &Vector2<f64>,
+    view: &PointView,
+    position: usize,
+    attitude: usize,
+    noise: &Matrix2<f64>,
+) {
+    for r in 0..2 {
+        z.residual[2 * i + r] = residual[r];
+        for k in 0..3 {
+            z.set(2 * i + r, position + k, -view.d_point[(r, k)]);
+            z.set(2 * i + r, attitude + k, view.d_attitude[(r, k)]);
+        }
+        for c in 0..2 {
+            z.noise[2 * i + r][2 * i + c] = noise[(r, c)];
+        }
+    }
+}
+
+/// The ground point `above_m` over the ground seen at a pixel.
+fn ground_point(own: &Own, models: &Models, px: Vector2<f64>, above_m: f64) -> Option<Vector3<f64>> {
+    let ned_from_camera =
+        own.ned_from_body * nalgebra::Rotation3::from_matrix_unchecked(models.camera_from_body.transpose());
+    let camera = own.position + own.ned_from_body * models.camera_at;
+    locate(&models.camera, &camera, &ned_from_camera, px, &models.ground, above_m, FARTHEST_M)
+        .ok()
+        .map(|found| found.ned_m)
+}
+
+/// First guess of a target from one frame: (state, whether the heading is known).
+fn guess(
+    own: &Own,
+    models: &Models,
+    index: usize,
+    markers: &[MarkerDetection],
+) -> Option<([f64; at::TARGET], bool)> {
+    let target = &models.targets[index];
+    let mut first = None;
+    let mut heading = None;
+    for seen in markers {
+        let Some(marker) = target.markers.iter().find(|marker| marker.id == seen.marker) else { continue };
+        let Some(place) = ground_point(own, models, seen.center_px, -marker.center.z) else { continue };
+        if let (None, Some(corners)) = (heading, &seen.corners_px) {
+            let point = |k: usize| ground_point(own, models, corners[k], -marker.center.z);
+            let up = point(0)? + point(1)? - point(2)? - point(3)?;
+            heading = Some(wrap_angle(up.y.atan2(up.x) - marker.yaw));
+        }
+        let Some((other, there)) = first else {
+            first = Some((marker, place));
+            continue;
+        };
+        let (apart, along): (Vector3<f64>, Vector3<f64>) = (place - there, marker.center - other.center);
+        if along.xy().norm() > 1e-3 {
+            heading = heading.or(Some(wrap_angle(apart.y.atan2(apart.x) - along.y.atan2(along.x))));
+        }
+    }
+    let (marker, place): (&super::models::Marker, Vector3<f64>) = first?;
+    let (s, c) = heading.unwrap_or(0.0).sin_cos();
+    let offset = marker.center;
+    let north = place.x - (c * offset.x - s * offset.y);
+    let east = place.y - (s * offset.x + c * offset.y);
+    Some(([north, east, heading.unwrap_or(0.0), 0.0, 0.0], heading.is_some()))
+}
+
+/// The track not yet used that lies farthest from those in use: spread is what separates turning from
+/// moving.
+fn next_feature(state: &State, models: &Models, tracks: &[FeatureTrack]) -> Option<FeatureTrack> {
+    let used = |id: u64| state.features.iter().any(|f| f.id == Some(id));
+    let lone = |track: &FeatureTrack| {
+        let others = tracks.iter().filter(|other| used(other.id));
+        others.map(|o| (o.px - track.px).norm()).fold(f64::INFINITY, f64::min)
+    };
+    let fit = |track: &&FeatureTrack| {
+        !used(track.id)
+            && track.sigma_px.is_finite()
+            && track.sigma_px > 0.0
+            && track.px.iter().all(|x| x.is_finite())
+            && models.camera.normalised(track.px).is_some()
+    };
+    tracks.iter().filter(fit).max_by(|a, b| lone(a).total_cmp(&lone(b)).then(b.id.cmp(&a.id))).copied()
+}
+
+impl Target {
+    /// What became of a track in a frame that does not show it.
+    fn unseen(&mut self, t: crate::time::MonoTime, lost_after: crate::time::Span) {
+        if !self.held {
+            self.status = TrackStatus::Lost;
+            return;
+        }
+        let away = t - self.last_seen;
+        if away > lost_after || (self.status == TrackStatus::Acquiring && away.s() > super::track::DOUBTFUL_S)
+        {
+            self.status = TrackStatus::Lost;
+        } else if away.s() > super::track::BLINK_S && self.status == TrackStatus::Tracking {
+            self.status = TrackStatus::Coasting;
+        }
+    }
+}
