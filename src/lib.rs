@@ -9,18 +9,18 @@
 //! `app` wires; `cli` talks to people. `tests/architecture.rs` holds this.
 
 // -- core: values in, values out
-pub mod align;
-pub mod calibrate;
+pub mod time;
+pub mod geo;
 pub mod config;
+pub mod msg;
 pub mod decode;
+pub mod align;
 pub mod detect;
 pub mod estimate;
-pub mod geo;
-pub mod msg;
-pub mod pipeline;
 pub mod plot;
+pub mod calibrate;
 pub mod simulate;
-pub mod time;
+pub mod pipeline;
 // -- edge: devices, disk, network
 pub mod io;
 // -- wiring

@@ -1,6 +1,7 @@
 //! The command line: parse arguments, call the library, turn results into exit codes.
 
 mod check_config;
+mod detect;
 mod error;
 mod keys;
 mod montecarlo;
@@ -27,6 +28,8 @@ enum Command {
     Keys(keys::Args),
     /// Predict how well the ground is located from here: the paper's error analysis
     Montecarlo(montecarlo::Args),
+    /// Find markers in images
+    Detect(detect::Args),
 }
 
 /// Runs the command line of this process.
@@ -44,6 +47,7 @@ pub fn main() -> ExitCode {
         Command::CheckConfig(args) => check_config::run(&args),
         Command::Keys(args) => keys::run(&args),
         Command::Montecarlo(args) => montecarlo::run(&args),
+        Command::Detect(args) => detect::run(&args),
     };
     error::exit_code(result)
 }

@@ -1,1 +1,18 @@
 //! Markers and ground features in frames.
+
+mod binarise;
+mod codes;
+mod components;
+mod edges;
+mod family;
+mod frame;
+mod homography;
+mod payload;
+mod pyramid;
+mod quad;
+mod simd;
+mod tag;
+
+pub use frame::FrameDetector;
+pub use simd::Simd;
+pub use tag::{LARGEST_IMAGE_PX, Region, TagDetector};

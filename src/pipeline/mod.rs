@@ -1,5 +1,6 @@
 //! The one path from events to outputs, live and in replay.
 
+pub mod frame;
 mod output;
 
 pub use output::{Health, Notice, NoticeKind, Output, SourceHealth, TargetHealth};

@@ -1,0 +1,127 @@
+//! `windhover detect IMAGE…`
+
+use std::path::{Path, PathBuf};
+
+use serde_json::{Value, json};
+
+use super::{CliError, CliResult};
+use crate::config::TagFamily;
+use crate::detect::{LARGEST_IMAGE_PX, TagDetector};
+use crate::io::clock::HostClock;
+use crate::msg::{GrayImage, MarkerDetection, MarkerId};
+
+/// Find markers in images.
+#[derive(clap::Args, Debug)]
+pub(super) struct Args {
+    /// Images: PNG, JPEG, BMP, PNM or TIFF
+    #[arg(required = true, value_name = "IMAGE")]
+    images: Vec<PathBuf>,
+    /// Family of the tags
+    #[arg(long, default_value = "36h11", value_parser = family)]
+    family: TagFamily,
+    /// Smallest edge of a tag's black square that is looked for, pixels
+    #[arg(long, value_name = "N", default_value_t = 16.0, value_parser = min_px)]
+    min_px: f64,
+    /// Most wrong bits corrected; families with few bits correct fewer
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u8).range(0..=3))]
+    max_hamming: u8,
+    /// One JSON object an image on standard output
+    #[arg(long)]
+    json: bool,
+}
+
+fn family(name: &str) -> Result<TagFamily, String> {
+    let known = || TagFamily::ALL.map(TagFamily::name).join(", ");
+    TagFamily::ALL
+        .into_iter()
+        .find(|f| f.name() == name)
+        .ok_or_else(|| format!("no such family; there are {}", known()))
+}
+
+fn min_px(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
+    (8.0..=10_000.0).contains(&value).then_some(value).ok_or_else(|| "not between 8 and 10000".to_owned())
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    let mut detector = TagDetector::new(&[args.family], args.min_px, args.max_hamming);
+    let clock = HostClock::start();
+    let mut found = Vec::new();
+    let mut failed = 0;
+    for path in &args.images {
+        let image = match read(path) {
+            Ok(image) => image,
+            Err(message) => {
+                eprintln!("windhover: {}: {message}", path.display());
+                failed += 1;
+                continue;
+            }
+        };
+        found.clear();
+        let start = clock.now();
+        detector.detect(image.view(), &mut found);
+        let ms = (clock.now() - start).ms();
+        if args.json {
+            println!("{}", as_json(path, ms, &found));
+        } else {
+            print_lines(path, ms, &found);
+        }
+    }
+    match failed {
+        0 => Ok(()),
+        n => Err(CliError::failed(format!("{n} of {} images could not be read", args.images.len()))),
+    }
+}
+
+fn read(path: &Path) -> Result<GrayImage, String> {
+    let image = image::ImageReader::open(path)
+        .map_err(|e| e.to_string())?
+        .with_guessed_format()
+        .map_err(|e| e.to_string())?
+        .decode()
+        .map_err(|e| e.to_string())?
+        .into_luma8();
+    let (width, height) = (image.width() as usize, image.height() as usize);
+    if width.max(height) > LARGEST_IMAGE_PX {
+        return Err(format!(
+            "{width}×{height} is larger than {LARGEST_IMAGE_PX} pixels on a side; scale it down"
+        ));
+    }
+    GrayImage::from_vec(width, height, image.into_raw()).ok_or_else(|| "no pixels".to_owned())
+}
+
+fn as_json(path: &Path, ms: f64, found: &[MarkerDetection]) -> Value {
+    let detections: Vec<Value> = found
+        .iter()
+        .filter_map(|m| {
+            let MarkerId::Tag { family, id } = m.marker else { return None };
+            Some(json!({
+                "family": family.name(),
+                "id": id,
+                "hamming": m.hamming,
+                "margin": m.margin,
+                "center": [m.center_px.x, m.center_px.y],
+                "corners": m.corners_px?.map(|c| [c.x, c.y]),
+            }))
+        })
+        .collect();
+    json!({ "image": path.to_string_lossy(), "ms": ms, "detections": detections })
+}
+
+fn print_lines(path: &Path, ms: f64, found: &[MarkerDetection]) {
+    let tags = if found.len() == 1 { "tag" } else { "tags" };
+    println!("{}: {} {tags} in {ms:.2} ms", path.display(), found.len());
+    for m in found {
+        if let MarkerId::Tag { family, id } = m.marker {
+            println!(
+                "  {} {id} at ({:.1}, {:.1}), {:.1} px, hamming {}, margin {:.0}",
+                family.name(),
+                m.center_px.x,
+                m.center_px.y,
+                m.size_px,
+                m.hamming,
+                m.margin
+            );
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! Dark pixels: thresholds from the local range of 4×4 tiles, one bit a pixel.
+
+use super::simd::{Simd, TILE};
+use crate::msg::ImageView;
+
+/// One bit a pixel, lowest first; set where the pixel is dark. Bits past the width are zero.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Bitmap {
+    pub width: usize,
+    pub height: usize,
+    words: Vec<u64>,
+}
+
+impl Bitmap {
+    /// The words of a row.
+    pub fn row(&self, v: usize) -> &[u64] {
+        let per_row = self.width.div_ceil(64);
+        &self.words[v * per_row..(v + 1) * per_row]
+    }
+}
+
+/// Thresholds an image against its surroundings, 12×12 pixels around each tile.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Binariser {
+    low: Vec<u8>,
+    high: Vec<u8>,
+    wide_low: Vec<u8>,
+    wide_high: Vec<u8>,
+    scratch: Vec<u8>,
+    thresholds: Vec<u8>,
+    tiles: (usize, usize),
+}
+
+impl Binariser {
+    /// Measures the range around every tile of an image.
+    pub fn measure(&mut self, image: ImageView<'_>, simd: Simd) {
+        let (across, down) = (image.width.div_ceil(TILE), image.height.div_ceil(TILE));
+        self.tiles = (across, down);
+        for buffer in [&mut self.low, &mut self.high, &mut self.wide_low, &mut self.wide_high] {
+            buffer.resize(across * down, 0);
+        }
+        for tile in 0..down {
+            let row = |k: usize| image.row((tile * TILE + k).min(image.height - 1));
+            let part = tile * across..(tile + 1) * across;
+            simd.tile_range(
+                [row(0), row(1), row(2), row(3)],
+                &mut self.low[part.clone()],
+                &mut self.high[part],
+            );
+        }
+        widen(&self.low, &mut self.wide_low, &mut self.scratch, across, u8::min);
+        widen(&self.high, &mut self.wide_high, &mut self.scratch, across, u8::max);
+    }
+
+    /// Marks pixels below `fraction`/256 of the way from the local minimum to the local maximum, where
+    /// these are at least `gate` apart; elsewhere nothing is dark.
+    pub fn mark(&mut self, image: ImageView<'_>, gate: u8, fraction: u16, out: &mut Bitmap, simd: Simd) {
+        let (across, down) = self.tiles;
+        self.thresholds.resize(across * down, 0);
+        for ((t, &low), &high) in self.thresholds.iter_mut().zip(&self.wide_low).zip(&self.wide_high) {
+            let range = high - low;
+            let above = (u16::from(range) * fraction + 128) >> 8;
+            *t = if range >= gate { low + above as u8 } else { 0 };
+        }
+        let per_row = image.width.div_ceil(64);
+        (out.width, out.height) = (image.width, image.height);
+        out.words.resize(per_row * image.height, 0);
+        for (v, words) in out.words.chunks_exact_mut(per_row).enumerate() {
+            let tile = v / TILE;
+            simd.pack_below(image.row(v), &self.thresholds[tile * across..(tile + 1) * across], words);
+        }
+    }
+}
+
+/// Extreme over 3×3 tiles.
+fn widen(from: &[u8], to: &mut [u8], scratch: &mut Vec<u8>, across: usize, pick: impl Fn(u8, u8) -> u8) {
+    let down = from.len() / across;
+    scratch.resize(across, 0);
+    for tile in 0..down {
+        let row = |t: usize| &from[t * across..(t + 1) * across];
+        let (above, here, below) = (row(tile.saturating_sub(1)), row(tile), row((tile + 1).min(down - 1)));
+        for (((s, &a), &b), &c) in scratch.iter_mut().zip(above).zip(here).zip(below) {
+            *s = pick(pick(a, b), c);
+        }
+        let to = &mut to[tile * across..(tile + 1) * across];
+        to[0] = pick(scratch[0], scratch[1.min(across - 1)]);
+        to[across - 1] = pick(scratch[across - 1], scratch[across.saturating_sub(2)]);
+        if across > 2 {
+            for (t, s) in to[1..across - 1].iter_mut().zip(scratch.windows(3)) {
+                *t = pick(pick(s[0], s[1]), s[2]);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::msg::GrayImage;
+
+    #[test]
+    fn a_dark_square_on_light_ground_is_marked() {
+        let mut image = GrayImage::from_vec(40, 30, vec![200; 1200]).expect("size");
+        for v in 10..18 {
+            (12..22).for_each(|u| image.data[v * 40 + u] = 20);
+        }
+        let (mut binariser, mut bits) = (Binariser::default(), Bitmap::default());
+        binariser.measure(image.view(), Simd::best());
+        binariser.mark(image.view(), 30, 128, &mut bits, Simd::best());
+        for v in 0..30 {
+            for u in 0..40 {
+                let dark = bits.row(v)[u / 64] >> (u % 64) & 1 == 1;
+                assert_eq!(dark, image.data[v * 40 + u] == 20, "({u}, {v})");
+            }
+        }
+        binariser.mark(image.view(), 190, 128, &mut bits, Simd::best());
+        assert!((0..30).all(|v| bits.row(v)[0] == 0), "a gate above the contrast leaves nothing");
+    }
+}

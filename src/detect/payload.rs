@@ -1,0 +1,122 @@
+//! What a quadrilateral says: its cells sampled, told white from black, and looked up.
+
+use super::family::{Family, Word};
+use super::homography::{Homography, narrow, wide};
+use super::pyramid::{Pyramid, level_from_frame};
+use super::quad::{Quad, bilinear, distance};
+use crate::msg::ImageView;
+
+/// Largest grid side: tag36h11 with its ring.
+const MOST: usize = 10;
+
+/// A word read from a quadrilateral.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(super) struct Reading {
+    pub word: Word,
+    /// Mean distance of the cells from the threshold, of the white or the black ones, whichever is less.
+    pub margin: f32,
+}
+
+/// Least step from black border to white ring, grey levels.
+const LEAST_CONTRAST: f32 = 8.0;
+
+/// Share of border and ring cells that may lie on the wrong side of the threshold.
+const MOST_WRONG_BORDER: f32 = 0.2;
+
+/// Grey values of the grid of cells of a tag.
+struct Grid {
+    side: usize,
+    pad: usize,
+    values: [f32; MOST * MOST],
+}
+
+impl Grid {
+    fn sample(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family: &Family) -> Option<Self> {
+        let h = Homography::of_square(family.width as f64, &wide(quad))?;
+        let edge = (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).sum::<f32>() / 4.0;
+        // Averaging over the cell: the level in which a cell is two to four pixels wide.
+        let cell = edge / family.width as f32;
+        let level = ((cell / 2.2).max(1.0).log2() as usize).min(pyramid.top());
+        let image = pyramid.level(image, level);
+        let (side, pad) = (family.grid_side(), family.pad);
+        let mut values = [0.0; MOST * MOST];
+        for y in 0..side {
+            for x in 0..side {
+                let centre = |k: usize| k as f64 + 0.5 - pad as f64;
+                let p = narrow(h.apply(centre(x), centre(y)));
+                values[y * side + x] = bilinear(image, p.map(|c| level_from_frame(c, level)));
+            }
+        }
+        Some(Self { side, pad, values })
+    }
+
+    /// Grid indices of the ring of cells `out` cells outside the border (−1: the border itself... 0).
+    fn ring(&self, out: usize) -> impl Iterator<Item = usize> + use<> {
+        let (side, low) = (self.side, self.pad - out);
+        let high = side - 1 - low;
+        (low..=high).flat_map(move |y| (low..=high).map(move |x| (x, y))).filter_map(move |(x, y)| {
+            (x == low || x == high || y == low || y == high).then_some(y * side + x)
+        })
+    }
+
+    /// Plane `a + b x + c y` through the values of a ring, x and y from the grid's middle.
+    fn plane(&self, out: usize) -> [f32; 3] {
+        let middle = (self.side - 1) as f32 / 2.0;
+        let (mut n, mut sum, mut sx, mut sy, mut sxx) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        for i in self.ring(out) {
+            let (x, y) = ((i % self.side) as f32 - middle, (i / self.side) as f32 - middle);
+            let value = self.values[i];
+            n += 1.0;
+            sum += value;
+            sx += x * value;
+            sy += y * value;
+            sxx += x * x;
+        }
+        [sum / n, sx / sxx, sy / sxx]
+    }
+
+    /// Threshold halfway between a plane through the black border and one through the white ring.
+    fn plane_threshold(&self) -> Option<[f32; MOST * MOST]> {
+        let (black, white) = (self.plane(0), self.plane(1));
+        if white[0] - black[0] < LEAST_CONTRAST {
+            return None;
+        }
+        let middle = (self.side - 1) as f32 / 2.0;
+        let mut thresholds = [0.0; MOST * MOST];
+        for (i, t) in thresholds.iter_mut().enumerate().take(self.side * self.side) {
+            let (x, y) = ((i % self.side) as f32 - middle, (i / self.side) as f32 - middle);
+            let at = |p: [f32; 3]| p[0] + p[1] * x + p[2] * y;
+            *t = 0.5 * (at(black) + at(white));
+        }
+        Some(thresholds)
+    }
+
+    fn read(&self, thresholds: &[f32; MOST * MOST], family: &Family) -> Option<Reading> {
+        let cells = self.side * self.side;
+        let mut bits = [false; MOST * MOST];
+        for i in 0..cells {
+            bits[i] = self.values[i] > thresholds[i];
+        }
+        let wrong = self.ring(0).filter(|&i| bits[i]).count() + self.ring(1).filter(|&i| !bits[i]).count();
+        let all = self.ring(0).count() + self.ring(1).count();
+        if wrong as f32 > MOST_WRONG_BORDER * all as f32 {
+            return None;
+        }
+        let word = family.find(&bits[..cells])?;
+        let (mut white, mut black) = ((0.0, 0.0), (0.0, 0.0));
+        for i in 0..cells {
+            let sum = if bits[i] { &mut white } else { &mut black };
+            sum.0 += (self.values[i] - thresholds[i]).abs();
+            sum.1 += 1.0f32;
+        }
+        let mean = |s: (f32, f32)| s.0 / s.1.max(1.0);
+        Some(Reading { word, margin: mean(white).min(mean(black)) })
+    }
+}
+
+/// Reads a quadrilateral given in frame coordinates.
+pub(super) fn read(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family: &Family) -> Option<Reading> {
+    let grid = Grid::sample(image, pyramid, quad, family)?;
+    let thresholds = grid.plane_threshold()?;
+    grid.read(&thresholds, family)
+}

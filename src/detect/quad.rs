@@ -1,0 +1,228 @@
+//! Quadrilaterals from the outlines of dark regions, and the cheap reasons to refuse one.
+
+use super::components::{Component, Outline};
+use crate::msg::ImageView;
+
+/// A point (u, v), pixels.
+pub(super) type Point = [f32; 2];
+
+/// Corners of a quadrilateral, clockwise as seen (u right, v down).
+pub(super) type Quad = [Point; 4];
+
+/// What sizes are looked for in one level, pixels of that level.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(super) struct SizeLimits {
+    /// Smallest mean edge.
+    pub least: f32,
+    /// Largest mean edge.
+    pub most: f32,
+}
+
+/// Shortest side over longest at which a square is still read: 70° off its normal, and blur.
+const LEAST_ASPECT: f32 = 0.25;
+
+/// Whether a component can be a tag's border, by box and area alone.
+pub(super) fn may_be_border(c: &Component, limits: SizeLimits, width: usize, height: usize) -> bool {
+    let (w, h) = (c.width() as f32, c.height() as f32);
+    let (short, long) = (w.min(h), w.max(h));
+    // A square's box is 1 to √2 of its edge; blur and threshold may eat a pixel.
+    let size_fits = long + 1.0 >= limits.least && short <= 1.5 * limits.most;
+    let shape_fits =
+        short >= LEAST_ASPECT * limits.least && short >= LEAST_ASPECT * 0.8 * long && short >= 4.0;
+    // A ring a sixth of the edge wide, turned by 45°, fills a quarter of its box.
+    let fill_fits = c.area as f32 >= 0.15 * w * h;
+    let inside =
+        c.left > 0 && c.top > 0 && usize::from(c.right) + 1 < width && usize::from(c.bottom) + 1 < height;
+    size_fits && shape_fits && fill_fits && inside
+}
+
+/// Finds quadrilaterals in outlines; keeps its buffers.
+#[derive(Clone, Debug, Default)]
+pub(super) struct QuadFinder {
+    hull: Vec<Point>,
+}
+
+impl QuadFinder {
+    /// The quadrilateral that a component's hull nearly is, half a pixel outside the centres of its
+    /// outermost pixels; `None` where the hull is of another shape.
+    pub fn quad(&mut self, component: &Component, outline: Outline<'_>) -> Option<Quad> {
+        self.find_hull(component, outline);
+        let hull_area = polygon_area(&self.hull);
+        let quad = largest_quad(&self.hull)?;
+        let quad_area = polygon_area(&quad);
+        // Corners are blunt by about a pixel: allow their area, and a tenth for bent edges.
+        if quad_area < 6.0 || quad_area < 0.9 * hull_area - 6.0 {
+            return None;
+        }
+        let quad = grow(&quad, 0.5)?;
+        let sides: [f32; 4] = std::array::from_fn(|i| distance(quad[i], quad[(i + 1) % 4]));
+        let longest = sides.iter().fold(0.0, |a: f32, &b| a.max(b));
+        let shortest = sides.iter().fold(f32::MAX, |a, &b| a.min(b));
+        (shortest >= LEAST_ASPECT * longest).then_some(quad)
+    }
+
+    /// Convex hull, clockwise: down the right side, up the left.
+    fn find_hull(&mut self, component: &Component, outline: Outline<'_>) {
+        self.hull.clear();
+        let rows = outline.iter().enumerate();
+        let points = |pick: fn(&(u16, u16)) -> u16| {
+            rows.clone().map(move |(i, lr)| [f32::from(pick(lr)), (usize::from(component.top) + i) as f32])
+        };
+        for point in points(|lr| lr.1) {
+            push_hull(&mut self.hull, 0, point);
+        }
+        let turn = self.hull.len();
+        for point in points(|lr| lr.0).rev() {
+            push_hull(&mut self.hull, turn, point);
+        }
+    }
+}
+
+/// Adds a point to a convex chain that starts at `from`.
+fn push_hull(hull: &mut Vec<Point>, from: usize, point: Point) {
+    while hull.len() >= from + 2 && cross(hull[hull.len() - 2], hull[hull.len() - 1], point) <= 0.0 {
+        hull.pop();
+    }
+    hull.push(point);
+}
+
+/// Twice the signed area of a triangle: positive where `c` is to the right of `a → b` as seen.
+fn cross(a: Point, b: Point, c: Point) -> f32 {
+    (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+}
+
+pub(super) fn distance(a: Point, b: Point) -> f32 {
+    (a[0] - b[0]).hypot(a[1] - b[1])
+}
+
+/// Area of a polygon, positive where its points run clockwise as seen.
+pub(super) fn polygon_area(points: &[Point]) -> f32 {
+    let Some(&last) = points.last() else { return 0.0 };
+    let mut previous = last;
+    let mut sum = 0.0;
+    for &p in points {
+        sum += previous[0] * p[1] - previous[1] * p[0];
+        previous = p;
+    }
+    0.5 * sum
+}
+
+/// The largest quadrilateral with corners among hull points: the farthest point from the middle, the
+/// farthest from that, the farthest to either side; then each corner in turn moves to where it adds most.
+fn largest_quad(hull: &[Point]) -> Option<Quad> {
+    if hull.len() < 4 {
+        return None;
+    }
+    let n = hull.len() as f32;
+    let middle = hull.iter().fold([0.0, 0.0], |m: Point, p| [m[0] + p[0] / n, m[1] + p[1] / n]);
+    let a = farthest(hull, |p| distance(p, middle));
+    let c = farthest(hull, |p| distance(p, a));
+    let b = farthest(hull, |p| -cross(a, c, p));
+    let d = farthest(hull, |p| cross(a, c, p));
+    let mut quad = [a, b, c, d];
+    for _ in 0..2 {
+        for i in 0..4 {
+            let (before, after) = (quad[(i + 3) % 4], quad[(i + 1) % 4]);
+            quad[i] = farthest(hull, |p| -cross(before, after, p));
+        }
+    }
+    let convex = (0..4).all(|i| cross(quad[i], quad[(i + 1) % 4], quad[(i + 2) % 4]) > 0.0);
+    convex.then_some(quad)
+}
+
+fn farthest(hull: &[Point], measure: impl Fn(Point) -> f32) -> Point {
+    let mut best = (hull[0], f32::MIN);
+    for &p in hull {
+        let m = measure(p);
+        if m > best.1 {
+            best = (p, m);
+        }
+    }
+    best.0
+}
+
+/// Moves every side outwards by `by` pixels.
+pub(super) fn grow(quad: &Quad, by: f32) -> Option<Quad> {
+    let lines = std::array::from_fn(|i| {
+        let line = Line::through(quad[i], quad[(i + 1) % 4]);
+        Line { c: line.c + by, ..line }
+    });
+    corners_of(&lines)
+}
+
+/// `n · p = c` with a unit normal that points out of a clockwise quadrilateral.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(super) struct Line {
+    pub n: Point,
+    pub c: f32,
+}
+
+impl Line {
+    /// Through two corners that follow each other clockwise.
+    pub fn through(a: Point, b: Point) -> Self {
+        let length = distance(a, b).max(1e-6);
+        let n = [(b[1] - a[1]) / length, -(b[0] - a[0]) / length];
+        Self { n, c: n[0] * a[0] + n[1] * a[1] }
+    }
+
+    fn meet(&self, other: &Self) -> Option<Point> {
+        let det = self.n[0] * other.n[1] - self.n[1] * other.n[0];
+        (det.abs() > 0.05).then(|| {
+            [
+                (self.c * other.n[1] - other.c * self.n[1]) / det,
+                (self.n[0] * other.c - other.n[0] * self.c) / det,
+            ]
+        })
+    }
+}
+
+/// The corners at which side `i − 1` meets side `i`.
+pub(super) fn corners_of(lines: &[Line; 4]) -> Option<Quad> {
+    let mut quad = [[0.0; 2]; 4];
+    for i in 0..4 {
+        quad[i] = lines[(i + 3) % 4].meet(&lines[i])?;
+    }
+    Some(quad)
+}
+
+/// How many of 16 pairs of pixels across a quadrilateral's sides are darker inside by `least`, and
+/// how many are lighter inside by as much.
+///
+/// `reach` is how far inside and outside the side the pairs lie, pixels.
+pub(super) fn border_votes(image: ImageView<'_>, quad: &Quad, reach: f32, least: i32) -> (u32, u32) {
+    let (mut right, mut wrong) = (0, 0);
+    for i in 0..4 {
+        let (a, b) = (quad[i], quad[(i + 1) % 4]);
+        let n = Line::through(a, b).n;
+        for t in [0.2, 0.4, 0.6, 0.8] {
+            let at = [a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])];
+            let pixel = |d: f32| nearest(image, [at[0] + d * n[0], at[1] + d * n[1]]);
+            if let (Some(inside), Some(outside)) = (pixel(-reach), pixel(reach)) {
+                let step = i32::from(outside) - i32::from(inside);
+                right += u32::from(step >= least);
+                wrong += u32::from(-step >= least);
+            }
+        }
+    }
+    (right, wrong)
+}
+
+fn nearest(image: ImageView<'_>, [u, v]: Point) -> Option<u8> {
+    let (u, v) = (u + 0.5, v + 0.5);
+    (u >= 0.0 && v >= 0.0 && (u as usize) < image.width && (v as usize) < image.height)
+        .then(|| image.data[v as usize * image.stride + u as usize])
+}
+
+/// Bilinear pixel value; coordinates are clamped to the image.
+pub(super) fn bilinear(image: ImageView<'_>, [u, v]: Point) -> f32 {
+    let (u, v) = (u.clamp(0.0, (image.width - 1) as f32), v.clamp(0.0, (image.height - 1) as f32));
+    let (iu, iv) = ((u as usize).min(image.width.max(2) - 2), (v as usize).min(image.height.max(2) - 2));
+    let (fu, fv) = (u - iu as f32, v - iv as f32);
+    let at = iv * image.stride + iu;
+    let right = usize::from(image.width > 1);
+    let down = if image.height > 1 { image.stride } else { 0 };
+    let p = |offset: usize| f32::from(image.data[at + offset]);
+    let top = p(0) + fu * (p(right) - p(0));
+    let bottom = p(down) + fu * (p(down + right) - p(down));
+    top + fv * (bottom - top)
+}

@@ -1,0 +1,31 @@
+//! Scalar kernels: the definition of what the vector ones compute.
+
+use super::TILE;
+
+pub(super) fn halve_rows(above: &[u8], below: &[u8], to: &mut [u8]) {
+    for ((to, a), b) in to.iter_mut().zip(above.chunks_exact(2)).zip(below.chunks_exact(2)) {
+        let sum = u16::from(a[0]) + u16::from(a[1]) + u16::from(b[0]) + u16::from(b[1]);
+        *to = ((sum + 2) >> 2) as u8;
+    }
+}
+
+pub(super) fn tile_range(rows: [&[u8]; TILE], low: &mut [u8], high: &mut [u8]) {
+    for (tile, (low, high)) in low.iter_mut().zip(high).enumerate() {
+        let (mut least, mut most) = (u8::MAX, 0);
+        for row in rows {
+            for &p in &row[tile * TILE..row.len().min((tile + 1) * TILE)] {
+                least = least.min(p);
+                most = most.max(p);
+            }
+        }
+        (*low, *high) = (least, most);
+    }
+}
+
+pub(super) fn pack_below(row: &[u8], thresholds: &[u8], words: &mut [u64]) {
+    for (word, pixels) in words.iter_mut().zip(row.chunks(64)).enumerate().map(|(i, p)| ((i, p.0), p.1)) {
+        let (index, word) = word;
+        let tiles = &thresholds[index * (64 / TILE)..];
+        *word = pixels.iter().enumerate().fold(0, |bits, (u, &p)| bits | u64::from(p < tiles[u / TILE]) << u);
+    }
+}

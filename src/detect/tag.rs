@@ -1,0 +1,222 @@
+//! The tag detector: from an image to tags with their corners.
+
+use super::binarise::{Binariser, Bitmap};
+use super::components::Labeller;
+use super::edges::{EdgeSearch, fit_sides};
+use super::family::Family;
+use super::payload;
+use super::pyramid::{Pyramid, frame_from_level};
+use super::quad::{Quad, QuadFinder, SizeLimits, border_votes, distance, may_be_border};
+use super::simd::Simd;
+use crate::config::TagFamily;
+use crate::msg::{GrayImage, ImageView, MarkerDetection, MarkerId};
+use nalgebra::{Matrix2, Vector2};
+
+/// Finds square tags; keeps its buffers from frame to frame.
+#[derive(Clone, Debug)]
+pub struct TagDetector {
+    families: Vec<Family>,
+    min_px: f32,
+    simd: Simd,
+    pyramid: Pyramid,
+    binariser: Binariser,
+    bits: Bitmap,
+    labeller: Labeller,
+    finder: QuadFinder,
+    found: Vec<Found>,
+    negative: GrayImage,
+}
+
+/// Part of a frame, pixels.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Region {
+    /// Leftmost column.
+    pub u: usize,
+    /// Topmost row.
+    pub v: usize,
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+}
+
+impl Region {
+    /// The part of an image within `radius` of a point; `None` where nothing of it is inside.
+    pub fn around(image: ImageView<'_>, center: Vector2<f64>, radius: f64) -> Option<Self> {
+        let span = |c: f64, size: usize| {
+            let low = (c - radius).floor().max(0.0);
+            let high = (c + radius).ceil().min(size as f64 - 1.0);
+            (low <= high).then(|| (low as usize, (high - low) as usize + 1))
+        };
+        let (u, width) = span(center.x, image.width)?;
+        let (v, height) = span(center.y, image.height)?;
+        Some(Self { u, v, width, height })
+    }
+}
+
+/// A decoded tag.
+#[derive(Clone, Copy, PartialEq, Debug)]
+struct Found {
+    family: TagFamily,
+    id: u32,
+    hamming: u8,
+    margin: f32,
+    /// In the tag's own order.
+    corners: Quad,
+    edge: f32,
+}
+
+/// Where between the local minimum and maximum the two binarisations divide, of 256. The lower keeps
+/// a border whole where a shadow's edge crosses the tag, the upper one that is thin and blurred.
+const FRACTIONS: [u16; 2] = [85, 128];
+
+/// Smallest edge in a level at which a border can be told from its surroundings, pixels.
+const LEAST_EDGE_IN_LEVEL: f32 = 12.0;
+
+/// Largest image, pixels on a side.
+pub const LARGEST_IMAGE_PX: usize = 32_767;
+
+impl TagDetector {
+    /// For tags of these families whose black square's edge is at least `min_px` pixels; corrects at most
+    /// `max_hamming` wrong bits, less for families with few bits.
+    pub fn new(families: &[TagFamily], min_px: f64, max_hamming: u8) -> Self {
+        Self {
+            families: families.iter().map(|&f| Family::new(f, max_hamming)).collect(),
+            min_px: min_px as f32,
+            simd: Simd::best(),
+            pyramid: Pyramid::default(),
+            binariser: Binariser::default(),
+            bits: Bitmap::default(),
+            labeller: Labeller::default(),
+            finder: QuadFinder::default(),
+            found: Vec::new(),
+            negative: GrayImage::default(),
+        }
+    }
+
+    /// The same with other kernels, for comparison.
+    pub fn with_simd(self, simd: Simd) -> Self {
+        Self { simd, ..self }
+    }
+
+    /// Looks for tags from this edge on, pixels, from now on.
+    pub fn set_min_px(&mut self, min_px: f64) {
+        self.min_px = min_px as f32;
+    }
+
+    /// Appends every tag found in the part of an image at (u, v), in coordinates of the whole.
+    pub fn detect_region(&mut self, image: ImageView<'_>, region: Region, out: &mut Vec<MarkerDetection>) {
+        let first = out.len();
+        self.detect(image.crop(region.u, region.v, region.width, region.height), out);
+        let shift = Vector2::new(region.u as f64, region.v as f64);
+        for found in &mut out[first..] {
+            found.center_px += shift;
+            if let Some(corners) = &mut found.corners_px {
+                corners.iter_mut().for_each(|c| *c += shift);
+            }
+        }
+    }
+
+    /// Appends every tag found in an image. Images over [`LARGEST_IMAGE_PX`] hold none.
+    pub fn detect(&mut self, image: ImageView<'_>, out: &mut Vec<MarkerDetection>) {
+        let sides = [image.width, image.height];
+        if sides.iter().any(|s| !(1..=LARGEST_IMAGE_PX).contains(s)) {
+            return;
+        }
+        self.found.clear();
+        if self.families.iter().any(|f| !f.inverted) {
+            self.search(image, false);
+        }
+        if self.families.iter().any(|f| f.inverted) {
+            let mut negative = std::mem::take(&mut self.negative);
+            negate(image, &mut negative);
+            self.search(negative.view(), true);
+            self.negative = negative;
+        }
+        out.extend(self.found.iter().map(detection));
+    }
+
+    /// Searches an image, or its negative for the families whose border is light.
+    fn search(&mut self, image: ImageView<'_>, inverted: bool) {
+        self.pyramid.build(image, 16, self.simd);
+        let base = if self.min_px >= 2.0 * LEAST_EDGE_IN_LEVEL { 1 } else { 0 };
+        for level in (base..=(base + 2).min(self.pyramid.top())).rev() {
+            self.search_level(image, level, inverted);
+        }
+    }
+
+    fn search_level(&mut self, image: ImageView<'_>, level: usize, inverted: bool) {
+        let scale = (1u32 << level) as f32;
+        let limits = SizeLimits { least: (self.min_px / scale).max(8.0), most: f32::MAX };
+        let at_level = self.pyramid.level(image, level);
+        let (width, height) = (at_level.width, at_level.height);
+        self.binariser.measure(at_level, self.simd);
+        let gate = 20;
+        for fraction in FRACTIONS {
+            self.binariser.mark(at_level, gate, fraction, &mut self.bits, self.simd);
+            self.labeller.label(&self.bits, |c| may_be_border(c, limits, width, height));
+            for (component, outline) in self.labeller.kept() {
+                let Some(quad) = self.finder.quad(component, outline) else { continue };
+                let edge = (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).sum::<f32>() / 4.0;
+                let reach = (edge / 16.0).clamp(0.8, 4.0);
+                let (right, _) = border_votes(at_level, &quad, reach, i32::from(gate) / 3);
+                if right < 12 {
+                    continue;
+                }
+                let search =
+                    EdgeSearch { reach: (edge / 8.0).clamp(1.5, 3.0), least_step: f32::from(gate) / 3.0 };
+                let Some(quad) = fit_sides(at_level, &quad, search) else { continue };
+                let quad = quad.map(|p| p.map(|c| frame_from_level(c, level)));
+                if self.found.iter().any(|f| same_place(&f.corners, &quad)) {
+                    continue;
+                }
+                for family in self.families.iter().filter(|f| f.inverted == inverted) {
+                    if let Some(found) = decode(image, &self.pyramid, &quad, family) {
+                        self.found.push(found);
+                        break;
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn negate(image: ImageView<'_>, to: &mut GrayImage) {
+    (to.width, to.height, to.stride) = (image.width, image.height, image.width);
+    to.data.clear();
+    (0..image.height).for_each(|v| to.data.extend(image.row(v).iter().map(|p| !p)));
+}
+
+fn decode(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family: &Family) -> Option<Found> {
+    let reading = payload::read(image, pyramid, quad, family)?;
+    let corners: Quad = std::array::from_fn(|i| quad[(i + reading.word.turns) % 4]);
+    Some(Found {
+        family: family.family,
+        id: reading.word.id,
+        hamming: reading.word.hamming,
+        margin: reading.margin,
+        corners,
+        edge: (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).sum::<f32>() / 4.0,
+    })
+}
+
+/// Whether two quadrilaterals are of one tag.
+fn same_place(a: &Quad, b: &Quad) -> bool {
+    let centre = |q: &Quad| [0, 1].map(|k| q.iter().map(|p| p[k]).sum::<f32>() / 4.0);
+    distance(centre(a), centre(b)) < 0.2 * distance(a[0], a[2])
+}
+
+fn detection(found: &Found) -> MarkerDetection {
+    let corners = found.corners.map(|p| Vector2::new(f64::from(p[0]), f64::from(p[1])));
+    let center = corners.iter().sum::<Vector2<f64>>() / 4.0;
+    MarkerDetection {
+        marker: MarkerId::Tag { family: found.family, id: found.id },
+        center_px: center,
+        center_cov_px2: Matrix2::identity() * 0.01,
+        corners_px: Some(corners),
+        corner_cov_px2: [Matrix2::identity() * 0.01; 4],
+        hamming: found.hamming,
+        margin: found.margin,
+        size_px: f64::from(found.edge),
+    }
+}
