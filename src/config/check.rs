@@ -62,6 +62,7 @@ impl Config {
             within("datum.height_m", datum.height_m, -1_000.0, 20_000.0)?;
         }
         self.check_targets()?;
+        self.check_daemon()?;
         within("detector.min_px", self.detector.min_px, 8.0, 1_000.0)?;
         within("detector.max_hamming", f64::from(self.detector.max_hamming), 0.0, 3.0)?;
         within("detector.ground_features", self.detector.ground_features as f64, 0.0, 64.0)?;
@@ -189,6 +190,18 @@ impl Config {
         within("camera.mount.yaw_deg", camera.mount.yaw_deg, -180.0, 180.0)?;
         within("camera.mount.pitch_deg", camera.mount.pitch_deg, -90.0, 90.0)?;
         within("camera.mount.roll_deg", camera.mount.roll_deg, -180.0, 180.0)
+    }
+
+    fn check_daemon(&self) -> Result<(), ConfigError> {
+        within("daemon.answer_within_s", self.daemon.answer_within_s, 1.0, 600.0)?;
+        within("daemon.frame_queue", self.daemon.frame_queue as f64, 1.0, 30.0)?;
+        within("daemon.jpeg_quality", f64::from(self.daemon.jpeg_quality), 1.0, 100.0)?;
+        if let Some(volts) = self.power.low_voltage_v {
+            within("power.low_voltage_v", volts, 0.1, 1_000.0)?;
+        }
+        within("power.hot_c", self.power.hot_c, -40.0, 200.0)?;
+        within("log.file_mb", self.log.file_mb, 0.01, 10_000.0)?;
+        within("log.files_kept", f64::from(self.log.files_kept), 0.0, 1_000.0)
     }
 
     fn check_targets(&self) -> Result<(), ConfigError> {

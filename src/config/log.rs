@@ -6,12 +6,73 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LogConfig {
-    /// Least severity shown: error, warn, info, debug or trace.
-    pub level: String,
+    /// Least severity shown: error, warn, info, debug or trace. Read again on SIGHUP.
+    pub level: LogLevel,
+    /// How lines look on standard error: `auto` speaks the journal's own protocol where standard error
+    /// is the journal, and text elsewhere.
+    pub format: LogFormat,
+    /// File the log is written to as well, for systems without a journal; none by default.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub file: Option<String>,
+    /// Size at which the file is put aside and a new one begun, megabytes.
+    pub file_mb: f64,
+    /// Files put aside that are kept.
+    pub files_kept: u32,
 }
 
 impl Default for LogConfig {
     fn default() -> Self {
-        Self { level: "info".into() }
+        Self {
+            level: LogLevel::Info,
+            format: LogFormat::Auto,
+            file: None,
+            file_mb: 10.0,
+            files_kept: 4,
+        }
     }
+}
+
+/// Severities, the gravest first.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LogLevel {
+    /// Something does not work and needs a person.
+    Error,
+    /// Something does not work and is being dealt with.
+    Warn,
+    /// What an operator wants to see in normal flight.
+    #[default]
+    Info,
+    /// Details for finding out why.
+    Debug,
+    /// Everything.
+    Trace,
+}
+
+impl LogLevel {
+    /// Its name in configuration and log.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Error => "error",
+            Self::Warn => "warn",
+            Self::Info => "info",
+            Self::Debug => "debug",
+            Self::Trace => "trace",
+        }
+    }
+}
+
+/// How lines look on standard error.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LogFormat {
+    /// The journal's protocol where standard error is the journal, else text.
+    #[default]
+    Auto,
+    /// logfmt: `key=value` words.
+    Text,
+    /// One JSON object a line.
+    Json,
+    /// The journal's protocol.
+    Journal,
 }

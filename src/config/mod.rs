@@ -4,6 +4,7 @@
 //! Angles are degrees here, as people write them; each section converts where it is used.
 
 mod check;
+mod daemon;
 mod estimator;
 mod link;
 mod log;
@@ -13,9 +14,10 @@ mod store;
 mod target;
 
 pub use check::ConfigError;
+pub use daemon::{DaemonConfig, Part, PowerConfig};
 pub use estimator::{DetectorConfig, EstimatorConfig};
 pub use link::{LinkConfig, MavlinkConfig};
-pub use log::LogConfig;
+pub use log::{LogConfig, LogFormat, LogLevel};
 pub use montecarlo::{Distribution, MonteCarloConfig};
 pub use sensors::{
     CameraConfig, CameraMount, CompassConfig, CompassFormat, Datum, Declination, GpsConfig, GroundConfig,
@@ -61,6 +63,12 @@ pub struct Config {
     /// The operator's log.
     #[serde(default)]
     pub log: LogConfig,
+    /// Running unattended.
+    #[serde(default)]
+    pub daemon: DaemonConfig,
+    /// Supply voltage and temperature.
+    #[serde(default)]
+    pub power: PowerConfig,
     /// The error analysis of `windhover montecarlo`.
     #[serde(default)]
     pub montecarlo: MonteCarloConfig,

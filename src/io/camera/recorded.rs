@@ -7,9 +7,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::CameraSettings;
+use crate::io::capture::CaptureReader;
 use crate::io::clock::HostClock;
 use crate::io::device::{Fault, FaultKind, NAP, NoteKind, RawFrame, Report, Stop};
-use crate::msg::FrameEncoding;
+use crate::msg::{EventBody, FrameEncoding};
 use crate::time::{MonoTime, Span};
 
 /// A recorded frame and when it was delivered, both on the recording's own clock.
@@ -82,7 +83,23 @@ fn wait_until(due: MonoTime, clock: HostClock, stop: &Stop, tell: &dyn Fn(Report
 }
 
 fn open(path: &Path) -> Result<Box<dyn Iterator<Item = Recorded>>, String> {
-    Ok(Box::new(folder(path)?))
+    if path.join(TIMES).is_file() {
+        return Ok(Box::new(folder(path)?));
+    }
+    let reader = CaptureReader::open(path).map_err(|error| error.to_string())?;
+    Ok(Box::new(reader.filter_map(|item| {
+        let event = item.event?;
+        let EventBody::Frame(frame) = event.body else { return None };
+        let frame = RawFrame {
+            t_exposure: frame.t_exposure,
+            encoding: frame.encoding,
+            width: frame.width,
+            height: frame.height,
+            stride: frame.stride,
+            data: frame.data,
+        };
+        Some(Recorded { t_recv: event.t_recv, frame })
+    })))
 }
 
 /// The list of a folder's images: `time_s,file`, a row an image, after a header row.
@@ -170,18 +187,13 @@ mod tests {
         };
         let stop = Stop::default();
         let frames = RefCell::new(Vec::new());
-        let fault = play(
-            &folder.path().to_string_lossy(),
-            &settings,
-            false,
-            HostClock::start(),
-            &stop,
-            &|r| match r {
+        let fault = play(&folder.path().to_string_lossy(), &settings, false, HostClock::start(), &stop, &|r| {
+            match r {
                 Report::Frame(t, frame) => frames.borrow_mut().push((t, frame)),
                 Report::Note(NoteKind::PlayedOut, ..) => stop.ask(),
                 _ => {}
-            },
-        );
+            }
+        });
 
         // Then two frames came, as far apart as they were recorded.
         assert!(fault.is_none());

@@ -1,0 +1,196 @@
+//! The health line: everything an operator wants to see, once a second, on one line.
+
+use crate::config::{Config, LogLevel};
+use crate::msg::{FixKind, TrackStatus};
+use crate::pipeline::{Health, SourceHealth, TargetHealth};
+use crate::time::Span;
+
+use super::log::{Line, Value};
+
+/// Figures that only a running daemon has.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct Figures {
+    /// Exposure to estimate, median, of the last ten seconds.
+    pub latency_p50: Option<Span>,
+    /// Exposure to estimate, 99 of 100.
+    pub latency_p99: Option<Span>,
+    /// State of the data card in a word, and its figures.
+    pub card: CardFigures,
+    /// State of the link in a word.
+    pub link: String,
+    /// Temperature, degrees Celsius.
+    pub temperature_c: Option<f64>,
+    /// Supply voltage, volts.
+    pub voltage_v: Option<f64>,
+    /// Share of one core this process used in the last second, percent.
+    pub cpu_percent: Option<f64>,
+    /// Resident memory, megabytes.
+    pub memory_mb: Option<f64>,
+    /// Whether something here deserves a warning.
+    pub warn: bool,
+}
+
+/// How the data card does.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct CardFigures {
+    /// `ok`, `off`, `full`, `failed`, ….
+    pub state: String,
+    /// Free space, megabytes.
+    pub free_mb: Option<f64>,
+    /// Time to make a second's data safe, 99 of 100.
+    pub sync_p99: Option<Span>,
+    /// Messages that could not be kept since the start.
+    pub dropped: u64,
+}
+
+/// The health line; `figures` where a daemon runs, none in replay.
+pub fn line(health: &Health, config: &Config, figures: Option<&Figures>) -> Line {
+    let mut line = Line::new(health.t, level(health, figures), "health");
+    line = gps(line, health);
+    line = source(line, "compass", &health.compass);
+    line = source(line, "camera", &health.camera);
+    for (target, name) in health.targets.iter().zip(config.target.iter().map(|t| t.name.as_str())) {
+        line = of_target(line, name, target);
+    }
+    let dropped = health.gps.dropped + health.compass.dropped + health.camera.dropped;
+    line = line.count("dropped", dropped);
+    match figures {
+        Some(figures) => of_daemon(line, figures),
+        None => line,
+    }
+}
+
+/// Normal flight is information; a silent source or a failing card is a warning.
+fn level(health: &Health, figures: Option<&Figures>) -> LogLevel {
+    let silent = |source: &SourceHealth| source.rate_hz <= 0.0;
+    let troubled = silent(&health.gps) || silent(&health.compass) || silent(&health.camera);
+    if troubled || figures.is_some_and(|f| f.warn) { LogLevel::Warn } else { LogLevel::Info }
+}
+
+fn gps(line: Line, health: &Health) -> Line {
+    let fix = match health.fix {
+        FixKind::None => "none",
+        FixKind::TwoD => "2d",
+        FixKind::ThreeD => "3d",
+    };
+    let line = source(line, "gps", &health.gps).with("fix", fix);
+    match health.sats {
+        Some(sats) => line.count("sats", u64::from(sats)),
+        None => line,
+    }
+}
+
+/// Rate, and the age where there is one: `gps=5.0Hz/0.12s`.
+fn source(line: Line, name: &str, health: &SourceHealth) -> Line {
+    let line = line.figure(format!("{name}_hz"), health.rate_hz, 1);
+    match health.age {
+        Some(age) => line.figure(format!("{name}_age_s"), age.s(), 2),
+        None => line,
+    }
+}
+
+fn of_target(line: Line, name: &str, target: &TargetHealth) -> Line {
+    let line = line
+        .with(name, target.last.status.name())
+        .count(format!("{name}_seen"), u64::from(target.frames_seen));
+    let Some(state) = target.last.state.filter(|_| target.last.status != TrackStatus::Lost) else {
+        return line;
+    };
+    let sigma = |index: usize| state.covariance.map_or(f64::NAN, |p| p[(index, index)].max(0.0).sqrt());
+    let estimate = |value: f64, sigma: f64, decimals| match sigma.is_finite() {
+        true => Value::Estimate(value, sigma, decimals),
+        false => Value::Figure(value, decimals),
+    };
+    let heading_deg = state.heading_rad.to_degrees().rem_euclid(360.0);
+    line.with("north_m", estimate(state.north_m, sigma(0), 2))
+        .with("east_m", estimate(state.east_m, sigma(1), 2))
+        .with("heading_deg", estimate(heading_deg, sigma(2).to_degrees(), 1))
+        .with("speed_mps", estimate(state.speed_mps, sigma(3), 2))
+        .with("yaw_rate_dps", estimate(state.yaw_rate_radps.to_degrees(), sigma(4).to_degrees(), 1))
+}
+
+fn of_daemon(mut line: Line, figures: &Figures) -> Line {
+    let span = |line: Line, name: &str, span: Option<Span>| match span {
+        Some(span) => line.figure(name, span.ms(), 1),
+        None => line,
+    };
+    let figure = |line: Line, name: &str, value: Option<f64>, decimals| match value {
+        Some(value) => line.figure(name, value, decimals),
+        None => line,
+    };
+    line = span(line, "latency_p50_ms", figures.latency_p50);
+    line = span(line, "latency_p99_ms", figures.latency_p99);
+    line = line.with("card", figures.card.state.as_str());
+    line = figure(line, "card_free_mb", figures.card.free_mb, 0);
+    line = span(line, "card_sync_p99_ms", figures.card.sync_p99);
+    if figures.card.dropped > 0 {
+        line = line.count("card_dropped", figures.card.dropped);
+    }
+    line = line.with("link", figures.link.as_str());
+    line = figure(line, "temp_c", figures.temperature_c, 1);
+    line = figure(line, "supply_v", figures.voltage_v, 2);
+    line = figure(line, "cpu_pct", figures.cpu_percent, 0);
+    figure(line, "mem_mb", figures.memory_mb, 0)
+}
+
+/// Latencies of the last frames.
+#[derive(Debug, Default)]
+pub struct Latencies {
+    recent: std::collections::VecDeque<Span>,
+}
+
+/// Ten seconds at thirty frames a second.
+const LATENCIES_KEPT: usize = 300;
+
+impl Latencies {
+    /// Takes one in.
+    pub fn push(&mut self, latency: Span) {
+        if self.recent.len() == LATENCIES_KEPT {
+            self.recent.pop_front();
+        }
+        self.recent.push_back(latency);
+    }
+
+    /// The smallest latency that `share` (0 to 1) of the frames kept.
+    pub fn quantile(&self, share: f64) -> Option<Span> {
+        let mut sorted: Vec<Span> = self.recent.iter().copied().collect();
+        sorted.sort_unstable();
+        let rank = (share * sorted.len() as f64).ceil() as usize;
+        sorted.get(rank.max(1) - 1).copied()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quantiles_are_ranks() {
+        let mut latencies = Latencies::default();
+        assert_eq!(latencies.quantile(0.5), None);
+        for ms in 1..=100 {
+            latencies.push(Span::from_ms(f64::from(ms)));
+        }
+        assert_eq!(latencies.quantile(0.5), Some(Span::from_ms(50.0)));
+        assert_eq!(latencies.quantile(0.99), Some(Span::from_ms(99.0)));
+        for _ in 0..LATENCIES_KEPT {
+            latencies.push(Span::from_ms(5.0));
+        }
+        assert_eq!(latencies.quantile(1.0), Some(Span::from_ms(5.0)));
+    }
+
+    #[test]
+    fn a_silent_source_is_a_warning() {
+        let config = crate::config::Config::parse(include_str!("../../config/windhover.toml")).expect("valid");
+        let up = SourceHealth { rate_hz: 5.0, age: Some(Span::from_ms(120.0)), ..SourceHealth::default() };
+        let mut health = Health { gps: up, compass: up, camera: up, ..Health::default() };
+        let text = line(&health, &config, None);
+        assert_eq!(text.level, LogLevel::Info);
+        assert!(text.text().contains("gps_hz=5.0 gps_age_s=0.12 fix=none"), "{}", text.text());
+        health.compass.rate_hz = 0.0;
+        let figures = Figures { link: "off".into(), temperature_c: Some(41.3), ..Figures::default() };
+        let text = line(&health, &config, Some(&figures));
+        assert_eq!(text.level, LogLevel::Warn);
+        assert!(text.text().contains("link=off temp_c=41.3"), "{}", text.text());
+    }
+}

@@ -1,0 +1,227 @@
+//! The pipeline's inbox: bounded, in order of time, the oldest frame dropped first.
+
+use std::collections::VecDeque;
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use crate::io::device::RawFrame;
+use crate::msg::{Event, EventBody, FramePayload, Source};
+use crate::time::MonoTime;
+
+/// Reads of the serial lines that wait: more than ten seconds' worth. A pipeline that is further
+/// behind than this does not answer, and the watchdog has it started again.
+const READS: usize = 8192;
+
+/// What devices delivered and the pipeline has not yet taken.
+///
+/// Events leave it in the order they were heard, numbered, and with times that never go back: what
+/// the pipeline handles is what is recorded, so a recording replays to the same estimates.
+#[derive(Debug)]
+pub struct Inbox {
+    lanes: Mutex<Lanes>,
+    filled: Condvar,
+    frames: usize,
+}
+
+#[derive(Debug, Default)]
+struct Lanes {
+    reads: VecDeque<(MonoTime, EventBody)>,
+    frames: VecDeque<(MonoTime, RawFrame)>,
+    dropped: [u32; 3],
+    last: Option<MonoTime>,
+    next_seq: u64,
+    next_frame: u32,
+}
+
+const SOURCES: [Source; 3] = [Source::Gps, Source::Compass, Source::Camera];
+
+fn slot(source: Source) -> usize {
+    match source {
+        Source::Gps => 0,
+        Source::Compass => 1,
+        Source::Camera => 2,
+    }
+}
+
+impl Inbox {
+    /// An inbox that holds so many frames.
+    pub fn new(frames: usize) -> Self {
+        Self { lanes: Mutex::default(), filled: Condvar::new(), frames: frames.max(1) }
+    }
+
+    /// Puts in bytes of a line, or that a source came or went.
+    pub fn put(&self, t_recv: MonoTime, body: EventBody) {
+        let mut lanes = self.lock();
+        if lanes.reads.len() >= READS
+            && let Some((_, oldest)) = lanes.reads.pop_front()
+            && let Some(source) = source_of(&oldest)
+        {
+            lanes.dropped[slot(source)] += 1;
+        }
+        lanes.reads.push_back((t_recv, body));
+        drop(lanes);
+        self.filled.notify_one();
+    }
+
+    /// Puts in a frame; where too many wait, the oldest goes.
+    pub fn put_frame(&self, t_recv: MonoTime, frame: RawFrame) {
+        let mut lanes = self.lock();
+        if lanes.frames.len() >= self.frames {
+            lanes.frames.pop_front();
+            lanes.dropped[slot(Source::Camera)] += 1;
+        }
+        lanes.frames.push_back((t_recv, frame));
+        drop(lanes);
+        self.filled.notify_one();
+    }
+
+    /// The next event in order of time; `None` where nothing came for `patience`.
+    pub fn take(&self, patience: Duration) -> Option<Event> {
+        let mut lanes = self.lock();
+        if lanes.is_empty() {
+            let waited = self.filled.wait_timeout_while(lanes, patience, |lanes| lanes.is_empty());
+            lanes = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+        lanes.next()
+    }
+
+    /// An event of the inbox's own making (time passing), numbered in order.
+    pub fn number(&self, t: MonoTime, body: EventBody) -> Event {
+        self.lock().number(t, body)
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Lanes> {
+        self.lanes.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn source_of(body: &EventBody) -> Option<Source> {
+    match body {
+        EventBody::GnssBytes(_) => Some(Source::Gps),
+        EventBody::CompassBytes(_) => Some(Source::Compass),
+        EventBody::Frame(_) => Some(Source::Camera),
+        _ => None,
+    }
+}
+
+impl Lanes {
+    fn is_empty(&self) -> bool {
+        self.reads.is_empty() && self.frames.is_empty()
+    }
+
+    fn next(&mut self) -> Option<Event> {
+        let read = self.reads.front().map(|(t, _)| *t);
+        let frame = self.frames.front().map(|(t, _)| *t);
+        let earliest = read.into_iter().chain(frame).min()?;
+        // What was lost is told first: it was older than what is still here.
+        if let Some(lost) = (0..SOURCES.len()).find(|&i| self.dropped[i] > 0) {
+            let count = std::mem::take(&mut self.dropped[lost]);
+            return Some(self.number(earliest, EventBody::Dropped { source: SOURCES[lost], count }));
+        }
+        if frame.is_some_and(|t| read.is_none_or(|read| t < read)) {
+            let (t, frame) = self.frames.pop_front()?;
+            let payload = self.payload(frame);
+            return Some(self.number(t, EventBody::Frame(payload)));
+        }
+        let (t, body) = self.reads.pop_front()?;
+        Some(self.number(t, body))
+    }
+
+    fn number(&mut self, t: MonoTime, body: EventBody) -> Event {
+        // Two threads may stamp and put in the other order, microseconds apart.
+        let t_recv = self.last.map_or(t, |last| t.max(last));
+        self.last = Some(t_recv);
+        let seq = self.next_seq;
+        self.next_seq += 1;
+        Event { t_recv, seq, body }
+    }
+
+    fn payload(&mut self, frame: RawFrame) -> FramePayload {
+        let index = self.next_frame;
+        self.next_frame = index.wrapping_add(1);
+        FramePayload {
+            index,
+            t_exposure: frame.t_exposure,
+            encoding: frame.encoding,
+            width: frame.width,
+            height: frame.height,
+            stride: frame.stride,
+            data: frame.data,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::msg::FrameEncoding;
+
+    fn at(ms: i64) -> MonoTime {
+        MonoTime::from_ns(ms * 1_000_000)
+    }
+
+    fn frame(ms: i64) -> RawFrame {
+        RawFrame {
+            t_exposure: at(ms),
+            encoding: FrameEncoding::Grey,
+            width: 1,
+            height: 1,
+            stride: 1,
+            data: Arc::from([0u8].as_slice()),
+        }
+    }
+
+    fn drain(inbox: &Inbox) -> Vec<Event> {
+        std::iter::from_fn(|| inbox.take(Duration::ZERO)).collect()
+    }
+
+    #[test]
+    fn events_leave_in_order_of_time_and_never_go_back() {
+        let inbox = Inbox::new(3);
+        inbox.put_frame(at(20), frame(15));
+        inbox.put(at(10), EventBody::GnssBytes(vec![1]));
+        inbox.put(at(30), EventBody::CompassBytes(vec![2]));
+        let first = drain(&inbox);
+        inbox.put(at(25), EventBody::GnssBytes(vec![3]));
+        let late = drain(&inbox);
+        let times: Vec<i64> = first.iter().chain(&late).map(|e| e.t_recv.ns() / 1_000_000).collect();
+        assert_eq!(times, [10, 20, 30, 30]);
+        let numbers: Vec<u64> = first.iter().chain(&late).map(|e| e.seq).collect();
+        assert_eq!(numbers, [0, 1, 2, 3]);
+    }
+
+    #[test]
+    fn the_newest_frames_win_and_the_loss_is_told() {
+        let inbox = Inbox::new(2);
+        for ms in [10, 20, 30, 40, 50] {
+            inbox.put_frame(at(ms), frame(ms));
+        }
+        let events = drain(&inbox);
+        assert!(
+            matches!(events[0].body, EventBody::Dropped { source: Source::Camera, count: 3 }),
+            "{:?}",
+            events[0]
+        );
+        let kept: Vec<(u32, i64)> = events[1..]
+            .iter()
+            .filter_map(|e| match &e.body {
+                EventBody::Frame(f) => Some((f.index, f.t_exposure.ns() / 1_000_000)),
+                _ => None,
+            })
+            .collect();
+        assert_eq!(kept, [(0, 40), (1, 50)]);
+    }
+
+    #[test]
+    fn reads_are_bounded() {
+        let inbox = Inbox::new(1);
+        for n in 0..READS + 5 {
+            inbox.put(at(n as i64), EventBody::CompassBytes(vec![0]));
+        }
+        let events = drain(&inbox);
+        assert_eq!(events.len(), READS + 1);
+        assert!(matches!(events[0].body, EventBody::Dropped { source: Source::Compass, count: 5 }));
+    }
+}

@@ -1,0 +1,85 @@
+//! `[daemon]` and `[power]`: what running unattended needs.
+
+use serde::{Deserialize, Serialize};
+
+/// `[daemon]`
+#[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DaemonConfig {
+    /// Parts whose absence is accepted: the service is ready without them, and uses them when they come.
+    pub optional: Vec<Part>,
+    /// Longest a task may go without answering before the watchdog is no longer stroked, seconds.
+    pub answer_within_s: f64,
+    /// Frames that wait for the pipeline; when one more comes, the oldest is dropped and recorded as
+    /// dropped. More frames mean more latency under load, never more throughput.
+    pub frame_queue: usize,
+    /// Frames are recorded as JPEG of this quality (1 to 100) where the camera gives raw ones.
+    pub jpeg_quality: u8,
+}
+
+impl Default for DaemonConfig {
+    fn default() -> Self {
+        Self { optional: Vec::new(), answer_within_s: 5.0, frame_queue: 3, jpeg_quality: 90 }
+    }
+}
+
+/// Parts of the daemon that have to be up before it is ready.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Part {
+    /// The GPS line.
+    Gps,
+    /// The compass line.
+    Compass,
+    /// The camera.
+    Camera,
+    /// The data card.
+    Store,
+}
+
+impl Part {
+    /// Every part.
+    pub const ALL: [Self; 4] = [Self::Gps, Self::Compass, Self::Camera, Self::Store];
+
+    /// Its name in configuration and log.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Gps => "gps",
+            Self::Compass => "compass",
+            Self::Camera => "camera",
+            Self::Store => "store",
+        }
+    }
+}
+
+/// `[power]`
+#[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PowerConfig {
+    /// Below this supply voltage for three seconds the flight is flushed and its segment closed, volts;
+    /// none: the voltage is shown and not acted on.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub low_voltage_v: Option<f64>,
+    /// Whether a mains or external supply going off line counts as power going.
+    pub on_mains_off: bool,
+    /// A file that holds the supply voltage (hwmon `in*_input`, millivolts, or `voltage_now`,
+    /// microvolts); none: the lowest of all batteries the kernel knows.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub voltage_file: Option<String>,
+    /// Temperature above which the health line is a warning, degrees Celsius.
+    pub hot_c: f64,
+    /// Where sysfs is.
+    pub sysfs: String,
+}
+
+impl Default for PowerConfig {
+    fn default() -> Self {
+        Self {
+            low_voltage_v: None,
+            on_mains_off: false,
+            voltage_file: None,
+            hot_c: 85.0,
+            sysfs: "/sys".into(),
+        }
+    }
+}
