@@ -10,6 +10,7 @@ pub mod mcap_write;
 pub mod notify;
 pub mod power;
 pub mod pps;
+pub mod process;
 pub mod proto;
 pub mod records;
 pub mod serial;

@@ -2,5 +2,7 @@
 
 pub mod frame;
 mod output;
+mod ticks;
 
+pub use ticks::{TICK, Ticks};
 pub use output::{Health, Notice, NoticeKind, Output, SourceHealth, TargetHealth};

@@ -11,7 +11,6 @@ use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
-use std::time::Duration;
 
 use super::events::{Event, Throttle};
 use crate::config::{LogConfig, LogLevel};
@@ -122,31 +121,26 @@ impl Log {
         message: impl Into<String>,
         fields: impl FnOnce(Line) -> Line,
     ) {
-        self.tell_at(self.clock.now(), event, about, |line| fields(line.says(message)));
+        let about = about.to_owned();
+        self.tell_keyed(self.clock.now(), event, about.clone(), |line| {
+            let line = line.says(message);
+            fields(if about.is_empty() { line } else { line.with("about", about) })
+        });
     }
 
-    /// As [`Self::tell_with`], at a time of its own.
-    pub fn tell_at(&self, t: MonoTime, event: Event, about: &str, fields: impl FnOnce(Line) -> Line) {
+    /// Tells of an operator event at a time of its own; lines of the same event and `key` are
+    /// throttled together.
+    pub fn tell_keyed(&self, t: MonoTime, event: Event, key: String, fields: impl FnOnce(Line) -> Line) {
         let held = {
             let mut throttles = self.throttles.lock().unwrap_or_else(PoisonError::into_inner);
-            let throttle = throttles.entry((event, about.to_owned())).or_default();
+            let throttle = throttles.entry((event, key)).or_default();
             throttle.pass(t, event.throttle())
         };
         let Some(held) = held else { return };
-        let mut line = Line::new(t, event.level(), event.name());
-        if !about.is_empty() {
-            line = line.with("about", about);
-        }
-        line = fields(line);
+        let mut line = fields(Line::new(t, event.level(), event.name()));
         if held > 0 {
             line = line.count("more_like_it", held);
         }
         self.write(line);
-    }
-
-    /// Waits until everything said so far is written, half a second at most.
-    pub fn settle(&self) {
-        // The queue is first in, first out: give the writer time rather than a protocol of its own.
-        std::thread::sleep(Duration::from_millis(20));
     }
 }

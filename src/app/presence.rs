@@ -1,0 +1,79 @@
+//! Which parts are up, and so whether the daemon is ready.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use crate::config::Part;
+
+/// State of a part.
+#[derive(Clone, PartialEq, Eq, Debug, Default)]
+pub enum PartState {
+    /// Not tried yet.
+    #[default]
+    Waiting,
+    /// Open; nothing delivered yet.
+    Open,
+    /// It delivers.
+    Delivers,
+    /// It does not; in a word, why.
+    Down(String),
+}
+
+impl PartState {
+    /// In a word.
+    pub fn word(&self) -> &str {
+        match self {
+            Self::Waiting => "waiting",
+            Self::Open => "open",
+            Self::Delivers => "ok",
+            Self::Down(why) => why,
+        }
+    }
+}
+
+/// Which parts are up. Copies are the same board.
+#[derive(Clone, Debug, Default)]
+pub struct Presence(Arc<Mutex<[PartState; Part::ALL.len()]>>);
+
+impl Presence {
+    /// Notes a part's state; what it was before.
+    pub fn set(&self, part: Part, state: PartState) -> PartState {
+        let mut board = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::replace(&mut board[part as usize], state)
+    }
+
+    /// A part's state.
+    pub fn get(&self, part: Part) -> PartState {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)[part as usize].clone()
+    }
+
+    /// Parts that are not up and whose absence is not accepted.
+    pub fn missing(&self, optional: &[Part]) -> Vec<(Part, PartState)> {
+        let wanted = Part::ALL.into_iter().filter(|part| !optional.contains(part));
+        let states = wanted.map(|part| (part, self.get(part)));
+        states.filter(|(_, state)| *state != PartState::Delivers).collect()
+    }
+
+    /// Missing parts in words: `gps missing, camera waiting`.
+    pub fn words(missing: &[(Part, PartState)]) -> String {
+        let words: Vec<String> =
+            missing.iter().map(|(part, state)| format!("{} {}", part.name(), state.word())).collect();
+        words.join(", ")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ready_when_all_that_is_wanted_delivers() {
+        let board = Presence::default();
+        assert_eq!(board.missing(&[]).len(), 4);
+        for part in [Part::Gps, Part::Camera, Part::Store] {
+            board.set(part, PartState::Delivers);
+        }
+        board.set(Part::Compass, PartState::Down("unplugged".into()));
+        assert_eq!(Presence::words(&board.missing(&[])), "compass unplugged");
+        assert!(board.missing(&[Part::Compass]).is_empty());
+    }
+}

@@ -1,0 +1,110 @@
+//! What changes when the configuration is read again, and what takes a restart.
+
+use std::collections::BTreeMap;
+
+use crate::config::Config;
+
+/// Keys that change in flight. A table's name stands for all its keys.
+const CHANGEABLE: [&str; 7] = [
+    "log.level",
+    "daemon.answer_within_s",
+    "daemon.optional",
+    "power.low_voltage_v",
+    "power.on_mains_off",
+    "power.hot_c",
+    "power.voltage_file",
+];
+
+/// Keys that differ between two configurations.
+#[derive(Clone, PartialEq, Eq, Debug, Default)]
+pub struct Differences {
+    /// Those that take effect now: `key: old → new`.
+    pub now: Vec<String>,
+    /// Those that take a restart.
+    pub restart: Vec<String>,
+}
+
+/// What differs between the running configuration and the one read again.
+pub fn differences(running: &Config, read: &Config) -> Differences {
+    let (old, new) = (flat(running), flat(read));
+    let mut differences = Differences::default();
+    let keys: std::collections::BTreeSet<&String> = old.keys().chain(new.keys()).collect();
+    for key in keys {
+        let (before, after) = (old.get(key), new.get(key));
+        if before == after {
+            continue;
+        }
+        let shown = |value: Option<&String>| value.cloned().unwrap_or_else(|| "unset".into());
+        let text = format!("{key}: {} → {}", shown(before), shown(after));
+        if CHANGEABLE.contains(&key.as_str()) {
+            differences.now.push(text);
+        } else {
+            differences.restart.push(text);
+        }
+    }
+    differences
+}
+
+/// The running configuration with the changeable keys of the one read again.
+pub fn merged(running: &Config, read: &Config) -> Config {
+    let mut merged = running.clone();
+    merged.log.level = read.log.level;
+    merged.daemon.answer_within_s = read.daemon.answer_within_s;
+    merged.daemon.optional.clone_from(&read.daemon.optional);
+    merged.power.low_voltage_v = read.power.low_voltage_v;
+    merged.power.on_mains_off = read.power.on_mains_off;
+    merged.power.hot_c = read.power.hot_c;
+    merged.power.voltage_file.clone_from(&read.power.voltage_file);
+    merged
+}
+
+/// Every value by its dotted key, as TOML writes it.
+fn flat(config: &Config) -> BTreeMap<String, String> {
+    let mut out = BTreeMap::new();
+    if let Ok(value) = toml::Value::try_from(config) {
+        put(&mut out, String::new(), &value);
+    }
+    out
+}
+
+fn put(out: &mut BTreeMap<String, String>, key: String, value: &toml::Value) {
+    let below = |name: &str| if key.is_empty() { name.to_owned() } else { format!("{key}.{name}") };
+    match value {
+        toml::Value::Table(table) => {
+            for (name, value) in table {
+                put(out, below(name), value);
+            }
+        }
+        toml::Value::Array(items) if items.iter().any(toml::Value::is_table) => {
+            for (index, item) in items.iter().enumerate() {
+                put(out, format!("{key}[{index}]"), item);
+            }
+        }
+        value => {
+            out.insert(key, value.to_string());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::LogLevel;
+
+    #[test]
+    fn what_can_change_changes_and_the_rest_is_told() {
+        let text = include_str!("../../config/windhover.toml");
+        let running = Config::parse(text).expect("valid");
+        let mut read = running.clone();
+        read.log.level = LogLevel::Debug;
+        read.gps.baud = 4800;
+        read.target[0].marker[1].id = Some(7);
+        read.power.low_voltage_v = Some(10.5);
+        let told = differences(&running, &read);
+        assert_eq!(told.now, ["log.level: \"info\" → \"debug\"", "power.low_voltage_v: unset → 10.5"]);
+        assert_eq!(told.restart, ["gps.baud: 38400 → 4800", "target[0].marker[1].id: 1 → 7"]);
+        let merged = merged(&running, &read);
+        assert!(differences(&merged, &read).now.is_empty());
+        assert_eq!(merged.gps.baud, running.gps.baud);
+    }
+}
