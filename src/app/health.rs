@@ -181,7 +181,8 @@ mod tests {
 
     #[test]
     fn a_silent_source_is_a_warning() {
-        let config = crate::config::Config::parse(include_str!("../../config/windhover.toml")).expect("valid");
+        let config =
+            crate::config::Config::parse(include_str!("../../config/windhover.toml")).expect("valid");
         let up = SourceHealth { rate_hz: 5.0, age: Some(Span::from_ms(120.0)), ..SourceHealth::default() };
         let mut health = Health { gps: up, compass: up, camera: up, ..Health::default() };
         let text = line(&health, &config, None);

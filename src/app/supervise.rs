@@ -145,11 +145,12 @@ mod tests {
         let clock = HostClock::start();
         let mut tasks = Supervisor::new(clock);
         let (sender, receiver) = std::sync::mpsc::channel::<()>();
-        tasks.spawn(RULE, move |heart| {
-            heart.beat();
-            let _ = receiver.recv();
-        })
-        .expect("a thread");
+        tasks
+            .spawn(RULE, move |heart| {
+                heart.beat();
+                let _ = receiver.recv();
+            })
+            .expect("a thread");
         assert!(tasks.silent(Span::from_s(5.0)).is_empty());
         std::thread::sleep(Duration::from_millis(30));
         assert_eq!(tasks.silent(Span::from_ms(10.0)).first().map(|s| s.0), Some("test"));

@@ -22,13 +22,7 @@ pub struct LogConfig {
 
 impl Default for LogConfig {
     fn default() -> Self {
-        Self {
-            level: LogLevel::Info,
-            format: LogFormat::Auto,
-            file: None,
-            file_mb: 10.0,
-            files_kept: 4,
-        }
+        Self { level: LogLevel::Info, format: LogFormat::Auto, file: None, file_mb: 10.0, files_kept: 4 }
     }
 }
 

@@ -4,5 +4,5 @@ pub mod frame;
 mod output;
 mod ticks;
 
-pub use ticks::{TICK, Ticks};
 pub use output::{Health, Notice, NoticeKind, Output, SourceHealth, TargetHealth};
+pub use ticks::{TICK, Ticks};

@@ -36,9 +36,10 @@ impl Sinks {
             LogFormat::Auto if stderr_is_journal() => journal(),
             LogFormat::Auto => Screen::Text,
         };
-        let file = config.file.as_ref().map(|path| {
-            RotatingFile::new(Path::new(path), (config.file_mb * 1e6) as u64, config.files_kept)
-        });
+        let file = config
+            .file
+            .as_ref()
+            .map(|path| RotatingFile::new(Path::new(path), (config.file_mb * 1e6) as u64, config.files_kept));
         Self { screen, file }
     }
 
@@ -97,7 +98,10 @@ impl RotatingFile {
             Err(error) => {
                 self.current = None;
                 if !std::mem::replace(&mut self.complained, true) {
-                    print(&format!("level=warn event=log_file msg=\"cannot write {}: {error}\"", self.path.display()));
+                    print(&format!(
+                        "level=warn event=log_file msg=\"cannot write {}: {error}\"",
+                        self.path.display()
+                    ));
                 }
             }
         }

@@ -187,13 +187,18 @@ mod tests {
         };
         let stop = Stop::default();
         let frames = RefCell::new(Vec::new());
-        let fault = play(&folder.path().to_string_lossy(), &settings, false, HostClock::start(), &stop, &|r| {
-            match r {
+        let fault = play(
+            &folder.path().to_string_lossy(),
+            &settings,
+            false,
+            HostClock::start(),
+            &stop,
+            &|r| match r {
                 Report::Frame(t, frame) => frames.borrow_mut().push((t, frame)),
                 Report::Note(NoteKind::PlayedOut, ..) => stop.ask(),
                 _ => {}
-            }
-        });
+            },
+        );
 
         // Then two frames came, as far apart as they were recorded.
         assert!(fault.is_none());
