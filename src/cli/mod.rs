@@ -1,5 +1,6 @@
 //! The command line: parse arguments, call the library, turn results into exit codes.
 
+mod calibrate;
 mod check_config;
 mod detect;
 mod error;
@@ -22,6 +23,8 @@ pub struct Cli {
 
 #[derive(Subcommand, Debug)]
 enum Command {
+    /// Calibrate the camera and how it is mounted
+    Calibrate(calibrate::Args),
     /// Say what is wrong with a configuration, or print the effective one
     CheckConfig(check_config::Args),
     /// Make the certificates with which payloads and ground stations know each other
@@ -44,6 +47,7 @@ pub fn main() -> ExitCode {
         }
     };
     let result = match cli.command {
+        Command::Calibrate(args) => calibrate::run(&args),
         Command::CheckConfig(args) => check_config::run(&args),
         Command::Keys(args) => keys::run(&args),
         Command::Montecarlo(args) => montecarlo::run(&args),

@@ -1,0 +1,24 @@
+//! `windhover calibrate`
+
+mod intrinsics;
+
+use super::CliResult;
+
+/// Calibrate the camera and how it is mounted.
+#[derive(clap::Args, Debug)]
+pub(super) struct Args {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(clap::Subcommand, Debug)]
+enum What {
+    /// The lens, from photographs of a printed board
+    Intrinsics(intrinsics::Args),
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    match &args.what {
+        What::Intrinsics(args) => intrinsics::run(args),
+    }
+}

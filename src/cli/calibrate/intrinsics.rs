@@ -1,0 +1,229 @@
+//! `windhover calibrate intrinsics`
+
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use nalgebra::Vector2;
+use serde_json::json;
+
+use crate::calibrate::intrinsics::{Intrinsics, PARAMETERS, Wanted, calibrate};
+use crate::calibrate::{
+    PlaneView, WINDOW_PX, coverage_advice, coverage_svg, find_corners, per_view_svg, residuals_svg,
+};
+use crate::cli::{CliError, CliResult};
+use crate::msg::GrayImage;
+use crate::plot;
+
+/// Calibrate the lens from photographs of a printed chessboard.
+///
+/// Corners are found without help, whichever way the board is turned. Photographs that cannot be
+/// used are named with the reason. Uncertainties are one sigma (MATLAB's toolbox prints three).
+#[derive(clap::Args, Debug)]
+pub(super) struct Args {
+    /// Photographs of the board, all of the same size, taken with the same focus
+    #[arg(required = true, value_name = "IMAGE")]
+    images: Vec<PathBuf>,
+    /// Inner corners of the board: columns x rows (a board of 10x7 squares has 9x6)
+    #[arg(long, value_name = "CxR")]
+    board: Board,
+    /// Edge of one square, metres
+    #[arg(long, value_name = "METRES", value_parser = positive)]
+    square_m: f64,
+    /// Half the window in which a corner is placed, pixels; never more than half-way to the next
+    /// corner. The default is what OpenCV's calibration uses; smaller suits small or slanted squares
+    #[arg(long, value_name = "PX", value_parser = positive, default_value_t = WINDOW_PX)]
+    window: f64,
+    /// Keep the third radial term at zero
+    #[arg(long)]
+    no_k3: bool,
+    /// Estimate how far the pixel axes are from square
+    #[arg(long)]
+    skew: bool,
+    /// Draw residuals, error per image and coverage into this directory
+    #[arg(long, value_name = "DIR")]
+    plots: Option<PathBuf>,
+    /// One JSON object on standard output
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Board {
+    columns: usize,
+    rows: usize,
+}
+
+impl FromStr for Board {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (columns, rows) = text.split_once(['x', 'X']).ok_or("write it as 9x6")?;
+        let count = |t: &str| t.trim().parse().map_err(|_| format!("{t:?} is not a number; write it as 9x6"));
+        let board = Self { columns: count(columns)?, rows: count(rows)? };
+        let fits = |n: usize| (3..=200).contains(&n);
+        if fits(board.columns) && fits(board.rows) {
+            Ok(board)
+        } else {
+            Err("a board has 3 to 200 inner corners each way".into())
+        }
+    }
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| format!("{text:?} is not a number"))?;
+    if value > 0.0 && value.is_finite() { Ok(value) } else { Err("must be above zero".into()) }
+}
+
+/// A photograph and what was found on it.
+struct Photo {
+    name: String,
+    found: Result<PlaneView, String>,
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    let (photos, size) = look_at(args)?;
+    for photo in &photos {
+        if let Err(reason) = &photo.found {
+            eprintln!("windhover: not used: {}: {reason}", photo.name);
+        }
+    }
+    let used: Vec<&Photo> = photos.iter().filter(|p| p.found.is_ok()).collect();
+    let views: Vec<PlaneView> = photos.iter().filter_map(|p| p.found.clone().ok()).collect();
+    let (width, height) = (size.0 as f64, size.1 as f64);
+    let wanted = Wanted { k3: !args.no_k3, skew: args.skew };
+    let result = calibrate(&views, width, height, wanted).map_err(CliError::failed)?;
+    let names: Vec<&str> = used.iter().map(|p| p.name.as_str()).collect();
+    if let Some(dir) = &args.plots {
+        draw(dir, &result, &views, &names, size)?;
+    }
+    if args.json {
+        println!("{}", as_json(&result, &photos));
+    } else {
+        print_text(&result, &names, &views, size);
+    }
+    Ok(())
+}
+
+fn look_at(args: &Args) -> Result<(Vec<Photo>, (usize, usize)), CliError> {
+    let mut size = None;
+    let mut photos = Vec::with_capacity(args.images.len());
+    for path in &args.images {
+        let name = path.display().to_string();
+        let image = match read(path) {
+            Ok(image) => image,
+            Err(reason) => {
+                photos.push(Photo { name, found: Err(reason) });
+                continue;
+            }
+        };
+        let first = *size.get_or_insert((image.width, image.height));
+        let found = if first == (image.width, image.height) {
+            corners_of(&image, args)
+        } else {
+            Err(format!(
+                "is {}x{} pixels; the first image is {}x{}",
+                image.width, image.height, first.0, first.1
+            ))
+        };
+        photos.push(Photo { name, found });
+    }
+    match size {
+        Some(size) => Ok((photos, size)),
+        None => {
+            let reasons: Vec<String> = photos
+                .iter()
+                .take(3)
+                .filter_map(|p| Some(format!("{}: {}", p.name, p.found.as_ref().err()?)))
+                .collect();
+            Err(CliError::failed(format!("no image could be read: {}", reasons.join("; "))))
+        }
+    }
+}
+
+fn read(path: &Path) -> Result<GrayImage, String> {
+    let image = image::open(path).map_err(|e| format!("cannot be read: {e}"))?.into_luma8();
+    let (width, height) = (image.width() as usize, image.height() as usize);
+    GrayImage::from_vec(width, height, image.into_raw()).ok_or_else(|| "has an impossible size".into())
+}
+
+fn corners_of(image: &GrayImage, args: &Args) -> Result<PlaneView, String> {
+    let Board { columns, rows } = args.board;
+    let corners = find_corners(image.view(), columns, rows, args.window).map_err(|e| e.to_string())?;
+    let at = |k: usize| Vector2::new((k % columns) as f64, (k / columns) as f64) * args.square_m;
+    let (plane_m, px) = corners.iter().enumerate().filter_map(|(k, c)| Some((at(k), (*c)?))).unzip();
+    Ok(PlaneView { plane_m, px })
+}
+
+fn draw(
+    dir: &Path,
+    result: &Intrinsics,
+    views: &[PlaneView],
+    names: &[&str],
+    size: (usize, usize),
+) -> CliResult {
+    let failed = |e: std::io::Error| CliError::failed(format!("cannot write into {}: {e}", dir.display()));
+    std::fs::create_dir_all(dir).map_err(failed)?;
+    for (file, svg) in [
+        ("residuals.svg", residuals_svg(result, views, size)),
+        ("per_image.svg", per_view_svg(result, names)),
+        ("coverage.svg", coverage_svg(views, size)),
+    ] {
+        std::fs::write(dir.join(file), plot::standalone(&svg)).map_err(failed)?;
+    }
+    Ok(())
+}
+
+fn as_json(result: &Intrinsics, photos: &[Photo]) -> serde_json::Value {
+    let c = &result.camera;
+    let sigma: serde_json::Map<String, serde_json::Value> =
+        PARAMETERS.iter().zip(result.sigma).map(|(name, s)| ((*name).to_owned(), json!(s))).collect();
+    let used = photos.iter().filter(|p| p.found.is_ok()).zip(&result.views);
+    let images: Vec<_> = used.map(|(p, fit)| json!({"image": p.name, "rms_px": fit.rms_px})).collect();
+    let refused: Vec<_> = photos
+        .iter()
+        .filter_map(|p| p.found.as_ref().err().map(|reason| json!({"image": p.name, "reason": reason})))
+        .collect();
+    json!({
+        "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy,
+        "distortion": c.distortion,
+        "skew": c.skew,
+        "sigma": sigma,
+        "rms_px": result.rms_px,
+        "images_used": result.views.len(),
+        "corners": result.points,
+        "images": images,
+        "refused": refused,
+    })
+}
+
+fn print_text(result: &Intrinsics, names: &[&str], views: &[PlaneView], size: (usize, usize)) {
+    let c = &result.camera;
+    println!(
+        "{} images, {} corners, error {:.4} px (root mean square)\n",
+        names.len(),
+        result.points,
+        result.rms_px
+    );
+    println!("parameter        value   one sigma");
+    let values = [c.fx, c.fy, c.cx, c.cy].into_iter().chain(c.distortion).chain([c.skew]).zip(result.sigma);
+    for (name, (value, sigma)) in PARAMETERS.iter().zip(values) {
+        if sigma > 0.0 {
+            println!("{name:<10} {value:>12.5} {sigma:>11.5}");
+        } else {
+            println!("{name:<10} {value:>12.5}       fixed");
+        }
+    }
+    println!("\nerror per image, px");
+    for (name, fit) in names.iter().zip(&result.views) {
+        println!("{:7.4}  {name}", fit.rms_px);
+    }
+    for advice in coverage_advice(result, views, size) {
+        println!("\n{advice}");
+    }
+    let [k1, k2, p1, p2, k3] = c.distortion;
+    println!("\n[camera.intrinsics]");
+    println!("fx = {:.5}\nfy = {:.5}\ncx = {:.5}\ncy = {:.5}", c.fx, c.fy, c.cx, c.cy);
+    println!("distortion = [{k1:.6}, {k2:.6}, {p1:.6}, {p2:.6}, {k3:.6}]");
+    if c.skew != 0.0 {
+        println!("skew = {:.7}", c.skew);
+    }
+}
