@@ -67,6 +67,7 @@ impl Config {
         within("detector.max_hamming", f64::from(self.detector.max_hamming), 0.0, 3.0)?;
         within("detector.ground_features", self.detector.ground_features as f64, 0.0, 64.0)?;
         self.check_estimator()?;
+        self.store.check()?;
         self.link.check()?;
         self.mavlink.check()?;
         self.check_montecarlo()

@@ -23,7 +23,7 @@ pub use sensors::{
     CameraConfig, CameraMount, CompassConfig, CompassFormat, Datum, Declination, GpsConfig, GroundConfig,
     GroundSource, PixelFormat,
 };
-pub use store::StoreConfig;
+pub use store::{FramePolicy, StoreConfig};
 pub use target::{Brightness, MarkerConfig, MarkerKind, TagFamily, TargetConfig, TargetModel};
 
 use serde::{Deserialize, Serialize};

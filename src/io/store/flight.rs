@@ -194,6 +194,18 @@ pub fn summarize(dir: &Path) -> StoreResult<FlightInfo> {
     Ok(info)
 }
 
+/// The run of the daemon a flight belongs to, from `flight.json` or any segment's head.
+pub fn session_of(dir: &Path) -> Option<u32> {
+    let told = std::fs::read(dir.join(FLIGHT_FILE)).ok();
+    if let Some(info) = told.and_then(|bytes| serde_json::from_slice::<FlightInfo>(&bytes).ok()) {
+        return Some(info.session);
+    }
+    segment_names(dir).iter().find_map(|name| {
+        let head = SegmentFile::open(&dir.join(name)).ok()?.salvage_head_only();
+        head.metadata?.get("session")?.parse().ok()
+    })
+}
+
 /// Writes `flight.json`, durably.
 pub fn write_info(volume: &Volume, name: &str, info: &FlightInfo) -> StoreResult<()> {
     let mut bytes = serde_json::to_vec_pretty(info).expect("maps with string keys are JSON");

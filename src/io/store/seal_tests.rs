@@ -56,7 +56,7 @@ fn write_segment(volume: &Volume, number: u32, chunks: u32, finish: bool) -> (Ve
     let mut ends = Vec::new();
     for chunk in 0..chunks {
         for i in 0..PER_CHUNK {
-            segment.push(&mut definitions, &record(&channels, chunk * PER_CHUNK + i));
+            segment.push(&mut definitions, &record(&channels, chunk * PER_CHUNK + i)).unwrap();
         }
         segment.commit().unwrap();
         ends.push(segment.len());

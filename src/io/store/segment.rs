@@ -1,18 +1,18 @@
-//! Writing one segment: records gather into a chunk, a commit appends it and makes it durable.
+//! Writing one segment: records gather into chunks, a commit appends them and makes them durable.
 //!
 //! Layout of a segment: magic, header, metadata `windhover`, all schemas and channels of the
-//! flight, attachment `config.toml`, padding; then per commit one append of chunk, message indexes
-//! and padding to the next page; at the end data end, summary, footer, magic.
-//! A commit starts on a page of its own, so that a card which loses power in mid-write can only
+//! flight, attachment `config.toml`, padding; then per chunk one append of the chunk, its message
+//! indexes and padding to the next page; at the end data end, summary, footer, magic.
+//! A chunk starts on a page of its own, so that a card which loses power in mid-write can only
 //! damage what was not acknowledged. Definitions are repeated inside the first chunk and every
 //! tenth after it: a segment whose head is lost still reads.
 
 use std::collections::BTreeMap;
 
 use super::format::{self, Compression};
-use super::record::{Definitions, RawRecord};
+use super::record::{Definitions, RawRecord, Weight};
 use super::summary::{PlacedChunk, Summary, TopicStats};
-use super::volume::{AppendFile, StoreResult, Volume};
+use super::volume::{AppendFile, StoreError, StoreResult, Volume};
 
 /// What a card writes as a whole: appends start and end on it.
 pub const PAGE: u64 = 4096;
@@ -59,6 +59,12 @@ pub(super) fn put_head(out: &mut Vec<u8>, summary: &mut Summary, head: &Head, de
     format::pad_to_page(out, 0, PAGE);
 }
 
+/// A chunk may span this much log time: readers put messages in order over a second.
+const CHUNK_SPAN_NS: u64 = 900_000_000;
+
+/// A chunk ends when it holds this many bytes, so that memory stays bounded.
+const CHUNK_BYTES: usize = 8 << 20;
+
 #[derive(Debug, Default)]
 struct Chunk {
     records: Vec<u8>,
@@ -66,24 +72,40 @@ struct Chunk {
     span_ns: Option<(u64, u64)>,
 }
 
-/// A segment being written.
+impl Chunk {
+    fn add(&mut self, channel: u16, record: &RawRecord) {
+        let offset = self.records.len() as u64;
+        let RawRecord { log_ns, publish_ns, sequence, data, .. } = record;
+        format::put_message(&mut self.records, channel, *sequence, *log_ns, *publish_ns, data);
+        self.messages.entry(channel).or_default().push((*log_ns, offset));
+        let (first, last) = self.span_ns.unwrap_or((*log_ns, *log_ns));
+        self.span_ns = Some((first.min(*log_ns), last.max(*log_ns)));
+    }
+}
+
+/// A segment being written. Frames and everything else go into chunks of their own: what reads only
+/// the latter (lists, back-fill, a replay without frames) then touches a hundredth of the bytes.
 #[derive(Debug)]
 pub struct SegmentWriter {
     file: AppendFile,
-    compression: Compression,
-    chunk: Chunk,
+    small: Chunk,
+    frames: Chunk,
+    frame_compression: Compression,
     summary: Summary,
+    begun_ns: Option<u64>,
     pending: usize,
+    unsynced: bool,
 }
 
 impl SegmentWriter {
-    /// Creates the file, writes its head and makes both durable.
+    /// Creates the file, writes its head and makes both durable. Frames are compressed as told,
+    /// everything else with lz4.
     pub fn create(
         volume: &Volume,
         (dir, name): (&str, &str),
         head: &Head,
         definitions: &Definitions,
-        compression: Compression,
+        frame_compression: Compression,
     ) -> StoreResult<Self> {
         let mut file = volume.create(&format!("{dir}/{name}"))?;
         let mut summary = Summary::default();
@@ -93,33 +115,45 @@ impl SegmentWriter {
         file.append(&out)?;
         file.sync()?;
         volume.sync_dir(dir)?;
-        Ok(Self { file, compression, chunk: Chunk::default(), summary, pending: 0 })
+        Ok(Self {
+            file,
+            small: Chunk::default(),
+            frames: Chunk::default(),
+            frame_compression,
+            summary,
+            begun_ns: None,
+            pending: 0,
+            unsynced: false,
+        })
     }
 
-    /// Adds a record to the chunk in memory; nothing is written before [`Self::commit`].
-    pub fn push(&mut self, definitions: &mut Definitions, record: &RawRecord) {
-        let (channel, new) = definitions.number(&record.channel);
-        let repeat = self.chunk.records.is_empty() && self.summary.chunk_count() % REPEAT_DEFINITIONS == 0;
-        if repeat {
-            definitions.put(&mut self.chunk.records);
-        } else if new {
-            definitions.put_one(&mut self.chunk.records, channel);
+    /// Adds a record; durable after the next [`Self::commit`]. Chunks that are long enough are
+    /// written on the way; on an error their records are lost.
+    pub fn push(&mut self, definitions: &mut Definitions, record: &RawRecord) -> StoreResult<()> {
+        let begun = *self.begun_ns.get_or_insert(record.log_ns);
+        if record.log_ns.saturating_sub(begun) >= CHUNK_SPAN_NS || self.pending_bytes() >= CHUNK_BYTES {
+            self.write_chunks()?;
+            self.begun_ns = Some(record.log_ns);
         }
-        let offset = self.chunk.records.len() as u64;
-        let RawRecord { log_ns, publish_ns, sequence, data, .. } = record;
-        format::put_message(&mut self.chunk.records, channel, *sequence, *log_ns, *publish_ns, data);
-        self.chunk.messages.entry(channel).or_default().push((*log_ns, offset));
-        let (first, last) = self.chunk.span_ns.unwrap_or((*log_ns, *log_ns));
-        self.chunk.span_ns = Some((first.min(*log_ns), last.max(*log_ns)));
+        let (channel, new) = definitions.number(&record.channel);
+        let chunk = if record.weight == Weight::Frame { &mut self.frames } else { &mut self.small };
+        let repeat = chunk.records.is_empty() && self.summary.chunk_count() % REPEAT_DEFINITIONS == 0;
+        if repeat {
+            definitions.put(&mut chunk.records);
+        } else if new {
+            definitions.put_one(&mut chunk.records, channel);
+        }
+        chunk.add(channel, record);
         self.pending += 1;
+        Ok(())
     }
 
-    /// Bytes in the chunk in memory.
+    /// Bytes in the chunks in memory.
     pub fn pending_bytes(&self) -> usize {
-        self.chunk.records.len()
+        self.small.records.len() + self.frames.records.len()
     }
 
-    /// Messages in the chunk in memory.
+    /// Messages in the chunks in memory.
     pub fn pending(&self) -> usize {
         self.pending
     }
@@ -134,26 +168,31 @@ impl SegmentWriter {
         self.summary.chunk_count() == 0
     }
 
-    /// Writes the chunk, durable on return; gives the bytes written. On an error the chunk is lost,
+    /// Writes what is pending; all of it is durable on return. On an error what is pending is lost,
     /// what was acknowledged before is not.
-    pub fn commit(&mut self) -> StoreResult<u64> {
-        let before = self.file.len();
-        self.write_chunk()?;
-        if self.file.len() > before {
+    pub fn commit(&mut self) -> StoreResult<()> {
+        self.write_chunks()?;
+        if std::mem::take(&mut self.unsynced) {
             self.file.sync()?;
         }
-        Ok(self.file.len() - before)
+        Ok(())
     }
 
-    /// Writes the chunk without waiting for it to be durable.
-    pub fn write_chunk(&mut self) -> StoreResult<()> {
-        let chunk = std::mem::take(&mut self.chunk);
+    /// Writes what is pending without waiting for it to be durable.
+    fn write_chunks(&mut self) -> StoreResult<()> {
         self.pending = 0;
+        self.begun_ns = None;
+        let (small, frames) = (std::mem::take(&mut self.small), std::mem::take(&mut self.frames));
+        self.write_chunk(small, Compression::Lz4)?;
+        self.write_chunk(frames, self.frame_compression)
+    }
+
+    fn write_chunk(&mut self, chunk: Chunk, compression: Compression) -> StoreResult<()> {
         let Some(span) = chunk.span_ns else { return Ok(()) };
         let start = self.file.len();
         let mut out = Vec::with_capacity(chunk.records.len() + 8192);
-        let header = format::put_chunk(&mut out, &chunk.records, span, self.compression)
-            .map_err(|e| super::volume::StoreError::new("compress a chunk for", self.file.path(), e))?;
+        let header = format::put_chunk(&mut out, &chunk.records, span, compression)
+            .map_err(|e| StoreError::new("compress a chunk for", self.file.path(), e))?;
         let placed =
             PlacedChunk { header, offset: start, length: out.len() as u64, messages: chunk.messages };
         let mut noted = self.summary.clone();
@@ -161,6 +200,7 @@ impl SegmentWriter {
         format::pad_to_page(&mut out, start, PAGE);
         self.file.reserve(out.len() as u64 + RESERVE_END, RESERVE_STEP)?;
         self.file.append(&out)?;
+        self.unsynced = true;
         self.summary = noted;
         Ok(())
     }
@@ -178,7 +218,7 @@ impl SegmentWriter {
     /// Commits what is left, writes the summary, gives back reserved blocks; durable on return.
     /// Gives the length of the file and its number of chunks.
     pub fn finish(mut self, definitions: &Definitions) -> StoreResult<(u64, usize)> {
-        self.write_chunk()?;
+        self.write_chunks()?;
         let mut out = Vec::new();
         self.summary.put_end(&mut out, self.file.len(), definitions);
         self.file.append(&out)?;

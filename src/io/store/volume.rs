@@ -188,12 +188,13 @@ impl Volume {
 
     /// Puts a whole small file in place so that a reader finds the old or the new one, never half.
     pub fn write_whole(&self, dir: &str, name: &str, bytes: &[u8]) -> StoreResult<()> {
-        let temporary = format!("{dir}/{name}.tmp");
+        let whole = if dir.is_empty() { name.to_owned() } else { format!("{dir}/{name}") };
+        let temporary = format!("{whole}.tmp");
         self.remove_file(&temporary)?;
         let mut file = self.create(&temporary)?;
         file.append(bytes)?;
         file.sync()?;
-        self.replace(&temporary, &format!("{dir}/{name}"))?;
+        self.replace(&temporary, &whole)?;
         self.sync_dir(dir)
     }
 
