@@ -88,7 +88,10 @@ impl Default for StoreConfig {
 impl StoreConfig {
     pub(super) fn check(&self) -> Result<(), ConfigError> {
         if !self.path.starts_with('/') {
-            refuse("store.path", format!("{:?} is not absolute; give a path such as /var/lib/windhover", self.path))?;
+            refuse(
+                "store.path",
+                format!("{:?} is not absolute; give a path such as /var/lib/windhover", self.path),
+            )?;
         }
         within("store.frames_every", f64::from(self.frames_every), 1.0, 10_000.0)?;
         within("store.jpeg_quality", f64::from(self.jpeg_quality), 1.0, 100.0)?;
@@ -98,7 +101,10 @@ impl StoreConfig {
         within("store.free_floor_mb", self.free_floor_mb as f64, 8.0, 1e6)?;
         within("store.free_target_mb", self.free_target_mb as f64, 0.0, 1e7)?;
         if self.free_target_mb != 0 && self.free_target_mb < self.free_floor_mb {
-            refuse("store.free_target_mb", "is below free_floor_mb; recording would stop before room is made")?;
+            refuse(
+                "store.free_target_mb",
+                "is below free_floor_mb; recording would stop before room is made",
+            )?;
         }
         within("store.max_gb", self.max_gb, 0.0, 1e6)?;
         within("store.max_age_days", self.max_age_days, 0.0, 36_500.0)?;

@@ -136,7 +136,8 @@ impl FlightWriter {
     pub fn commit(&mut self, now_ns: u64) -> StoreResult<Option<FinishedSegment>> {
         let Some((segment, begun_ns)) = &mut self.segment else { return Ok(None) };
         segment.commit()?;
-        let due = now_ns.saturating_sub(*begun_ns) >= self.limits.span_ns || segment.len() >= self.limits.bytes;
+        let due =
+            now_ns.saturating_sub(*begun_ns) >= self.limits.span_ns || segment.len() >= self.limits.bytes;
         if !due || segment.is_empty() {
             return Ok(None);
         }
@@ -184,7 +185,8 @@ impl FlightWriter {
             return self.open_segment(now_ns);
         }
         let head = self.head.clone();
-        let fresh = Self::begin(&self.volume, self.session, start, Head { time_ns: now_ns, ..head }, self.limits)?;
+        let fresh =
+            Self::begin(&self.volume, self.session, start, Head { time_ns: now_ns, ..head }, self.limits)?;
         *self = fresh;
         Ok(())
     }

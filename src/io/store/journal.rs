@@ -1,4 +1,5 @@
-//! A log of file operations, and the disk as a power cut at any point of it may leave it.
+//! A log of file operations, and the disk as a power cut at any point of it may leave it; also a card
+//! that fails on demand.
 //!
 //! What a card keeps of writes that no barrier followed is its own affair: none, all, the first
 //! ones, or any of their pages. [`Journal::image`] builds each of these from the log, with file
@@ -71,6 +72,8 @@ pub enum Loss {
 struct Log {
     ops: Vec<Op>,
     files: u64,
+    fault: Option<std::io::ErrorKind>,
+    free_bytes: Option<u64>,
 }
 
 /// The operations of a [`super::volume::Volume`], in order.
@@ -86,6 +89,24 @@ impl Journal {
 
     pub(super) fn note(&self, op: Op) {
         self.log().ops.push(op);
+    }
+
+    /// From now on every operation fails like this, or works again.
+    pub fn set_fault(&self, fault: Option<std::io::ErrorKind>) {
+        self.log().fault = fault;
+    }
+
+    /// From now on so much is said to be free, or what really is.
+    pub fn set_free(&self, bytes: Option<u64>) {
+        self.log().free_bytes = bytes;
+    }
+
+    pub(super) fn fault(&self) -> std::io::Result<()> {
+        self.log().fault.map_or(Ok(()), |kind| Err(kind.into()))
+    }
+
+    pub(super) fn free_bytes(&self) -> Option<u64> {
+        self.log().free_bytes
     }
 
     pub(super) fn create(&self, path: &str) -> u64 {

@@ -1,15 +1,36 @@
 //! Flights on the data card: append-only MCAP segments, and beside them what can be rebuilt.
 //!
-//! `docs/storage.md` tells the layout and what is guaranteed.
+//! [`Store`] runs three threads: one encodes (frames to JPEG, values to protobuf), one writes and is
+//! the only one to wait for the card, one keeps house (index, sealing, old flights). Callers hold a
+//! [`StoreHandle`] and never wait. `docs/storage.md` tells the layout and what is guaranteed.
 
+mod encode;
 pub mod flight;
+pub mod flight_writer;
 pub mod format;
+pub mod frames;
+mod handle;
+#[cfg(test)]
+mod handle_tests;
+pub mod index;
 pub mod journal;
+pub mod keeper;
+pub mod queue;
+pub mod rebuild;
 pub mod record;
+mod recorder;
+pub mod retention;
 pub mod scan;
 pub mod seal;
 #[cfg(test)]
 mod seal_tests;
 pub mod segment;
+mod shared;
+pub mod status;
 pub mod summary;
 pub mod volume;
+pub mod wear;
+
+pub use frames::Region;
+pub use handle::{Store, StoreHandle};
+pub use status::{Recording, StoreNotice, StoreStatus};

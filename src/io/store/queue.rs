@@ -92,7 +92,8 @@ pub enum Popped<T> {
 impl<T> Queue<T> {
     /// An empty queue that holds up to `limit_bytes`.
     pub fn new(limit_bytes: usize) -> Self {
-        let inner = Inner { entries: VecDeque::new(), bytes: 0, frames: 0, drops: Drops::default(), closed: false };
+        let inner =
+            Inner { entries: VecDeque::new(), bytes: 0, frames: 0, drops: Drops::default(), closed: false };
         Self { inner: Mutex::new(inner), filled: Condvar::new(), limit_bytes }
     }
 
@@ -162,7 +163,13 @@ mod tests {
     use super::*;
 
     fn entry(n: u64, bytes: usize, weight: Weight) -> Entry<u64> {
-        Entry { value: n, bytes, weight, topic: if weight == Weight::Frame { "f" } else { "s" }.into(), log_ns: n }
+        Entry {
+            value: n,
+            bytes,
+            weight,
+            topic: if weight == Weight::Frame { "f" } else { "s" }.into(),
+            log_ns: n,
+        }
     }
 
     fn drain(queue: &Queue<u64>) -> Vec<u64> {

@@ -67,6 +67,10 @@ impl Volume {
         self.root.join(relative)
     }
 
+    fn fault(&self) -> std::io::Result<()> {
+        self.journal.as_ref().map_or(Ok(()), |journal| journal.fault())
+    }
+
     fn note(&self, op: impl FnOnce() -> Op) {
         if let Some(journal) = &self.journal {
             journal.note(op());
@@ -76,7 +80,9 @@ impl Volume {
     /// Makes a directory; one that is there already is an error.
     pub fn create_dir(&self, relative: &str) -> StoreResult<()> {
         let path = self.path(relative);
-        std::fs::create_dir(&path).map_err(|e| StoreError::new("create directory", &path, e))?;
+        self.fault()
+            .and_then(|()| std::fs::create_dir(&path))
+            .map_err(|e| StoreError::new("create directory", &path, e))?;
         self.note(|| Op::CreateDir(relative.into()));
         Ok(())
     }
@@ -93,8 +99,8 @@ impl Volume {
     /// Makes a directory's entries durable.
     pub fn sync_dir(&self, relative: &str) -> StoreResult<()> {
         let path = self.path(relative);
-        File::open(&path)
-            .and_then(|dir| dir.sync_all())
+        self.fault()
+            .and_then(|()| File::open(&path)?.sync_all())
             .map_err(|e| StoreError::new("sync directory", &path, e))?;
         self.note(|| Op::SyncDir(relative.into()));
         Ok(())
@@ -128,7 +134,9 @@ impl Volume {
     /// Renames over what has the new name.
     pub fn replace(&self, from: &str, to: &str) -> StoreResult<()> {
         let old = self.path(from);
-        std::fs::rename(&old, self.path(to)).map_err(|e| StoreError::new("rename", &old, e))?;
+        self.fault()
+            .and_then(|()| std::fs::rename(&old, self.path(to)))
+            .map_err(|e| StoreError::new("rename", &old, e))?;
         self.note(|| Op::Rename { from: from.into(), to: to.into() });
         Ok(())
     }
@@ -136,7 +144,7 @@ impl Volume {
     /// Removes a file; one that is not there is fine.
     pub fn remove_file(&self, relative: &str) -> StoreResult<()> {
         let path = self.path(relative);
-        match std::fs::remove_file(&path) {
+        match self.fault().and_then(|()| std::fs::remove_file(&path)) {
             Err(e) if e.kind() == ErrorKind::NotFound => return Ok(()),
             other => other.map_err(|e| StoreError::new("remove", &path, e))?,
         }
@@ -164,10 +172,9 @@ impl Volume {
     /// Makes an empty file to append to; one of that name is an error.
     pub fn create(&self, relative: &str) -> StoreResult<AppendFile> {
         let path = self.path(relative);
-        let file = OpenOptions::new()
-            .write(true)
-            .create_new(true)
-            .open(&path)
+        let file = self
+            .fault()
+            .and_then(|()| OpenOptions::new().write(true).create_new(true).open(&path))
             .map_err(|e| StoreError::new("create", &path, e))?;
         let id = self.journal.as_ref().map_or(0, |j| j.create(relative));
         Ok(AppendFile { file, path, id, journal: self.journal.clone(), length: 0, reserved: 0 })
@@ -202,7 +209,8 @@ impl Volume {
     pub fn space(&self) -> StoreResult<(u64, u64)> {
         let stat = rustix::fs::statvfs(&self.root)
             .map_err(|e| StoreError::new("ask free space of", &self.root, e))?;
-        Ok((stat.f_bavail * stat.f_frsize, stat.f_blocks * stat.f_frsize))
+        let free = self.journal.as_ref().and_then(|journal| journal.free_bytes());
+        Ok((free.unwrap_or(stat.f_bavail * stat.f_frsize), stat.f_blocks * stat.f_frsize))
     }
 }
 
@@ -240,7 +248,8 @@ impl AppendFile {
 
     /// Appends all of `bytes`.
     pub fn append(&mut self, bytes: &[u8]) -> StoreResult<()> {
-        if let Err(source) = self.file.write_all_at(bytes, self.length) {
+        let fault = self.journal.as_ref().map_or(Ok(()), |journal| journal.fault());
+        if let Err(source) = fault.and_then(|()| self.file.write_all_at(bytes, self.length)) {
             // Half an append is cut off again so that the file ends on a whole record.
             let _ = self.file.set_len(self.length);
             return Err(StoreError::new("write", &self.path, source));

@@ -1,0 +1,226 @@
+//! The whole store on a directory: what goes in comes out, and a failing card stops nothing else.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::mpsc::Receiver;
+use std::time::Duration;
+
+use super::flight::{self, FLIGHTS};
+use super::journal::Journal;
+use super::volume::Volume;
+use super::{Recording, Store, StoreHandle, StoreNotice};
+use crate::config::StoreConfig;
+use crate::io::capture::CaptureReader;
+use crate::io::clock::HostClock;
+use crate::io::records::{Record, Schema, topic};
+use crate::msg::{Event, EventBody, FrameEncoding, FramePayload};
+use crate::time::UtcTime;
+
+fn gps(clock: &HostClock, seq: u64) -> Event {
+    Event { t_recv: clock.now(), seq, body: EventBody::GnssBytes(format!("$GPGGA,{seq}\r\n").into_bytes()) }
+}
+
+fn frame(clock: &HostClock, index: u32) -> Event {
+    let t = clock.now();
+    let payload = FramePayload {
+        index,
+        t_exposure: t,
+        encoding: FrameEncoding::Grey,
+        width: 64,
+        height: 48,
+        stride: 64,
+        data: Arc::from(vec![index as u8; 64 * 48]),
+    };
+    Event { t_recv: t, seq: u64::from(index), body: EventBody::Frame(payload) }
+}
+
+fn estimate(clock: &HostClock, n: u32) -> Arc<Record> {
+    let now = clock.now();
+    Arc::new(Record {
+        topic: topic::target_state("ugv").into(),
+        schema: Schema::TargetState,
+        log_time: now,
+        publish_time: now,
+        data: n.to_le_bytes().to_vec(),
+    })
+}
+
+fn config(path: &Path) -> StoreConfig {
+    let free_target_mb = 0;
+    StoreConfig {
+        path: path.display().to_string(),
+        free_floor_mb: 8,
+        free_target_mb,
+        ..StoreConfig::default()
+    }
+}
+
+/// Waits for a notice of this name, up to ten seconds.
+fn expect_notice(notices: &Receiver<StoreNotice>, name: &str) -> StoreNotice {
+    loop {
+        match notices.recv_timeout(Duration::from_secs(10)) {
+            Ok(notice) if notice.name() == name => return notice,
+            Ok(_) => {}
+            Err(error) => panic!("no notice {name}: {error}"),
+        }
+    }
+}
+
+/// Waits until the card took something this often, up to ten seconds.
+fn wait_for_commits(handle: &StoreHandle, times: usize) {
+    let mut last = handle.status().last_commit_ns;
+    let mut seen = 0;
+    for _ in 0..1000 {
+        let now = handle.status().last_commit_ns;
+        seen += usize::from(now != last);
+        last = now;
+        if seen == times {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    panic!("no commit in ten seconds: {:?}", handle.status());
+}
+
+fn events_of(dir: &Path) -> (Vec<Vec<u8>>, u32) {
+    let (mut lines, mut frames) = (Vec::new(), 0);
+    let mut reader = CaptureReader::open(dir).unwrap();
+    for item in &mut reader {
+        match item.event.map(|e| e.body) {
+            Some(EventBody::GnssBytes(bytes)) => lines.push(bytes),
+            Some(EventBody::Frame(_)) => frames += 1,
+            _ => {}
+        }
+    }
+    assert_eq!(reader.take_warnings(), Vec::<String>::new());
+    (lines, frames)
+}
+
+#[test]
+fn a_flight_is_recorded_named_and_read_again() {
+    let dir = tempfile::tempdir().unwrap();
+    let clock = HostClock::start();
+    let volume = Volume::new(dir.path());
+    let (store, notices) = Store::start_on(volume.clone(), &config(dir.path()), "[gps]\n".into(), clock);
+    let handle = store.handle();
+    assert_eq!(handle.run(), 1);
+    for n in 0..40 {
+        handle.event(&gps(&clock, n));
+        handle.event(&frame(&clock, n as u32));
+        handle.record(estimate(&clock, n as u32), Some(n as u32));
+    }
+    handle.put_state("datum", vec![1, 2, 3]);
+    assert!(!handle.set_start(UtcTime::from_unix_ns(315_532_800_000_000_000)), "1980 is not believed");
+    assert!(handle.set_start(UtcTime::from_unix_ns(1_795_000_000_000_000_000)));
+    expect_notice(&notices, "flight_named");
+    store.stop();
+
+    let name = "20261118T110640Z";
+    assert_eq!(flight::flight_names(dir.path()).unwrap(), [name]);
+    let (lines, frames) = events_of(&dir.path().join(FLIGHTS).join(name));
+    assert_eq!((lines.len(), frames), (40, 40));
+    assert_eq!(lines[39], b"$GPGGA,39\r\n");
+    let info = flight::flight_info(dir.path(), name).unwrap();
+    assert!(info.closed);
+    assert_eq!(info.estimates().unwrap().count, 40);
+
+    // The next run finds state and queue of the one before.
+    let (store, _notices) = Store::start_on(volume, &config(dir.path()), String::new(), clock);
+    let handle = store.handle();
+    assert_eq!(handle.run(), 2);
+    assert_eq!(handle.state("datum", Duration::from_secs(5)), Some(vec![1, 2, 3]));
+    let index = handle.index().unwrap();
+    assert_eq!(index.queued_runs(), [(1, 0, 40)]);
+    let (number, record) = index.queued(1, 7, 8).next().unwrap();
+    assert_eq!(
+        (number, &record.data[..], &record.topic[..]),
+        (7, &7u32.to_le_bytes()[..], "/target/ugv/state")
+    );
+    store.stop();
+}
+
+#[test]
+fn a_failing_card_stops_recording_loudly_and_it_resumes() {
+    for (fault, free) in [
+        (Some(std::io::ErrorKind::StorageFull), None),
+        (Some(std::io::ErrorKind::ReadOnlyFilesystem), None),
+        (Some(std::io::ErrorKind::PermissionDenied), None),
+        (Some(std::io::ErrorKind::Other), None),
+        (None, Some(1 << 20)),
+    ] {
+        let dir = tempfile::tempdir().unwrap();
+        let clock = HostClock::start();
+        let journal = Arc::new(Journal::default());
+        let volume = Volume::journaled(dir.path(), Arc::clone(&journal));
+        let (store, notices) = Store::start_on(volume, &config(dir.path()), "[gps]\n".into(), clock);
+        let handle = store.handle();
+        expect_notice(&notices, "recording_started");
+        handle.event(&gps(&clock, 0));
+        wait_for_commits(&handle, 2);
+        journal.set_fault(fault);
+        journal.set_free(free);
+        handle.event(&gps(&clock, 1));
+        expect_notice(&notices, "recording_stopped");
+        assert!(matches!(handle.status().recording, Recording::Stopped(_)), "{fault:?}");
+        // Nothing waits meanwhile: a thousand frames are handed in at once.
+        (0..1000).for_each(|n| handle.event(&frame(&clock, n)));
+        std::thread::sleep(Duration::from_millis(300));
+        journal.set_fault(None);
+        journal.set_free(None);
+        expect_notice(&notices, "recording_resumed");
+        handle.event(&gps(&clock, 2));
+        expect_notice(&notices, "recording_dropout");
+        store.stop();
+        let name = flight::flight_names(dir.path()).unwrap().remove(0);
+        super::keeper::settle_flight(&Volume::new(dir.path()), &name, true, |_, _| {}).unwrap();
+        let (lines, _) = events_of(&dir.path().join(FLIGHTS).join(&name));
+        let kept: Vec<&[u8]> = lines.iter().map(|l| &l[..]).collect();
+        assert!(kept.contains(&&b"$GPGGA,0\r\n"[..]) && kept.contains(&&b"$GPGGA,2\r\n"[..]), "{fault:?}");
+        let info = flight::flight_info(dir.path(), &name).unwrap();
+        assert!(info.topics.contains_key("/store/dropout"), "{fault:?}: {:?}", info.topics.keys());
+    }
+}
+
+#[test]
+fn without_a_card_everything_else_goes_on() {
+    let dir = tempfile::tempdir().unwrap();
+    let missing = dir.path().join("not-there");
+    let clock = HostClock::start();
+    let (store, notices) = Store::start_on(Volume::new(&missing), &config(&missing), String::new(), clock);
+    let handle = store.handle();
+    assert!(handle.run() >= 0x8000_0000, "a number no card has");
+    let StoreNotice::Stopped { reason } = expect_notice(&notices, "recording_stopped") else { panic!() };
+    assert!(reason.contains("not-there"), "{reason}");
+    assert_eq!(handle.state("datum", Duration::ZERO), None);
+    // The card comes.
+    std::fs::create_dir(&missing).unwrap();
+    expect_notice(&notices, "recording_resumed");
+    handle.event(&gps(&clock, 3));
+    store.stop();
+    assert_eq!(flight::flight_names(&missing).unwrap(), ["boot-1"]);
+}
+
+#[test]
+fn a_broken_index_is_made_again_from_the_segments() {
+    let dir = tempfile::tempdir().unwrap();
+    let clock = HostClock::start();
+    let volume = Volume::new(dir.path());
+    let (store, notices) = Store::start_on(volume.clone(), &config(dir.path()), String::new(), clock);
+    let handle = store.handle();
+    (0..25).for_each(|n| handle.record(estimate(&clock, n), Some(n)));
+    handle.put_state("clock", vec![9]);
+    expect_notice(&notices, "recording_started");
+    store.stop();
+    let index = dir.path().join(super::index::INDEX);
+    for file in ["db", "conf"] {
+        std::fs::write(index.join(file), vec![0xA5; 70_000]).unwrap();
+    }
+    let (store, notices) = Store::start_on(volume, &config(dir.path()), String::new(), clock);
+    expect_notice(&notices, "index_rebuilding");
+    expect_notice(&notices, "index_ready");
+    let index = store.handle().index().unwrap();
+    assert_eq!(index.queued_runs(), [(1, 0, 25)]);
+    assert_eq!(index.state("clock"), Some(vec![9]));
+    assert_eq!(super::rebuild::differences(dir.path(), &index).unwrap().len(), 0);
+    store.stop();
+}

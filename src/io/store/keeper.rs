@@ -1,0 +1,357 @@
+//! The keeper thread: everything that may take long, so that recording never waits for it.
+//!
+//! Opens the index (or moves it aside and makes it again), commits its changes, seals what a power
+//! cut left, brings the index up to what lies on the card, and deletes old flights.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::time::Duration;
+
+use super::flight::{self, FLIGHTS, FlightInfo};
+use super::flight_writer::FinishedSegment;
+use super::index::{self, Change, INDEX, Index, IndexError, SegmentEntry};
+use super::rebuild;
+use super::retention;
+use super::seal::{self, Sealing};
+use super::shared::Shared;
+use super::status::StoreNotice;
+use super::volume::{StoreResult, Volume};
+use crate::config::StoreConfig;
+use crate::io::clock::HostClock;
+use crate::time::{MonoTime, Span};
+
+/// What the keeper is told.
+#[derive(Debug)]
+pub(super) enum Message {
+    /// Changes of which the segment is durable.
+    Changes(Vec<Change>),
+    /// A segment is closed.
+    SegmentDone {
+        /// Run.
+        session: u32,
+        /// The segment.
+        segment: FinishedSegment,
+    },
+    /// A flight began, or got another name.
+    Begun {
+        /// Run.
+        session: u32,
+        /// Name of its directory.
+        name: String,
+    },
+    /// The card is too full to record.
+    NeedSpace,
+    /// Queued records up to these are on the ground.
+    Cursor(String, u32, u32),
+}
+
+/// Work that waits its turn, one flight at a time.
+#[derive(Debug)]
+enum Task {
+    Sweep,
+    Look,
+    Settle(String),
+    Retain,
+}
+
+/// How often an index that cannot be opened is tried again.
+const RETRY_INDEX: Span = Span::from_ns(5_000_000_000);
+
+/// How often old flights are looked for.
+const RETAIN_EVERY: Span = Span::from_ns(60_000_000_000);
+
+/// Records are taken off the queue this many at a time.
+const TRIM_STEP: u64 = 1_000;
+
+pub(super) struct Keeper {
+    volume: Volume,
+    config: StoreConfig,
+    clock: HostClock,
+    shared: Arc<Shared>,
+    index: Option<Index>,
+    tried_at: Option<MonoTime>,
+    retained_at: MonoTime,
+    held: Vec<Change>,
+    queued: u64,
+    tasks: VecDeque<Task>,
+    present: Option<(u32, String)>,
+}
+
+impl Keeper {
+    pub(super) fn new(volume: Volume, config: StoreConfig, clock: HostClock, shared: Arc<Shared>) -> Self {
+        Self {
+            volume,
+            config,
+            clock,
+            shared,
+            index: None,
+            tried_at: None,
+            retained_at: clock.now(),
+            held: Vec::new(),
+            queued: 0,
+            tasks: VecDeque::new(),
+            present: None,
+        }
+    }
+
+    /// Runs until the recorder is gone.
+    pub(super) fn run(mut self, inbox: &Receiver<Message>) {
+        loop {
+            self.open_index();
+            let wait = if self.tasks.is_empty() { 500 } else { 0 };
+            match inbox.recv_timeout(Duration::from_millis(wait)) {
+                Ok(message) => self.hear(message),
+                // The recorder is gone before the store says stop: nothing comes any more.
+                Err(_) if self.shared.is_stopping() => break,
+                Err(RecvTimeoutError::Timeout) => self.step(),
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+        }
+        self.apply();
+        self.shared.set_index(None);
+    }
+
+    fn hear(&mut self, message: Message) {
+        match message {
+            Message::Changes(changes) => {
+                self.queued += changes.iter().filter(|c| matches!(c, Change::Queue(..))).count() as u64;
+                self.held.extend(changes);
+                self.trim();
+                self.apply();
+            }
+            Message::SegmentDone { session, segment } => {
+                self.held.push(Change::Segment(session, segment.number, entry_of(&segment)));
+            }
+            Message::Begun { session, name } => {
+                let first = self.present.is_none();
+                self.held.push(Change::Flight(session, name.clone()));
+                self.present = Some((session, name));
+                if first {
+                    self.tasks.push_back(Task::Sweep);
+                    self.tasks.push_back(Task::Look);
+                }
+            }
+            Message::NeedSpace => {
+                if !self.tasks.iter().any(|t| matches!(t, Task::Retain)) {
+                    self.tasks.push_front(Task::Retain);
+                }
+            }
+            Message::Cursor(station, run, through) => {
+                self.held.push(Change::Cursor(station, run, through));
+            }
+        }
+    }
+
+    /// The queue holds so many records; the oldest are taken off a thousand at a time.
+    fn trim(&mut self) {
+        let Some(index) = &self.index else { return };
+        if self.queued <= self.config.backfill_records + TRIM_STEP {
+            return;
+        }
+        if let Some((run, first, end)) = index.queued_runs().first().copied() {
+            let below = end.min(first.saturating_add(TRIM_STEP as u32));
+            self.held.push(Change::Unqueue(run, below));
+            self.queued = self.queued.saturating_sub(u64::from(below - first));
+        }
+    }
+
+    fn apply(&mut self) {
+        let Some(index) = &self.index else {
+            // Without an index only the newest are held; the segments have them all.
+            let excess = self.held.len().saturating_sub(20_000);
+            self.held.drain(..excess);
+            return;
+        };
+        if self.held.is_empty() {
+            return;
+        }
+        match index.apply(&self.held) {
+            Ok(()) => self.held.clear(),
+            Err(error) => {
+                self.shared.notice(StoreNotice::Failed { reason: error.to_string() });
+                self.close_index();
+            }
+        }
+    }
+
+    fn close_index(&mut self) {
+        self.index = None;
+        self.shared.set_index(None);
+        self.tried_at = Some(self.clock.now());
+    }
+
+    /// Opens the index once the card is there; an unusable one is moved aside and made again.
+    fn open_index(&mut self) {
+        let now = self.clock.now();
+        let waiting = self.tried_at.is_some_and(|tried| now - tried < RETRY_INDEX);
+        if self.index.is_some() || self.present.is_none() || waiting {
+            return;
+        }
+        self.tried_at = Some(now);
+        let dir = self.volume.path(INDEX);
+        let opened = match Index::open(&dir) {
+            Err(error @ IndexError::Unusable { .. }) => {
+                self.shared.notice(StoreNotice::IndexRebuilding { reason: error.to_string() });
+                match index::move_aside(&dir) {
+                    Ok(_) => Index::open(&dir),
+                    Err(_) => Err(error),
+                }
+            }
+            other => other,
+        };
+        match opened {
+            Ok(index) => {
+                self.queued = index.queued_runs().iter().map(|(_, first, end)| u64::from(end - first)).sum();
+                self.shared.set_index(Some(index.clone()));
+                self.index = Some(index);
+                self.tasks.push_back(Task::Look);
+                self.apply();
+            }
+            Err(error) => self.shared.notice(StoreNotice::Failed { reason: error.to_string() }),
+        }
+    }
+
+    /// One piece of work; whatever fails is told and tried again at the next start.
+    fn step(&mut self) {
+        let now = self.clock.now();
+        if now - self.retained_at >= RETAIN_EVERY {
+            self.retained_at = now;
+            self.tasks.push_back(Task::Retain);
+        }
+        let done = match self.tasks.pop_front() {
+            None => return,
+            Some(Task::Sweep) => flight::sweep(&self.volume),
+            Some(Task::Look) => self.look(),
+            Some(Task::Settle(name)) => self.settle(&name),
+            Some(Task::Retain) => self.retain(),
+        };
+        if let Err(error) = done {
+            self.shared.notice(StoreNotice::Failed { reason: error.to_string() });
+        }
+    }
+
+    fn is_present(&self, name: &str) -> bool {
+        self.present.as_ref().is_some_and(|(_, present)| present == name)
+    }
+
+    /// Compares the directories with the index: what the index does not know, or was not closed, is
+    /// settled flight by flight, newest first; what is gone is forgotten.
+    fn look(&mut self) -> StoreResult<()> {
+        let root = self.volume.root().to_owned();
+        let known = self.index.as_ref().map_or(Vec::new(), Index::flights);
+        let mut on_card = flight::flight_names(&root)?;
+        on_card.retain(|name| !self.is_present(name));
+        on_card.sort_unstable_by(|a, b| retention::age_order(&root, b).cmp(&retention::age_order(&root, a)));
+        for (run, name) in &known {
+            if !on_card.contains(name) && !self.is_present(name) {
+                self.held.push(Change::Forget(*run));
+            }
+        }
+        for name in on_card {
+            let closed = root.join(FLIGHTS).join(&name).join(flight::FLIGHT_FILE).exists();
+            let indexed = self.index.is_none() || known.iter().any(|(_, known)| *known == name);
+            if !closed || !indexed {
+                self.tasks.push_back(Task::Settle(name));
+            }
+        }
+        if self.index.is_some() && !self.tasks.iter().any(|t| matches!(t, Task::Settle(_))) {
+            self.shared.notice(StoreNotice::IndexReady { flights: known.len() });
+        }
+        Ok(())
+    }
+
+    /// Seals a flight's segments, writes its `flight.json`, puts it into the index.
+    fn settle(&mut self, name: &str) -> StoreResult<()> {
+        if self.is_present(name) || !self.volume.path(&format!("{FLIGHTS}/{name}")).is_dir() {
+            return Ok(());
+        }
+        let closed = self.volume.path(&format!("{FLIGHTS}/{name}/{}", flight::FLIGHT_FILE)).exists();
+        if !closed {
+            let shared = Arc::clone(&self.shared);
+            let sealed = settle_flight(&self.volume, name, false, |segment, sealing| {
+                let what = describe(sealing);
+                shared.notice(StoreNotice::Sealed { segment: segment.into(), what });
+            })?;
+            if sealed.is_none() {
+                return Ok(());
+            }
+        }
+        if let Some(index) = self.index.clone() {
+            let room = self.config.backfill_records.saturating_sub(self.queued);
+            self.queued += rebuild::index_flight(self.volume.root(), name, &index, room)?;
+            if !self.tasks.iter().any(|t| matches!(t, Task::Settle(_))) {
+                self.shared.notice(StoreNotice::IndexReady { flights: index.flights().len() });
+            }
+        }
+        Ok(())
+    }
+
+    fn retain(&mut self) -> StoreResult<()> {
+        let present = self.present.as_ref().map(|(_, name)| name.clone());
+        let start = self.shared.start();
+        let deleted = retention::make_room(&self.volume, &self.config, present.as_deref(), start)?;
+        for (info, reason) in deleted {
+            self.held.push(Change::Forget(info.session));
+            self.shared.notice(StoreNotice::Deleted { flight: info.name, reason });
+        }
+        let floor = self.config.free_floor_mb.max(self.config.free_target_mb) << 20;
+        if let Ok((free, _)) = self.volume.space()
+            && self.config.free_target_mb > 0
+            && free < floor
+        {
+            self.shared.notice(StoreNotice::AlmostFull { free_mb: free >> 20 });
+        }
+        Ok(())
+    }
+}
+
+fn entry_of(segment: &FinishedSegment) -> SegmentEntry {
+    let first = segment.topics.values().map(|t| t.first_ns).min().unwrap_or(0);
+    let last = segment.topics.values().map(|t| t.last_ns).max().unwrap_or(0);
+    let messages = segment.topics.values().map(|t| t.count).sum();
+    SegmentEntry { bytes: segment.bytes, messages, span_ns: (first, last) }
+}
+
+/// What sealing did, in words.
+pub fn describe(sealing: &Sealing) -> String {
+    match sealing {
+        Sealing::Whole => "whole".into(),
+        Sealing::Closed { chunks, cut_bytes } => {
+            format!("was cut off; {chunks} chunks kept, {cut_bytes} bytes behind them given up")
+        }
+        Sealing::Rewritten { chunks, lost_bytes } => {
+            format!("had holes; {chunks} chunks kept, {lost_bytes} bytes given up")
+        }
+        Sealing::Removed => "held no whole chunk and was removed".into(),
+    }
+}
+
+/// Seals all segments of a flight and writes its `flight.json`; a flight without any segment left is
+/// removed (`None`). `told` hears of every segment that was not whole.
+pub fn settle_flight(
+    volume: &Volume,
+    name: &str,
+    deep: bool,
+    mut told: impl FnMut(&str, &Sealing),
+) -> StoreResult<Option<FlightInfo>> {
+    let dir = format!("{FLIGHTS}/{name}");
+    let mut repaired = 0;
+    for segment in flight::segment_names(&volume.path(&dir)) {
+        let sealing = seal::seal_segment(volume, &dir, &segment, deep)?;
+        if sealing != Sealing::Whole {
+            repaired += 1;
+            told(&format!("{name}/{segment}"), &sealing);
+        }
+    }
+    if flight::segment_names(&volume.path(&dir)).is_empty() {
+        flight::delete(volume, name)?;
+        return Ok(None);
+    }
+    let path = volume.path(&dir);
+    let before = flight::flight_info(volume.root(), name)?.repaired;
+    let mut info = flight::summarize(&path)?;
+    info.repaired = before + repaired;
+    flight::write_info(volume, name, &info)?;
+    Ok(Some(info))
+}
