@@ -6,6 +6,7 @@ mod detect;
 mod error;
 mod keys;
 mod montecarlo;
+mod report;
 
 pub use error::{CliError, CliResult};
 
@@ -31,6 +32,8 @@ enum Command {
     Keys(keys::Args),
     /// Predict how well the ground is located from here: the paper's error analysis
     Montecarlo(montecarlo::Args),
+    /// Write a page about a flight
+    Report(report::Args),
     /// Find markers in images
     Detect(detect::Args),
 }
@@ -51,6 +54,7 @@ pub fn main() -> ExitCode {
         Command::CheckConfig(args) => check_config::run(&args),
         Command::Keys(args) => keys::run(&args),
         Command::Montecarlo(args) => montecarlo::run(&args),
+        Command::Report(args) => report::run(&args),
         Command::Detect(args) => detect::run(&args),
     };
     error::exit_code(result)

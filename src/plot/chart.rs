@@ -114,6 +114,12 @@ impl Chart {
         self
     }
 
+    /// Makes the vertical range that of these values, whatever else is drawn.
+    pub fn y_range_of(self, values: impl Iterator<Item = f64>) -> Self {
+        let (low, high) = range(values, 0.15);
+        self.y_range(low, high)
+    }
+
     /// The same scale on both axes, as maps have.
     pub fn equal(mut self) -> Self {
         self.equal = true;

@@ -1,0 +1,190 @@
+//! A flight read whole into memory for looking at: everything but the pictures.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use prost::Message;
+use prost_types::Timestamp;
+
+use crate::config::Config;
+use crate::geo::Geodetic;
+use crate::io::capture::{CaptureReader, attached_config};
+use crate::io::mcap_read::{RawMessage, ReadError};
+use crate::io::proto::{foxglove as fox, host_time, windhover as wh};
+use crate::io::records::topic;
+use crate::msg::{EventBody, FramePayload};
+use crate::time::{MonoTime, UtcTime};
+
+/// What was estimated of one target.
+#[derive(Clone, Debug, Default)]
+pub struct Track {
+    /// As known in real time, one a frame.
+    pub filtered: Vec<wh::TargetState>,
+    /// From the fixed-lag smoother.
+    pub smoothed: Vec<wh::TargetState>,
+    /// By the paper's method.
+    pub paper: Vec<wh::TargetState>,
+}
+
+/// A frame's arrival.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct FrameArrival {
+    /// When it was dequeued.
+    pub t_recv: MonoTime,
+    /// When it was exposed.
+    pub t_exposure: MonoTime,
+    /// Its size as recorded.
+    pub bytes: usize,
+}
+
+/// A flight.
+#[derive(Clone, Debug, Default)]
+pub struct Flight {
+    /// Name of its file or directory.
+    pub name: String,
+    /// The configuration it was flown or replayed with, as text.
+    pub config_text: Option<String>,
+    /// The same, understood.
+    pub config: Option<Config>,
+    /// Log time of the first message.
+    pub began: MonoTime,
+    /// Log time of the last message.
+    pub ended: MonoTime,
+    /// UTC of the first epoch that had a date.
+    pub utc: Option<UtcTime>,
+    /// What was damaged.
+    pub warnings: Vec<String>,
+    /// Origin of the NED frame.
+    pub datum: Option<Geodetic>,
+    /// Targets by name.
+    pub targets: BTreeMap<String, Track>,
+    /// The helicopter's own state, one a frame.
+    pub ownship: Vec<wh::Ownship>,
+    /// GPS epochs.
+    pub epochs: Vec<wh::GnssEpoch>,
+    /// Compass samples.
+    pub attitudes: Vec<wh::Attitude>,
+    /// What was seen in each frame.
+    pub detections: Vec<wh::Detections>,
+    /// What became of measurements.
+    pub fusion: Vec<wh::Fusion>,
+    /// Once a second.
+    pub health: Vec<wh::Health>,
+    /// Operator's notices.
+    pub notices: Vec<fox::Log>,
+    /// Losses, arrivals and departures of devices.
+    pub source_events: Vec<wh::SourceEvent>,
+    /// Reads of the GPS line: when, and how many bytes.
+    pub gps_reads: Vec<(MonoTime, usize)>,
+    /// Reads of the compass line.
+    pub compass_reads: Vec<(MonoTime, usize)>,
+    /// Frames, in the order of their numbers.
+    pub frames: Vec<FrameArrival>,
+}
+
+impl Flight {
+    /// Reads a capture or flight: a file, or a directory of segments.
+    pub fn read(path: &Path) -> Result<Self, ReadError> {
+        let mut flight = Self { name: name_of(path), ..Self::default() };
+        flight.config_text = attached_config(path)?;
+        flight.config = flight.config_text.as_deref().and_then(|text| Config::parse(text).ok());
+        let mut reader = CaptureReader::open(path)?;
+        let mut first = true;
+        for item in reader.by_ref() {
+            let t = item.raw.log_time;
+            if first {
+                (flight.began, first) = (t, false);
+            }
+            flight.ended = flight.ended.max(t);
+            match item.event.map(|event| event.body) {
+                Some(EventBody::GnssBytes(bytes)) => flight.gps_reads.push((t, bytes.len())),
+                Some(EventBody::CompassBytes(bytes)) => flight.compass_reads.push((t, bytes.len())),
+                Some(EventBody::Frame(frame)) => flight.frames.push(FrameArrival {
+                    t_recv: t,
+                    t_exposure: frame.t_exposure,
+                    bytes: frame.data.len(),
+                }),
+                _ => flight.take(&item.raw),
+            }
+        }
+        flight.warnings = reader.take_warnings();
+        flight.utc = flight.epochs.iter().find_map(|e| e.utc_ns).map(UtcTime::from_unix_ns);
+        Ok(flight)
+    }
+
+    fn take(&mut self, raw: &RawMessage) {
+        match raw.channel.topic.as_str() {
+            topic::OWNSHIP => keep(&mut self.ownship, raw),
+            topic::GPS_EPOCH => keep(&mut self.epochs, raw),
+            topic::COMPASS_ATTITUDE => keep(&mut self.attitudes, raw),
+            topic::CAMERA_DETECTIONS => keep(&mut self.detections, raw),
+            topic::FUSION => keep(&mut self.fusion, raw),
+            topic::HEALTH => keep(&mut self.health, raw),
+            topic::LOG => keep(&mut self.notices, raw),
+            topic::SOURCE_EVENT => keep(&mut self.source_events, raw),
+            topic::DATUM => {
+                if let Ok(d) = wh::Datum::decode(&raw.data[..]) {
+                    self.datum =
+                        Some(Geodetic { lat_deg: d.lat_deg, lon_deg: d.lon_deg, height_m: d.height_m });
+                }
+            }
+            other => self.take_target(other, raw),
+        }
+    }
+
+    fn take_target(&mut self, topic: &str, raw: &RawMessage) {
+        let Some((name, what)) = topic.strip_prefix("/target/").and_then(|rest| rest.rsplit_once('/')) else {
+            return;
+        };
+        let wanted = matches!(what, "state" | "smoothed" | "paper");
+        if !wanted {
+            return;
+        }
+        let track = self.targets.entry(name.to_owned()).or_default();
+        match what {
+            "state" => keep(&mut track.filtered, raw),
+            "smoothed" => keep(&mut track.smoothed, raw),
+            _ => keep(&mut track.paper, raw),
+        }
+    }
+
+    /// Seconds from the beginning.
+    pub fn seconds(&self, t: MonoTime) -> f64 {
+        (t - self.began).s()
+    }
+
+    /// The same for a message's time.
+    pub fn at(&self, t: Option<&Timestamp>) -> f64 {
+        self.seconds(host_time(t))
+    }
+
+    /// Its length, seconds.
+    pub fn duration_s(&self) -> f64 {
+        (self.ended - self.began).s()
+    }
+}
+
+fn keep<M: Message + Default>(list: &mut Vec<M>, raw: &RawMessage) {
+    // A message that cannot be decoded is of another version; the reader tells of damage.
+    list.extend(M::decode(&raw.data[..]).ok());
+}
+
+fn name_of(path: &Path) -> String {
+    path.file_stem().map_or_else(|| path.display().to_string(), |stem| stem.to_string_lossy().into_owned())
+}
+
+/// Calls `each` for the frames with these numbers (ascending), in order.
+pub fn frames(path: &Path, numbers: &[u32], mut each: impl FnMut(&FramePayload)) -> Result<(), ReadError> {
+    let Some(last) = numbers.last() else { return Ok(()) };
+    for item in CaptureReader::open(path)? {
+        if let Some(EventBody::Frame(frame)) = item.event.map(|event| event.body) {
+            if numbers.binary_search(&frame.index).is_ok() {
+                each(&frame);
+            }
+            if frame.index >= *last {
+                break;
+            }
+        }
+    }
+    Ok(())
+}
