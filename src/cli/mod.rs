@@ -7,6 +7,7 @@ mod error;
 mod keys;
 mod montecarlo;
 mod report;
+mod store;
 
 pub use error::{CliError, CliResult};
 
@@ -34,6 +35,8 @@ enum Command {
     Montecarlo(montecarlo::Args),
     /// Write a page about a flight
     Report(report::Args),
+    /// See and tend the flights on the data card
+    Store(store::Args),
     /// Find markers in images
     Detect(detect::Args),
 }
@@ -55,6 +58,7 @@ pub fn main() -> ExitCode {
         Command::Keys(args) => keys::run(&args),
         Command::Montecarlo(args) => montecarlo::run(&args),
         Command::Report(args) => report::run(&args),
+        Command::Store(args) => store::run(&args),
         Command::Detect(args) => detect::run(&args),
     };
     error::exit_code(result)

@@ -11,6 +11,7 @@ use std::time::Duration;
 use super::flight::{self, FLIGHTS, FlightInfo};
 use super::flight_writer::FinishedSegment;
 use super::index::{self, Change, INDEX, Index, IndexError, SegmentEntry};
+use super::inspect;
 use super::rebuild;
 use super::retention;
 use super::seal::{self, Sealing};
@@ -242,7 +243,7 @@ impl Keeper {
         let known = self.index.as_ref().map_or(Vec::new(), Index::flights);
         let mut on_card = flight::flight_names(&root)?;
         on_card.retain(|name| !self.is_present(name));
-        on_card.sort_unstable_by(|a, b| retention::age_order(&root, b).cmp(&retention::age_order(&root, a)));
+        on_card.sort_by_cached_key(|name| std::cmp::Reverse(retention::age_order(&root, name)));
         for (run, name) in &known {
             if !on_card.contains(name) && !self.is_present(name) {
                 self.held.push(Change::Forget(*run));
@@ -349,7 +350,7 @@ pub fn settle_flight(
         return Ok(None);
     }
     let path = volume.path(&dir);
-    let before = flight::flight_info(volume.root(), name)?.repaired;
+    let before = inspect::glance(volume.root(), name)?.repaired;
     let mut info = flight::summarize(&path)?;
     info.repaired = before + repaired;
     flight::write_info(volume, name, &info)?;

@@ -4,6 +4,8 @@
 //! the only one to wait for the card, one keeps house (index, sealing, old flights). Callers hold a
 //! [`StoreHandle`] and never wait. `docs/storage.md` tells the layout and what is guaranteed.
 
+#[cfg(test)]
+mod crash_tests;
 mod encode;
 pub mod flight;
 pub mod flight_writer;
@@ -13,6 +15,7 @@ mod handle;
 #[cfg(test)]
 mod handle_tests;
 pub mod index;
+pub mod inspect;
 pub mod journal;
 pub mod keeper;
 pub mod queue;

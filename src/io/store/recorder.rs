@@ -12,6 +12,7 @@ use std::time::Duration;
 use super::encode::{parse_state, unsigned};
 use super::flight_writer::{self, FlightWriter, SegmentLimits};
 use super::index::{Change, QueuedRecord};
+use super::inspect::RecorderLock;
 use super::keeper::Message;
 use super::queue::{Drops, Popped, Queue};
 use super::record::{ChannelDef, DROPOUT_TOPIC, RawRecord, STATE_TOPIC, Weight};
@@ -57,6 +58,7 @@ pub(super) struct Recorder {
     changes: Vec<Change>,
     committed: Durations,
     dropouts: Arc<ChannelDef>,
+    lock: Option<RecorderLock>,
 }
 
 impl Recorder {
@@ -81,6 +83,7 @@ impl Recorder {
             changes: Vec::new(),
             committed: Durations::default(),
             dropouts: ChannelDef::json(DROPOUT_TOPIC),
+            lock: None,
         }
     }
 
@@ -262,6 +265,9 @@ impl Recorder {
             let full = std::io::Error::from(std::io::ErrorKind::StorageFull);
             return Err(StoreError::new("keep a reserve on", self.volume.root(), full));
         }
+        // The lock of a card that was pulled is worth nothing: it is taken anew.
+        self.lock = None;
+        self.lock = Some(RecorderLock::acquire(self.volume.root())?);
         let now_ns = unsigned(self.clock.now());
         let start = self.shared.start();
         if let Some(flight) = &mut self.flight {
@@ -323,14 +329,12 @@ impl Recorder {
         if self.changes.is_empty() {
             return;
         }
-        match self.keeper.try_send(Message::Changes(std::mem::take(&mut self.changes))) {
-            Err(TrySendError::Full(Message::Changes(held))) => {
-                self.changes = held;
-                let excess = self.changes.len().saturating_sub(MAX_CHANGES);
-                self.changes.drain(..excess);
-            }
-            // Sent, or nobody keeps an index any more.
-            _ => {}
+        // Sent, or nobody keeps an index any more; only a keeper that is behind is tried again.
+        let sent = self.keeper.try_send(Message::Changes(std::mem::take(&mut self.changes)));
+        if let Err(TrySendError::Full(Message::Changes(held))) = sent {
+            self.changes = held;
+            let excess = self.changes.len().saturating_sub(MAX_CHANGES);
+            self.changes.drain(..excess);
         }
     }
 

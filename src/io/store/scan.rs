@@ -233,7 +233,7 @@ impl SegmentFile {
             let record = self.record(at).filter(|(code, _)| *code != op::CHUNK);
             let Some((code, body)) = record else {
                 // A head ends on a page; anywhere else it is cut or holed.
-                salvage.head_whole = at % PAGE == 0;
+                salvage.head_whole = at.is_multiple_of(PAGE);
                 return at;
             };
             let place = (at, RECORD_HEAD as u64 + body.len() as u64);
@@ -302,7 +302,7 @@ impl SegmentFile {
         }
         match self.record(at) {
             Some((format::PADDING, body)) => Some(at + RECORD_HEAD as u64 + body.len() as u64),
-            _ => (at % PAGE == 0).then_some(at),
+            _ => (at.is_multiple_of(PAGE)).then_some(at),
         }
     }
 

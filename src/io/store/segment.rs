@@ -137,7 +137,8 @@ impl SegmentWriter {
         }
         let (channel, new) = definitions.number(&record.channel);
         let chunk = if record.weight == Weight::Frame { &mut self.frames } else { &mut self.small };
-        let repeat = chunk.records.is_empty() && self.summary.chunk_count() % REPEAT_DEFINITIONS == 0;
+        let repeat =
+            chunk.records.is_empty() && self.summary.chunk_count().is_multiple_of(REPEAT_DEFINITIONS);
         if repeat {
             definitions.put(&mut chunk.records);
         } else if new {

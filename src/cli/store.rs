@@ -1,0 +1,181 @@
+//! `windhover store …`: flights on the flash card.
+
+mod check;
+mod show;
+
+use std::io::{BufRead, IsTerminal, Write};
+use std::path::{Path, PathBuf};
+
+use clap::{Args as ClapArgs, Subcommand};
+
+use super::{CliError, CliResult};
+use crate::app::config_file;
+use crate::io::store::flight;
+use crate::io::store::inspect;
+use crate::io::store::volume::Volume;
+
+/// See and tend the flights on the data card.
+///
+/// FLIGHT is a directory name as `store list` shows it, or the beginning of one that no other has.
+/// Everything but `rebuild` works while the daemon records; it never touches the flight in the air.
+#[derive(ClapArgs, Debug)]
+pub(super) struct Args {
+    /// Configuration that tells where the store is
+    #[arg(long, global = true, value_name = "FILE", default_value = "/etc/windhover/windhover.toml")]
+    config: PathBuf,
+    /// Directory of the store, instead of the configuration's store.path
+    #[arg(long, global = true, value_name = "DIR")]
+    path: Option<PathBuf>,
+    #[command(subcommand)]
+    action: Action,
+}
+
+#[derive(Subcommand, Debug)]
+enum Action {
+    /// List all flights, oldest first
+    List {
+        /// One JSON object a line
+        #[arg(long)]
+        json: bool,
+    },
+    /// Tell all about a flight: durations, sizes, gaps, dropouts, and what it costs the card
+    Show {
+        /// Flight
+        flight: String,
+        /// As JSON
+        #[arg(long)]
+        json: bool,
+    },
+    /// Read flights whole and compare them with the index; changes nothing
+    Verify {
+        /// Flights [default: all]
+        flight: Vec<String>,
+    },
+    /// Seal segments that are cut or holed, keeping every whole chunk
+    Repair {
+        /// Flights [default: all]
+        flight: Vec<String>,
+    },
+    /// Make the index again from the segments (the daemon must not run)
+    Rebuild,
+    /// Never delete a flight to make room
+    Keep {
+        /// Flights
+        #[arg(required = true)]
+        flight: Vec<String>,
+        /// Take the mark away again
+        #[arg(long)]
+        undo: bool,
+    },
+    /// Delete flights
+    Delete {
+        /// Flights
+        #[arg(required = true)]
+        flight: Vec<String>,
+        /// Do not ask
+        #[arg(long, short)]
+        yes: bool,
+    },
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    let root = match &args.path {
+        Some(path) => path.clone(),
+        None => PathBuf::from(config_file::load(&args.config).map_err(CliError::config)?.store.path),
+    };
+    if !root.is_dir() {
+        let root = root.display();
+        return Err(CliError::failed(format!("no store at {root}; is the data card mounted? (--path DIR)")));
+    }
+    match &args.action {
+        Action::List { json } => show::list(&root, *json),
+        Action::Show { flight, json } => show::show(&root, &resolve(&root, flight)?, *json),
+        Action::Verify { flight } => check::verify(&root, &resolve_all(&root, flight)?, flight.is_empty()),
+        Action::Repair { flight } => check::repair(&root, &resolve_all(&root, flight)?),
+        Action::Rebuild => check::rebuild(&root),
+        Action::Keep { flight, undo } => keep(&root, &resolve_all(&root, flight)?, !undo),
+        Action::Delete { flight, yes } => delete(&root, &resolve_all(&root, flight)?, *yes),
+    }
+}
+
+/// The flight of that name, or the only one whose name begins so.
+fn resolve(root: &Path, asked: &str) -> Result<String, CliError> {
+    // Shells complete to paths: the last part counts.
+    let asked = asked.trim_end_matches('/').rsplit('/').next().unwrap_or(asked);
+    let names = flight::flight_names(root)?;
+    if names.iter().any(|name| name == asked) {
+        return Ok(asked.to_owned());
+    }
+    let mut like: Vec<&String> = names.iter().filter(|name| name.starts_with(asked)).collect();
+    like.sort_unstable();
+    match like[..] {
+        [one] => Ok(one.clone()),
+        [] => Err(CliError::failed(format!(
+            "no flight {asked:?} in {}; see `windhover store list`",
+            root.display()
+        ))),
+        _ => Err(CliError::failed(format!(
+            "{asked:?} may be {} or {}; give more of the name",
+            like[0], like[1]
+        ))),
+    }
+}
+
+/// The flights asked for; all, oldest first, where none was.
+fn resolve_all(root: &Path, asked: &[String]) -> Result<Vec<String>, CliError> {
+    if asked.is_empty() {
+        return Ok(inspect::list(root)?.0.into_iter().map(|info| info.name).collect());
+    }
+    asked.iter().map(|name| resolve(root, name)).collect()
+}
+
+fn keep(root: &Path, names: &[String], keep: bool) -> CliResult {
+    let volume = Volume::new(root);
+    for name in names {
+        flight::set_keep(&volume, name, keep)?;
+        println!("{name}: {}", if keep { "kept" } else { "may be deleted to make room" });
+    }
+    Ok(())
+}
+
+fn delete(root: &Path, names: &[String], yes: bool) -> CliResult {
+    refuse_in_the_air(root, names)?;
+    let volume = Volume::new(root);
+    for name in names {
+        let info = inspect::glance(root, name)?;
+        if info.keep {
+            return Err(CliError::failed(format!(
+                "{name} is marked keep; `windhover store keep --undo {name}` first"
+            )));
+        }
+        if !yes && !asked(&format!("delete {name}, {}?", show::size(info.bytes)))? {
+            println!("{name}: left as it is");
+            continue;
+        }
+        flight::delete(&volume, name)?;
+        println!("{name}: deleted");
+    }
+    Ok(())
+}
+
+fn refuse_in_the_air(root: &Path, names: &[String]) -> CliResult {
+    match inspect::in_the_air(root)? {
+        Some(present) if names.contains(&present) => {
+            Err(CliError::failed(format!("{present} is being recorded; stop the daemon first")))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Asks on the terminal; without one, `--yes` must say it.
+fn asked(question: &str) -> Result<bool, CliError> {
+    let stdin = std::io::stdin();
+    if !stdin.is_terminal() {
+        return Err(CliError::usage("there is no terminal to ask on; say --yes"));
+    }
+    eprint!("{question} [y/N] ");
+    std::io::stderr().flush()?;
+    let mut answer = String::new();
+    stdin.lock().read_line(&mut answer)?;
+    Ok(matches!(answer.trim(), "y" | "Y" | "yes"))
+}
