@@ -296,3 +296,36 @@ impl Disk {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::super::volume::Volume;
+    use super::*;
+
+    /// What a cut leaves of `F/a`, written in two appends of which only the first was synced.
+    fn left(loss: Loss) -> Vec<u8> {
+        let (live, image) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let journal = Arc::new(Journal::default());
+        let volume = Volume::journaled(live.path(), Arc::clone(&journal));
+        volume.create_dir("F").unwrap();
+        volume.sync_dir("").unwrap();
+        let mut file = volume.create("F/a").unwrap();
+        file.append(&[1; 4096]).unwrap();
+        file.sync().unwrap();
+        volume.sync_dir("F").unwrap();
+        file.append(&[2; 8192]).unwrap();
+        volume.create("F/b").unwrap();
+        journal.image(journal.len(), loss, image.path()).unwrap();
+        assert_eq!(image.path().join("F/b").exists(), matches!(loss, Loss::Nothing | Loss::TornTail));
+        std::fs::read(image.path().join("F/a")).unwrap()
+    }
+
+    #[test]
+    fn what_no_barrier_covers_may_be_lost() {
+        assert_eq!(left(Loss::FlushedOnly).len(), 4096);
+        assert_eq!(left(Loss::Nothing).len(), 12288);
+        assert_eq!(left(Loss::TornTail).len(), 8192);
+    }
+}

@@ -216,10 +216,10 @@ impl Recorder {
     /// Says why nothing is recorded, once.
     fn stop(&mut self, reason: String) {
         self.retry_at = self.clock.now() + RETRY_EVERY;
+        self.shared.status().recording = Recording::Stopped(reason.clone());
         if self.trouble.as_ref() != Some(&reason) {
             self.shared.notice(StoreNotice::Stopped { reason: reason.clone() });
         }
-        self.shared.status().recording = Recording::Stopped(reason.clone());
         self.trouble = Some(reason);
     }
 
@@ -240,14 +240,14 @@ impl Recorder {
         match self.try_open() {
             Ok(()) => {
                 let flight = self.flight.as_ref().map_or_else(String::new, |f| f.name().to_owned());
-                let notice = match self.trouble.take() {
-                    Some(_) => StoreNotice::Resumed { flight: flight.clone() },
-                    None => StoreNotice::Started { flight: flight.clone() },
-                };
-                self.shared.notice(notice);
                 let mut status = self.shared.status();
                 status.recording = Recording::On;
-                status.flight = flight;
+                status.flight.clone_from(&flight);
+                drop(status);
+                self.shared.notice(match self.trouble.take() {
+                    Some(_) => StoreNotice::Resumed { flight },
+                    None => StoreNotice::Started { flight },
+                });
             }
             Err(error) => self.stop(error.to_string()),
         }
