@@ -157,6 +157,39 @@ impl Estimator {
         state.expect(&self.core.models)
     }
 
+    /// How much older GPS is than configured, as learnt so far, seconds.
+    pub fn gps_delay_s(&self) -> f64 {
+        self.core.state.own.gps_delay_s
+    }
+
+    /// One line on what the filter believes of the sensors and of the intensities of motion.
+    pub fn inside(&self) -> String {
+        let (own, l) = (&self.core.state.own, &self.core.state.learnt);
+        let sigma = |i: usize| self.core.state.cov.at(i, i).max(0.0).sqrt();
+        let targets: Vec<String> =
+            l.target_q.iter().map(|q| format!("{:.3}/{:.3}", q[0].sqrt(), q[1].sqrt())).collect();
+        format!(
+            "heading bias {:.2}±{:.2} deg, tilt gain {:.2}±{:.2}, tilt bias {:.2},{:.2}±{:.2} deg, delay {:.0}±{:.0} ms, \
+             sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} force {:.2}/{:.2} targets {}",
+            own.heading_bias.to_degrees(),
+            sigma(super::state::at::HEADING_BIAS).to_degrees(),
+            own.tilt_gain,
+            sigma(super::state::at::TILT_GAIN),
+            own.tilt_bias.x.to_degrees(),
+            own.tilt_bias.y.to_degrees(),
+            sigma(super::state::at::TILT_BIAS).to_degrees(),
+            own.gps_delay_s * 1e3,
+            sigma(super::state::at::GPS_DELAY) * 1e3,
+            l.heading_var.sqrt().to_degrees(),
+            l.tilt_var.sqrt().to_degrees(),
+            l.tilt_rate_q.sqrt(),
+            l.yaw_rate_q.sqrt(),
+            l.side_force_var.sqrt(),
+            l.thrust_var.sqrt(),
+            targets.join(" ")
+        )
+    }
+
     fn start(&mut self, epoch: &Stamped<GnssEpoch>, out: &mut Vec<EstimatorOutput>) -> bool {
         let Some(compass) = self.compass.filter(|c| (epoch.t_valid - c.t_valid).abs() <= COMPASS_AGE) else {
             return false;

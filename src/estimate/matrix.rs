@@ -46,6 +46,21 @@ impl Grid {
         axpy(&mut tail[..self.cols], a, &head[from * self.cols..(from + 1) * self.cols]);
     }
 
+    /// `row[to] += a row[from]`, whichever comes first.
+    pub(super) fn add_row_from(&mut self, to: usize, a: f64, from: usize) {
+        let (low, high) = (to.min(from), to.max(from));
+        let (head, tail) = self.data.split_at_mut(high * self.cols);
+        let (low, high) = (&mut head[low * self.cols..][..self.cols], &mut tail[..self.cols]);
+        if to < from { axpy(low, a, high) } else { axpy(high, a, low) }
+    }
+
+    /// `column[to] += a column[from]`
+    pub(super) fn add_column_from(&mut self, to: usize, a: f64, from: usize) {
+        for row in self.data.chunks_exact_mut(self.cols) {
+            row[to] += a * row[from];
+        }
+    }
+
     /// Copies without allocating where the sizes match.
     pub(super) fn copy_from(&mut self, other: &Self) {
         self.cols = other.cols;

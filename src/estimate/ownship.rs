@@ -295,7 +295,7 @@ pub(super) fn start(
     variances[at::GPS_BIAS..at::GPS_BIAS + 3].copy_from_slice(models.gps_bias_var.as_slice());
     variances[at::HEADING_BIAS] = models.heading_bias_var;
     variances[at::TILT_GAIN] = START_TILT_GAIN.powi(2);
-    variances[at::TILT_BIAS..at::TILT_BIAS + 2].fill(0.005 * 0.005);
+    variances[at::TILT_BIAS..at::TILT_BIAS + 2].fill(START_TILT_BIAS.powi(2));
     variances[at::GPS_DELAY] = models.gps_delay_var;
     for (i, variance) in variances.into_iter().enumerate() {
         state.cov.set(i, i, variance);
@@ -305,5 +305,7 @@ pub(super) fn start(
 
 /// Tilt at the start, one sigma, rad: what a helicopter may fly with whatever its compass says.
 const START_TILT: f64 = 0.1;
+/// Zero offset of a tilt sensor, one sigma, rad (0.4°: data sheets allow 0.2° to 0.5°).
+const START_TILT_BIAS: f64 = 0.007;
 /// How far from 1 the share of tilt read may be at the start, one sigma.
 const START_TILT_GAIN: f64 = 0.5;

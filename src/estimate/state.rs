@@ -287,6 +287,38 @@ impl State {
         }
     }
 
+    /// Carries the covariance over to the estimate that an update has just moved by `dx`.
+    ///
+    /// What is seen of vehicles and ground says nothing of absolute heading: turning helicopter,
+    /// velocity and everything seen about the vertical together changes no pixel. In error states
+    /// that direction is `(e_D × p̂, e_D × v̂, 1, e_D × f̂, …)`; it depends on the estimate, so an update
+    /// that moves p̂ by Δ leaves the covariance with the old one, and the filter gains heading it never
+    /// measured. Adding `e_D × Δ` times the heading error to each horizontal vector's error keeps the
+    /// direction where it belongs (the error of an invariant filter, restricted to the vertical axis:
+    /// Barrau and Bonnabel 2017).
+    pub(super) fn keep_heading_unobserved(&mut self, dx: &[f64]) {
+        let vectors = self.len();
+        let turn = at::ATTITUDE + 2;
+        let starts = [at::POSITION, at::VELOCITY]
+            .into_iter()
+            .chain((0..self.targets.len()).map(|i| at::OWN + at::TARGET * i))
+            .chain((at::OWN + at::TARGET * self.targets.len()..vectors).step_by(at::FEATURE));
+        for start in starts {
+            let (north, east) = (-dx[start + 1], dx[start]);
+            if north == 0.0 && east == 0.0 {
+                continue;
+            }
+            self.cov.add_row_from(start, north, turn);
+            self.cov.add_row_from(start + 1, east, turn);
+            self.cov.add_column_from(start, north, turn);
+            self.cov.add_column_from(start + 1, east, turn);
+            for echo in self.echoes.iter_mut().chain([&mut self.probe]).filter(|e| e.live) {
+                echo.cross.add_column_from(start, north, turn);
+                echo.cross.add_column_from(start + 1, east, turn);
+            }
+        }
+    }
+
     /// Whether every mean is a number and every variance a number not below zero.
     pub(super) fn is_sound(&self) -> bool {
         let diagonal = (0..self.len()).all(|i| {

@@ -187,6 +187,7 @@ impl Workspace {
             self.update_echo(echo, z, l, white);
         }
         state.inject(&self.dx);
+        state.keep_heading_unobserved(&self.dx);
     }
 
     /// Fixed-point smoothing: the copy `c` moves by `P_cx Hᵀ S⁻¹ r`.
