@@ -55,7 +55,8 @@ impl Score {
             let last: Matrix3<f64> = p.fixed_view::<3, 3>(2, 2).into();
             let e3 = e.fixed_rows::<3>(2).into_owned();
             self.nees3 += last.try_inverse().map_or(f64::NAN, |i| (e3.transpose() * i * e3)[0]);
-            self.nees5 += p.try_inverse().map_or(f64::NAN, |i: SMatrix<f64, 5, 5>| (e.transpose() * i * e)[0]);
+            self.nees5 +=
+                p.try_inverse().map_or(f64::NAN, |i: SMatrix<f64, 5, 5>| (e.transpose() * i * e)[0]);
             let two = p.fixed_view::<2, 2>(0, 0).into_owned();
             let e2 = e.fixed_rows::<2>(0).into_owned();
             self.nees2 += two.try_inverse().map_or(f64::NAN, |i| (e2.transpose() * i * e2)[0]);
@@ -201,7 +202,16 @@ fn main() {
     }
     println!(
         "{:<18} {:<9} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>6}",
-        "scenario", "method", "rel m", "heading deg", "speed m/s", "yaw rate", "NEES3", "NEES5", "NEES pos", "cover"
+        "scenario",
+        "method",
+        "rel m",
+        "heading deg",
+        "speed m/s",
+        "yaw rate",
+        "NEES3",
+        "NEES5",
+        "NEES pos",
+        "cover"
     );
     for name in names {
         let mut scenario = Scenario::named(&name).unwrap_or_else(|| panic!("no scenario {name}"));

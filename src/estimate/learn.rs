@@ -118,7 +118,7 @@ impl State {
         let age_s = (now - echo.t).s();
         for (i, target) in self.targets.iter().enumerate() {
             // A target started again since then has nothing in common with its copy.
-            let same = target.held && target.seen > 2 && echo.status[i] != crate::msg::TrackStatus::Lost;
+            let same = target.held && echo.t >= target.started;
             if !same || target.last_seen < now {
                 continue;
             }

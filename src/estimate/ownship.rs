@@ -201,7 +201,7 @@ impl Core {
             }
             z.set(i, gain, sign * d[i]);
             z.set(i, bias + i, 1.0);
-            z.noise[i][i] = self.state.learnt.tilt_var;
+            z.noise[i][i] = self.state.learnt.tilt_var + UNTIED * product_var(&self.state, i, &d_attitude);
         }
         let residual = [z.residual[0], z.residual[1]];
         let outcome = self.fuse_gated(FusionSource::CompassTilt);
@@ -230,6 +230,24 @@ impl Core {
 
 /// What one compass reading counts in a sliding mean, s: the interval of a 30 Hz compass.
 const SAMPLE_GAIN_S: f64 = 1.0 / 30.0;
+
+/// Readings over which the product of the errors of gain and tilt stays what it is: two seconds of a
+/// 30 Hz compass. Its variance counts so many times, since it does not average out.
+const UNTIED: f64 = 60.0;
+
+/// Variance of the product of the errors of tilt gain and of `d_i`, which the linear model leaves out:
+/// as long as the gain is unknown, a reading near zero does not prove that the aircraft is level.
+fn product_var(state: &State, i: usize, d_attitude: &Matrix3<f64>) -> f64 {
+    let (mut tilt_var, mut mixed) = (0.0, 0.0);
+    for a in 0..3 {
+        for b in 0..3 {
+            let p = state.cov.at(at::ATTITUDE + a, at::ATTITUDE + b);
+            tilt_var += d_attitude[(i, a)] * d_attitude[(i, b)] * p;
+        }
+        mixed += d_attitude[(i, a)] * state.cov.at(at::ATTITUDE + a, at::TILT_GAIN);
+    }
+    (state.cov.at(at::TILT_GAIN, at::TILT_GAIN) * tilt_var + mixed * mixed).max(0.0)
+}
 
 fn antenna_velocity(own: &Own, models: &Models) -> Vector3<f64> {
     own.velocity + own.ned_from_body * own.rate.cross(&models.antenna_at)

@@ -104,6 +104,10 @@ pub(super) struct Target {
     pub(super) last_seen: MonoTime,
     /// Frames it was seen in since it was last started.
     pub(super) seen: u32,
+    /// When the present track was (last) started: nothing ties it to copies from before.
+    pub(super) started: MonoTime,
+    /// When and where (north, east) it was first seen since it was last unknown.
+    pub(super) first_seen: (MonoTime, [f64; 2]),
     /// Frames in a row in which its markers lay outside the gate.
     pub(super) rejected: u32,
 }

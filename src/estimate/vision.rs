@@ -9,7 +9,7 @@ use crate::msg::{Disposition, FeatureTrack, FrameObservations, FusionSource, Mar
 use super::core::Core;
 use super::models::Models;
 use super::state::{Own, State, Target, at};
-use super::track::started;
+use super::track::{FRAMES_TO_START, started, started_again};
 use super::update::Measurement;
 
 /// A point of the world in the image, with its derivatives.
@@ -77,8 +77,9 @@ impl Core {
             self.state.targets[index].unseen(t, lost_after);
             return;
         }
-        if !target.held || away {
-            self.start_target(index, markers);
+        if !target.held || away || target.seen < FRAMES_TO_START {
+            let before = target.held.then_some(*target).filter(|_| !away);
+            self.start_target(index, markers, before);
             return;
         }
         let mut good = 0;
@@ -99,7 +100,7 @@ impl Core {
             target.rejected += 1;
             let patience = if target.status == TrackStatus::Tracking { restart_after } else { 2 };
             if target.rejected >= patience {
-                self.start_target(index, markers);
+                self.start_target(index, markers, None);
                 return;
             }
         }
@@ -112,7 +113,7 @@ impl Core {
         let start = self.state.target_at(index);
         let mean = self.state.targets[index].mean;
         let model = &self.models.targets[index].markers[marker];
-        let floor = Matrix2::identity() * self.models.marker_var_px2;
+        let floor = Matrix2::identity() * (self.models.marker_var_px2 + self.curvature_px2());
         let points: &[Vector3<f64>] = match (&model.corners, &seen.corners_px) {
             (Some(corners), Some(_)) => corners,
             _ => std::slice::from_ref(&model.center),
@@ -145,19 +146,32 @@ impl Core {
         outcome.disposition == Disposition::Fused
     }
 
+    /// What the linear model leaves out of a pixel while tilt is hardly known, px²: a tilt error δ bends
+    /// the image by up to `f δ²`. It dies out as tilt gets known (0.3 px at 1°, 0.03 px at 0.3°).
+    fn curvature_px2(&self) -> f64 {
+        let cov = &self.state.cov;
+        let tilt_var = cov.at(at::ATTITUDE, at::ATTITUDE) + cov.at(at::ATTITUDE + 1, at::ATTITUDE + 1);
+        (self.models.camera.fx * tilt_var).powi(2)
+    }
+
     /// Starts a target from the markers of one frame: where they lie on the ground, with a wide
     /// prior that the same pixels then narrow, so that everything common with the helicopter's own
     /// errors stands in the covariance.
-    fn start_target(&mut self, index: usize, markers: &[MarkerDetection]) {
+    fn start_target(&mut self, index: usize, markers: &[MarkerDetection], before: Option<Target>) {
         let Some((mean, heading_known)) = guess(&self.state.own, &self.models, index, markers) else {
             self.refuse(FusionSource::Marker, Disposition::Invalid);
             return;
         };
         let start = self.state.target_at(index);
-        self.state.targets[index] = started(mean, self.state.t);
+        let moving = self.models.targets[index].model != TargetModel::Static;
+        let t = self.state.t;
+        self.state.targets[index] = match before {
+            Some(before) if moving => started_again(mean, t, &before),
+            Some(before) => Target { seen: before.seen + 1, ..started(mean, t) },
+            None => started(mean, t),
+        };
         self.state.learnt.target_q[index] = self.learning.start.target_q[index];
         let heading_var = if heading_known { 1.0 } else { UNKNOWN_HEADING.powi(2) };
-        let moving = self.models.targets[index].model != TargetModel::Static;
         let (speed_var, rate_var) = if moving { (9.0, 1.0) } else { (0.0, 0.0) };
         self.state.renew(start, &[900.0, 900.0, heading_var, speed_var, rate_var]);
         for detection in markers {
@@ -219,7 +233,8 @@ impl Core {
         let position = self.z.columns(at::POSITION, 3);
         let attitude = self.z.columns(at::ATTITUDE, 3);
         let place = self.z.columns(start, 2);
-        let noise = Matrix2::identity() * (track.sigma_px.powi(2) * self.models.feature_factor2);
+        let known = track.sigma_px.powi(2) * self.models.feature_factor2;
+        let noise = Matrix2::identity() * (known + self.curvature_px2());
         set_point(&mut self.z, 0, &(track.px - view.px), &view, position, attitude, &noise);
         for (k, d) in [Vector3::new(1.0, 0.0, slope_n), Vector3::new(0.0, 1.0, slope_e)].iter().enumerate() {
             let d = view.d_point * d;
