@@ -98,39 +98,48 @@ impl State {
         blend(&mut l.thrust_var, squares[5], gain, s.thrust_var);
     }
 
-    /// Fits the targets' intensities from the copy that is closest to `interval` old. Call once a
-    /// frame, after its fusion.
+    /// Fits the targets' intensities. Call once a frame, after its fusion.
+    ///
+    /// The increments looked at span the filter's own memory of the component, `2 P/q`: real motion is
+    /// smoother than a random walk, and the intensity that serves is the one at that scale.
     pub(super) fn learn_targets(&mut self, learning: &Learning) {
+        let now = self.t;
+        let since_s = (now - self.learnt.t_target).s().clamp(0.0, 0.2);
+        self.learnt.t_target = now;
         if !learning.on {
             return;
         }
-        let (now, interval) = (self.t, learning.interval);
-        let old_enough = |e: &Echo| e.live && now - e.t >= Span::from_ns(interval.ns() * 4 / 5);
-        let Some(slot) =
-            (0..self.echoes.len()).filter(|i| old_enough(&self.echoes[*i])).max_by_key(|i| self.echoes[*i].t)
-        else {
-            return;
-        };
-        let since = (now - self.learnt.t_target).s().clamp(0.0, 0.2);
-        self.learnt.t_target = now;
-        let gain = since / learning.over_s;
-        let echo = &self.echoes[slot];
-        let age_s = (now - echo.t).s();
-        for (i, target) in self.targets.iter().enumerate() {
-            // A target started again since then has nothing in common with its copy.
-            let same = target.held && echo.t >= target.started;
-            if !same || target.last_seen < now {
-                continue;
-            }
-            for (k, which) in [3, 4].into_iter().enumerate() {
-                let (column, row) = (at::OWN + at::TARGET * i + which, at::TARGET * i + which);
-                let spread = increment(echo, row, self.cov.at(column, column), column, 1.0);
-                let square = (target.mean[which] - echo.mean[row]).powi(2) + spread;
-                blend(&mut self.learnt.target_q[i][k], square / age_s, gain, learning.start.target_q[i][k]);
+        for i in 0..self.targets.len() {
+            if self.targets[i].held && self.targets[i].last_seen == now {
+                for k in 0..2 {
+                    self.learn_target(learning, i, k, since_s / learning.over_s);
+                }
             }
         }
     }
+
+    /// Fits the walk of target `i`'s speed (`k` = 0) or yaw rate (`k` = 1).
+    fn learn_target(&mut self, learning: &Learning, i: usize, k: usize, gain: f64) {
+        let (column, row) = (self.target_at(i) + 3 + k, at::TARGET * i + 3 + k);
+        let (target, var) = (&self.targets[i], self.cov.at(column, column));
+        let q = self.learnt.target_q[i][k];
+        let memory_s = (2.0 * var / q).clamp(SHORTEST_S, learning.interval.s());
+        // A target started again since then has nothing in common with its copy.
+        let usable = self.echoes.iter().filter(|e| e.live && e.t < self.t && e.t >= target.started);
+        let misfit = |e: &&Echo| ((self.t - e.t).s() - memory_s).abs();
+        let Some(echo) = usable.min_by(|a, b| misfit(a).total_cmp(&misfit(b))) else { return };
+        let age_s = (self.t - echo.t).s();
+        if age_s < 0.5 * memory_s {
+            return;
+        }
+        let spread = increment(echo, row, var, column, 1.0);
+        let square = (target.mean[3 + k] - echo.mean[row]).powi(2) + spread;
+        blend(&mut self.learnt.target_q[i][k], square / age_s, gain, learning.start.target_q[i][k]);
+    }
 }
+
+/// Shortest increment looked at, s.
+const SHORTEST_S: f64 = 0.1;
 
 /// Variance of `x_now − decay · x_then`.
 fn increment(echo: &Echo, row: usize, var_now: f64, column: usize, decay: f64) -> f64 {
