@@ -1,0 +1,92 @@
+//! What a decoder made of the bytes it was given, counted.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+/// Why a sentence or packet was refused.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub enum Refusal {
+    /// Longer than any sentence of the format.
+    TooLong,
+    /// Cut short by the start of another.
+    CutShort,
+    /// Bytes that are not printable ASCII.
+    NotAscii,
+    /// No `*HH` where the format has one.
+    NoChecksum,
+    /// Checksum or CRC does not match.
+    BadChecksum,
+    /// Fields missing or not of the kind the format says.
+    Malformed,
+    /// A value that cannot be: latitude beyond the poles, hour 25, not a number.
+    OutOfRange,
+    /// Arrived after its epoch was given out.
+    AfterItsEpoch,
+    /// Belongs to a burst whose sentences with a time were lost.
+    NoTime,
+}
+
+impl Refusal {
+    /// In words, for people.
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::TooLong => "too long",
+            Self::CutShort => "cut short",
+            Self::NotAscii => "not ASCII",
+            Self::NoChecksum => "no checksum",
+            Self::BadChecksum => "bad checksum",
+            Self::Malformed => "malformed",
+            Self::OutOfRange => "value out of range",
+            Self::AfterItsEpoch => "after its epoch was complete",
+            Self::NoTime => "burst without a time",
+        }
+    }
+}
+
+/// What a decoder made of its bytes.
+#[derive(Clone, PartialEq, Eq, Debug, Default)]
+pub struct DecodeCounts {
+    /// Sentences or packets understood and used.
+    pub used: u64,
+    /// Sound sentences or packets that carry nothing wanted.
+    pub ignored: u64,
+    /// Bytes outside any sentence or packet.
+    pub noise_bytes: u64,
+    /// Sound readings of which the device itself said that something is not valid.
+    pub flagged: u64,
+    refused: BTreeMap<Refusal, u64>,
+}
+
+impl DecodeCounts {
+    pub(super) fn refuse(&mut self, why: Refusal) {
+        *self.refused.entry(why).or_insert(0) += 1;
+    }
+
+    /// How often something was refused for this reason.
+    pub fn refused(&self, why: Refusal) -> u64 {
+        self.refused.get(&why).copied().unwrap_or(0)
+    }
+
+    /// All refusals.
+    pub fn refused_total(&self) -> u64 {
+        self.refused.values().sum()
+    }
+
+    /// Every reason that occurred, with how often.
+    pub fn refusals(&self) -> impl Iterator<Item = (Refusal, u64)> + '_ {
+        self.refused.iter().map(|(why, count)| (*why, *count))
+    }
+}
+
+impl fmt::Display for DecodeCounts {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} used, {} not needed, {} refused", self.used, self.ignored, self.refused_total())?;
+        for (index, (why, count)) in self.refusals().enumerate() {
+            write!(f, "{}{count} {}", if index == 0 { " (" } else { ", " }, why.words())?;
+        }
+        if self.refused_total() > 0 {
+            write!(f, ")")?;
+        }
+        write!(f, ", {} flagged by the device, {} bytes outside sentences", self.flagged, self.noise_bytes)
+    }
+}
