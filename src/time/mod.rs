@@ -5,8 +5,13 @@
 //! ([`UtcTime`]) comes only from the receiver and never enters arithmetic with host time except
 //! through the fit between them.
 
+mod fit;
+mod jitter;
+mod steady;
 mod utc;
 
+pub use fit::{ClockFit, GnssClock};
+pub use steady::SteadyClock;
 pub use utc::{Civil, UtcTime, days_in_month};
 
 use std::fmt;

@@ -1,0 +1,293 @@
+//! A straight line under arrivals that come late by an unknown jitter, with its uncertainty.
+//!
+//! Arrival x at time t is a + b·t + jitter. The jitter is either symmetric, normal of sigma s, or
+//! one-sided, exponential of mean τ with a little normal noise (the exponentially modified
+//! Gaussian). Its kind and size are not known: each candidate is fitted by Newton's method (both
+//! log-densities are concave, so there is one maximum), weighed by its evidence in Laplace's
+//! approximation, and the line is the mean over all. For symmetric jitter it runs through the
+//! middle, for one-sided jitter along the lower edge, where nothing was late.
+
+/// A point: time in seconds, arrival in milliseconds.
+pub(super) type Point = (f64, f64);
+
+/// Sizes of jitter considered, milliseconds, each twice the one before.
+const SIZES_MS: [f64; 8] = [0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0];
+/// Normal noise beside one-sided jitter, as parts of it.
+const NOISE_PARTS: [f64; 2] = [1.0 / 16.0, 0.2];
+/// Least normal noise, milliseconds: what stamping a read costs.
+const NOISE_MIN_MS: f64 = 0.1;
+/// Newton steps at most; from the line before, two or three do.
+const STEPS_MAX: usize = 30;
+/// Candidates lighter than the heaviest by more than this (log) are looked at seldom.
+const LOG_WEIGHT_FAINT: f64 = -25.0;
+/// Every so many fits all candidates are looked at.
+const FULL_EVERY: u32 = 16;
+
+/// Shape of the jitter, milliseconds.
+#[derive(Clone, Copy, Debug)]
+struct Shape {
+    /// Normal part.
+    sigma: f64,
+    /// Mean of the one-sided part; 0 for none.
+    tau: f64,
+}
+
+/// One candidate shape with its fitted line.
+#[derive(Clone, Debug)]
+struct Candidate {
+    shape: Shape,
+    /// Value at the fit's mean time, slope per second.
+    line: (f64, f64),
+    /// Covariance of (value, slope): var, cov, var.
+    covariance: [f64; 3],
+    log_weight: f64,
+    fitted: bool,
+}
+
+/// The fit over all candidate shapes.
+#[derive(Clone, Debug)]
+pub(super) struct JitterFit {
+    candidates: Vec<Candidate>,
+    slope_sigma: f64,
+    t_mean: f64,
+    fits: u32,
+}
+
+impl JitterFit {
+    /// `slope_sigma`: one-sigma of the slope expected beforehand, milliseconds a second.
+    pub(super) fn new(slope_sigma: f64) -> Self {
+        let symmetric = SIZES_MS.iter().map(|&sigma| Shape { sigma, tau: 0.0 });
+        let one_sided = SIZES_MS.iter().flat_map(|&tau| {
+            NOISE_PARTS.iter().map(move |part| Shape { sigma: (tau * part).max(NOISE_MIN_MS), tau })
+        });
+        let candidates = symmetric
+            .chain(one_sided)
+            .map(|shape| Candidate {
+                shape,
+                line: (0.0, 0.0),
+                covariance: [0.0; 3],
+                log_weight: 0.0,
+                fitted: false,
+            })
+            .collect();
+        Self { candidates, slope_sigma, t_mean: 0.0, fits: 0 }
+    }
+
+    /// Fits the line to these points, starting from the fit before.
+    pub(super) fn fit(&mut self, points: &[Point]) {
+        if points.is_empty() {
+            return;
+        }
+        let count = points.len() as f64;
+        let t_mean = points.iter().map(|p| p.0).sum::<f64>() / count;
+        let x_mean = points.iter().map(|p| p.1).sum::<f64>() / count;
+        let moved = t_mean - self.t_mean;
+        self.t_mean = t_mean;
+        let all = self.fits.is_multiple_of(FULL_EVERY);
+        self.fits = self.fits.wrapping_add(1);
+        for candidate in &mut self.candidates {
+            if candidate.fitted {
+                candidate.line.0 += candidate.line.1 * moved;
+                if !all && candidate.log_weight == f64::NEG_INFINITY {
+                    continue;
+                }
+            } else {
+                candidate.line = (x_mean - candidate.shape.tau, 0.0);
+            }
+            candidate.maximise(points, t_mean, self.slope_sigma);
+        }
+        let heaviest = self.candidates.iter().map(|c| c.log_weight).fold(f64::NEG_INFINITY, f64::max);
+        for candidate in &mut self.candidates {
+            let log_weight = candidate.log_weight - heaviest;
+            candidate.log_weight = if log_weight < LOG_WEIGHT_FAINT { f64::NEG_INFINITY } else { log_weight };
+        }
+    }
+
+    /// The line and its one-sigma at time `t`, milliseconds.
+    pub(super) fn at(&self, t: f64) -> (f64, f64) {
+        let dt = t - self.t_mean;
+        let value = |candidate: &Candidate| candidate.line.0 + candidate.line.1 * dt;
+        let mean = self.weighted(value);
+        let variance = self.weighted(|candidate| {
+            let [vv, vs, ss] = candidate.covariance;
+            vv + 2.0 * vs * dt + ss * dt * dt + (value(candidate) - mean).powi(2)
+        });
+        (mean, variance.max(0.0).sqrt())
+    }
+
+    /// The slope, milliseconds a second.
+    pub(super) fn slope(&self) -> f64 {
+        self.weighted(|candidate| candidate.line.1)
+    }
+
+    /// Size of the jitter: normal sigma and one-sided mean, milliseconds.
+    pub(super) fn jitter_ms(&self) -> (f64, f64) {
+        (self.weighted(|candidate| candidate.shape.sigma), self.weighted(|candidate| candidate.shape.tau))
+    }
+
+    fn weighted(&self, of: impl Fn(&Candidate) -> f64) -> f64 {
+        let (mut sum, mut weights) = (0.0, 0.0);
+        for candidate in self.candidates.iter().filter(|candidate| candidate.fitted) {
+            let weight = candidate.log_weight.exp();
+            sum += weight * of(candidate);
+            weights += weight;
+        }
+        if weights > 0.0 { sum / weights } else { 0.0 }
+    }
+}
+
+/// Log-likelihood with its slope and curvature over (value, slope) of the line.
+struct Quadratic {
+    log: f64,
+    gradient: [f64; 2],
+    /// Negative second derivatives: aa, ab, bb.
+    curvature: [f64; 3],
+}
+
+impl Candidate {
+    fn maximise(&mut self, points: &[Point], t_mean: f64, slope_sigma: f64) {
+        let reach = 4.0 * (self.shape.sigma + self.shape.tau);
+        let mut line = self.line;
+        let mut here = self.quadratic(points, t_mean, slope_sigma, line);
+        for _ in 0..STEPS_MAX {
+            let [aa, ab, bb] = here.curvature;
+            let det = aa * bb - ab * ab;
+            let [ga, gb] = here.gradient;
+            let mut step = ((bb * ga - ab * gb) / det, (aa * gb - ab * ga) / det);
+            let long = (step.0.abs() / reach).max(1.0);
+            step = (step.0 / long, step.1 / long);
+            let mut better = None;
+            for _ in 0..8 {
+                let next = (line.0 + step.0, line.1 + step.1);
+                let there = self.quadratic(points, t_mean, slope_sigma, next);
+                if there.log >= here.log - 1e-9 {
+                    better = Some((next, there));
+                    break;
+                }
+                step = (step.0 * 0.5, step.1 * 0.5);
+            }
+            let Some((next, there)) = better else {
+                break;
+            };
+            (line, here) = (next, there);
+            if step.0.abs() < 1e-3 * self.shape.sigma {
+                break;
+            }
+        }
+        let [aa, ab, bb] = here.curvature;
+        let det = aa * bb - ab * ab;
+        self.line = line;
+        self.covariance = [bb / det, -ab / det, aa / det];
+        self.log_weight = here.log - 0.5 * det.ln();
+        self.fitted = true;
+    }
+
+    fn quadratic(&self, points: &[Point], t_mean: f64, slope_sigma: f64, line: (f64, f64)) -> Quadratic {
+        let prior = 1.0 / (slope_sigma * slope_sigma);
+        let mut sum = Quadratic {
+            log: -0.5 * prior * line.1 * line.1,
+            gradient: [0.0, -prior * line.1],
+            // A floor keeps the value determined where the density is flat (all points far above).
+            curvature: [1e-9, 0.0, prior],
+        };
+        for &(t, x) in points {
+            let dt = t - t_mean;
+            let (log, slope, bend) = self.shape.log_density(x - line.0 - line.1 * dt);
+            sum.log += log;
+            sum.gradient[0] -= slope;
+            sum.gradient[1] -= slope * dt;
+            sum.curvature[0] -= bend;
+            sum.curvature[1] -= bend * dt;
+            sum.curvature[2] -= bend * dt * dt;
+        }
+        sum
+    }
+}
+
+impl Shape {
+    /// Log-density of the jitter `u` with its first and second derivative.
+    ///
+    /// One-sided: ln f = −ln τ + s²/2τ² − u/τ + ln Φ(z), z = u/s − s/τ.
+    fn log_density(self, u: f64) -> (f64, f64, f64) {
+        let Self { sigma, tau } = self;
+        if tau == 0.0 {
+            let z = u / sigma;
+            return (-0.5 * z * z - sigma.ln() - LN_SQRT_2PI, -z / sigma, -1.0 / (sigma * sigma));
+        }
+        let z = u / sigma - sigma / tau;
+        let (log_phi, mills) = log_normal_cdf(z);
+        let log = -tau.ln() + 0.5 * (sigma / tau).powi(2) - u / tau + log_phi;
+        (log, mills / sigma - 1.0 / tau, -mills * (z + mills) / (sigma * sigma))
+    }
+}
+
+/// ln √(2π).
+const LN_SQRT_2PI: f64 = 0.918_938_533_204_672_7;
+
+/// ln Φ(z) and φ(z)/Φ(z) of the normal distribution, for any z.
+fn log_normal_cdf(z: f64) -> (f64, f64) {
+    let scaled = scaled_erfc(z.abs() * std::f64::consts::FRAC_1_SQRT_2);
+    let gauss = (-0.5 * z * z).exp();
+    if z < 0.0 {
+        // Φ(z) = ½ exp(−z²/2) erfcx(−z/√2)
+        let mills = (2.0 / std::f64::consts::PI).sqrt() / scaled;
+        return ((0.5 * scaled).ln() - 0.5 * z * z, mills);
+    }
+    let phi = 1.0 - 0.5 * gauss * scaled;
+    (phi.ln(), gauss * (-LN_SQRT_2PI).exp() / phi)
+}
+
+/// exp(x²)·erfc(x) for x ≥ 0, to 1.2·10⁻⁷ of its value (Chebyshev fit, Numerical Recipes 6.2).
+fn scaled_erfc(x: f64) -> f64 {
+    const C: [f64; 10] = [
+        -1.265_512_23,
+        1.000_023_68,
+        0.374_091_96,
+        0.096_784_18,
+        -0.186_288_06,
+        0.278_868_07,
+        -1.135_203_98,
+        1.488_515_87,
+        -0.822_152_23,
+        0.170_872_77,
+    ];
+    let t = 1.0 / (1.0 + 0.5 * x);
+    t * C.iter().rev().fold(0.0, |sum, c| sum * t + c).exp()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn normal_tail_is_accurate() {
+        // Φ(0) = ½, Φ(1) = 0.841344746, ln Φ(−10) = −53.23128515
+        assert!((log_normal_cdf(0.0).0 - 0.5f64.ln()).abs() < 1e-6);
+        assert!((log_normal_cdf(1.0).0 - 0.841_344_746f64.ln()).abs() < 1e-6);
+        assert!((log_normal_cdf(-10.0).0 + 53.231_285_15).abs() < 1e-5);
+        assert!(log_normal_cdf(-1e4).0.is_finite() && log_normal_cdf(1e4).1 == 0.0);
+    }
+
+    #[test]
+    fn derivatives_agree_with_differences() {
+        for shape in [Shape { sigma: 2.0, tau: 0.0 }, Shape { sigma: 1.0, tau: 8.0 }] {
+            for u in [-5.0, -0.5, 0.0, 1.0, 20.0] {
+                let h = 1e-3;
+                let (below, here, above) =
+                    (shape.log_density(u - h), shape.log_density(u), shape.log_density(u + h));
+                assert!(((above.0 - below.0) / (2.0 * h) - here.1).abs() < 1e-3, "{shape:?} {u}");
+                assert!(((above.1 - below.1) / (2.0 * h) - here.2).abs() < 1e-3, "{shape:?} {u}");
+                assert!(here.2 <= 0.0, "concave");
+            }
+        }
+    }
+
+    #[test]
+    fn points_on_a_line_give_the_line() {
+        let mut fit = JitterFit::new(1.0);
+        let points: Vec<Point> = (0..50).map(|i| (f64::from(i) * 0.2, 3.0 + 0.01 * f64::from(i) * 0.2)).collect();
+        fit.fit(&points);
+        let (value, sigma) = fit.at(9.8);
+        assert!((value - 3.098).abs() < 0.1 && sigma < 0.1, "{value} ± {sigma}");
+    }
+}
