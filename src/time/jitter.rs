@@ -285,7 +285,8 @@ mod tests {
     #[test]
     fn points_on_a_line_give_the_line() {
         let mut fit = JitterFit::new(1.0);
-        let points: Vec<Point> = (0..50).map(|i| (f64::from(i) * 0.2, 3.0 + 0.01 * f64::from(i) * 0.2)).collect();
+        let points: Vec<Point> =
+            (0..50).map(|i| (f64::from(i) * 0.2, 3.0 + 0.01 * f64::from(i) * 0.2)).collect();
         fit.fit(&points);
         let (value, sigma) = fit.at(9.8);
         assert!((value - 3.098).abs() < 0.1 && sigma < 0.1, "{value} ± {sigma}");
