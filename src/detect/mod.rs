@@ -7,6 +7,7 @@ mod edges;
 mod family;
 mod frame;
 mod homography;
+mod pattern;
 mod payload;
 mod pyramid;
 mod quad;
@@ -14,5 +15,6 @@ mod simd;
 mod tag;
 
 pub use frame::FrameDetector;
+pub use pattern::{TagPattern, tag_pattern};
 pub use simd::Simd;
 pub use tag::{LARGEST_IMAGE_PX, Region, TagDetector};

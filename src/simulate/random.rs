@@ -19,6 +19,9 @@ pub(super) enum Purpose {
     Exposure = 5,
     Markers = 6,
     Features = 7,
+    Scene = 8,
+    GnssLine = 9,
+    CompassLine = 10,
     Vehicle = 100,
 }
 

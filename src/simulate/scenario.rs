@@ -40,6 +40,8 @@ pub struct Scenario {
     pub compass: CompassSim,
     /// The camera's errors.
     pub camera: CameraSim,
+    /// What the frames look like.
+    pub scene: Scene,
 }
 
 /// The host's clock against UTC: `host = utc + offset + drift · (utc − start)`.
@@ -268,6 +270,27 @@ pub struct CameraSim {
     pub feature_life_s: f64,
 }
 
+/// What the frames look like.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Scene {
+    /// Exposure time, ms: it smears what moves.
+    pub exposure_ms: f64,
+    /// Blur of the lens, pixels one-sigma.
+    pub blur_px: f64,
+    /// Noise of the sensor at mid grey, grey levels one-sigma.
+    pub noise_levels: f64,
+    /// Light lost in the frame's corners, as a share.
+    pub vignetting: f64,
+    /// Where the sun stands: azimuth and elevation, degrees.
+    pub sun_deg: (f64, f64),
+    /// Objects that lie about on 100 m² of ground.
+    pub objects: f64,
+    /// Bands of shadow across the ground, this many metres from one to the next.
+    pub shadow_bands_m: Option<f64>,
+    /// At this time, seconds, the picture becomes this many times brighter.
+    pub light_change: Option<(f64, f64)>,
+}
+
 /// A marker covered for a while.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct HiddenMarker {
@@ -365,6 +388,21 @@ impl Default for CameraSim {
             features: 8,
             feature_noise_px: 0.5,
             feature_life_s: 10.0,
+        }
+    }
+}
+
+impl Default for Scene {
+    fn default() -> Self {
+        Self {
+            exposure_ms: 3.0,
+            blur_px: 0.4,
+            noise_levels: 2.0,
+            vignetting: 0.2,
+            sun_deg: (140.0, 50.0),
+            objects: 12.0,
+            shadow_bands_m: None,
+            light_change: None,
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use super::scenario::{
     CameraSim, Clock, CompassSim, GpsSim, Helicopter, HelicopterPath, HiddenMarker, Route, Scenario,
-    SpeedPlan, VehiclePlan, Wind,
+    Scene, SpeedPlan, VehiclePlan, Wind,
 };
 use crate::config::{CompassFormat, Config, TargetConfig, TargetModel};
 use crate::geo::{Geodetic, ImageTop, TiltConvention};
@@ -171,6 +171,7 @@ impl Scenario {
             gps: GpsSim::default(),
             compass: CompassSim::default(),
             camera: CameraSim::default(),
+            scene: Scene::default(),
         }
     }
 
