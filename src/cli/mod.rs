@@ -8,6 +8,7 @@ mod keys;
 mod montecarlo;
 mod report;
 mod store;
+mod simulate;
 
 pub use error::{CliError, CliResult};
 
@@ -39,6 +40,8 @@ enum Command {
     Store(store::Args),
     /// Find markers in images
     Detect(detect::Args),
+    /// Make a capture of a simulated flight, with the truth beside it
+    Simulate(simulate::Args),
 }
 
 /// Runs the command line of this process.
@@ -60,6 +63,7 @@ pub fn main() -> ExitCode {
         Command::Report(args) => report::run(&args),
         Command::Store(args) => store::run(&args),
         Command::Detect(args) => detect::run(&args),
+        Command::Simulate(args) => simulate::run(&args),
     };
     error::exit_code(result)
 }

@@ -1,8 +1,8 @@
 //! The named scenarios.
 
 use super::scenario::{
-    CameraSim, Clock, CompassSim, GpsSim, Helicopter, HelicopterPath, HiddenMarker, Route, Scenario,
-    Scene, SpeedPlan, VehiclePlan, Wind,
+    CameraSim, Clock, CompassSim, GpsSim, Helicopter, HelicopterPath, HiddenMarker, Route, Scenario, Scene,
+    SpeedPlan, VehiclePlan, Wind,
 };
 use crate::config::{CompassFormat, Config, TargetConfig, TargetModel};
 use crate::geo::{Geodetic, ImageTop, TiltConvention};

@@ -6,8 +6,7 @@ use super::camera::FrameTruth;
 use super::world::World;
 
 /// Header of the helicopter's truth: position, velocity (NED), heading, `ned_from_body` row by row.
-pub const OWNSHIP_HEADER: &str =
-    "frame,time_ns,n,e,d,vn,ve,vd,yaw,r00,r01,r02,r10,r11,r12,r20,r21,r22";
+pub const OWNSHIP_HEADER: &str = "frame,time_ns,n,e,d,vn,ve,vd,yaw,r00,r01,r02,r10,r11,r12,r20,r21,r22";
 
 /// Header of a vehicle's truth: its reference point, and visibility and centre of each marker.
 pub fn vehicle_header(world: &World, target: usize) -> String {

@@ -70,9 +70,8 @@ impl Body {
         let aft = fold(-0.25 * length, f32::min, -1.0);
         let fore = fold(1.25 * length, f32::max, 1.0) + 0.12 * length;
         let wide = plates.iter().map(|p| p.centre.y.abs() + 1.35 * p.half).fold(0.36 * length, f32::max);
-        let hull = (height.is_finite() && height > 0.05).then(|| {
-            (Vector3::new(aft, -wide, -(height - 0.005)), Vector3::new(fore, wide, 0.0))
-        });
+        let hull = (height.is_finite() && height > 0.05)
+            .then(|| (Vector3::new(aft, -wide, -(height - 0.005)), Vector3::new(fore, wide, 0.0)));
         let dark_disc = target
             .marker
             .iter()

@@ -58,9 +58,8 @@ fn add_octave(grey: &mut [f32], cell: usize, amplitude: f32, stream: &mut Stream
     let count = SIDE / cell;
     // Uniform values have a sigma of 1/√12; interpolation loses some of it again.
     let scale = amplitude * 12.0_f32.sqrt() * if cell == 1 { 1.0 } else { 1.35 };
-    let lattice: Vec<f32> = (0..count * count)
-        .map(|_| (stream.word() as f32 / u32::MAX as f32 - 0.5) * scale)
-        .collect();
+    let lattice: Vec<f32> =
+        (0..count * count).map(|_| (stream.word() as f32 / u32::MAX as f32 - 0.5) * scale).collect();
     let ease: Vec<f32> = (0..cell)
         .map(|i| {
             let s = i as f32 / cell as f32;

@@ -1,0 +1,184 @@
+//! `windhover simulate OUT.mcap`
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use super::{CliError, CliResult};
+use crate::io::capture::CaptureWriter;
+use crate::msg::EventBody;
+use crate::simulate::{Flight, FrameStorage, FrameTruth, Scenario, World, truth};
+
+/// Make a capture of a simulated flight, with the truth beside it.
+///
+/// OUT.mcap holds what real devices would have delivered: the bytes of the serial lines as reads
+/// returned them, camera frames, and the configuration. Beside it, OUT.truth.csv tells where the
+/// vehicle really was at each frame (OUT.truth_NAME.csv for each further vehicle) and
+/// OUT.truth_ownship.csv where the helicopter was. The same scenario and seed always make the same
+/// flight.
+#[derive(clap::Args, Debug)]
+#[command(after_help = "\
+Examples:
+  windhover simulate flight.mcap                          a minute of following a vehicle at 15 m
+  windhover simulate a.mcap --scenario hover10 --seed 7   another draw of every error
+  windhover simulate b.mcap --duration 10 --scale 0.5     short, at half the resolution: a small file
+  windhover simulate --list                               what scenarios there are
+
+Then:
+  windhover replay flight.mcap --out result.mcap          run the pipeline over it
+  windhover report result.mcap --truth flight.truth.csv   how far the estimates are from the truth")]
+pub(super) struct Args {
+    /// Capture to write
+    #[arg(required_unless_present = "list", value_name = "OUT.mcap")]
+    out: Option<PathBuf>,
+    /// What happens in the flight (see --list)
+    #[arg(long, default_value = "follow", value_name = "NAME")]
+    scenario: String,
+    /// Length of the flight, seconds [default: the scenario's own, 60]
+    #[arg(long, value_name = "S")]
+    duration: Option<f64>,
+    /// Draws every random error: latencies, biases, noise, wind, routes
+    #[arg(long, default_value_t = 1, value_name = "N")]
+    seed: u64,
+    /// Camera resolution as a share of 1280 x 1024
+    #[arg(long, default_value_t = 1.0, value_name = "FACTOR")]
+    scale: f64,
+    /// Frames a second [default: the scenario's own, 15]
+    #[arg(long, value_name = "FPS")]
+    fps: Option<f64>,
+    /// JPEG quality of the frames, 1 to 100
+    #[arg(long, default_value_t = 90, value_name = "Q", value_parser = clap::value_parser!(u8).range(1..=100))]
+    quality: u8,
+    /// Store frames as raw grey pixels instead of JPEG (large)
+    #[arg(long, conflicts_with = "quality")]
+    lossless: bool,
+    /// List the scenarios and exit
+    #[arg(long)]
+    list: bool,
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    if args.list {
+        for (name, about) in Scenario::names() {
+            println!("{name:18} {about}");
+        }
+        return Ok(());
+    }
+    let out = args.out.as_deref().ok_or_else(|| CliError::usage("say which capture to write"))?;
+    let scenario = scenario(args)?;
+    let storage = if args.lossless { FrameStorage::Raw } else { FrameStorage::Jpeg(args.quality) };
+    write_flight(scenario, args.seed, storage, out)
+}
+
+fn scenario(args: &Args) -> Result<Scenario, CliError> {
+    let unknown = || {
+        CliError::usage(format!(
+            "no scenario is called {:?}; `windhover simulate --list` names them",
+            args.scenario
+        ))
+    };
+    let mut scenario = Scenario::named(&args.scenario).ok_or_else(unknown)?;
+    if !(0.05..=4.0).contains(&args.scale) {
+        return Err(CliError::usage(format!("--scale {}: give a factor between 0.05 and 4", args.scale)));
+    }
+    if args.scale != 1.0 {
+        scenario = scenario.with_resolution(args.scale);
+    }
+    if let Some(duration_s) = args.duration {
+        if !(0.1..=36_000.0).contains(&duration_s) {
+            return Err(CliError::usage(format!("--duration {duration_s}: give 0.1 to 36000 seconds")));
+        }
+        scenario.duration_s = duration_s;
+    }
+    if let Some(fps) = args.fps {
+        scenario.config.camera.fps = fps;
+    }
+    scenario.config.check().map_err(|e| CliError::usage(format!("this flight cannot be configured: {e}")))?;
+    Ok(scenario)
+}
+
+/// `flight.mcap` → `flight.SUFFIX.csv`.
+fn beside(out: &Path, suffix: &str) -> PathBuf {
+    out.with_extension(format!("{suffix}.csv"))
+}
+
+struct TruthFiles {
+    files: Vec<(PathBuf, BufWriter<File>)>,
+}
+
+impl TruthFiles {
+    /// One file for each vehicle, then the helicopter's.
+    fn create(out: &Path, world: &World) -> Result<Self, CliError> {
+        let targets = world.scenario().config.target.iter().enumerate();
+        let mut headed: Vec<(PathBuf, String)> = targets
+            .map(|(i, target)| {
+                let suffix = if i == 0 { "truth".into() } else { format!("truth_{}", target.name) };
+                (beside(out, &suffix), truth::vehicle_header(world, i))
+            })
+            .collect();
+        headed.push((beside(out, "truth_ownship"), truth::OWNSHIP_HEADER.to_owned()));
+        let mut files = Vec::new();
+        for (path, header) in headed {
+            let file = File::create(&path).map_err(|e| cannot_write(&path, &e))?;
+            files.push((path, BufWriter::new(file)));
+            Self::line(files.last_mut().expect("one was just pushed"), &header)?;
+        }
+        Ok(Self { files })
+    }
+
+    fn line((path, file): &mut (PathBuf, BufWriter<File>), text: &str) -> Result<(), CliError> {
+        writeln!(file, "{text}").map_err(|e| cannot_write(path, &e))
+    }
+
+    fn frame(&mut self, world: &World, frame: &FrameTruth) -> Result<(), CliError> {
+        let vehicles = world.vehicles();
+        for (target, file) in self.files.iter_mut().enumerate().take(vehicles) {
+            Self::line(file, &truth::vehicle_row(world, target, frame))?;
+        }
+        Self::line(&mut self.files[vehicles], &truth::ownship_row(world, frame))
+    }
+
+    fn finish(self) -> Result<Vec<PathBuf>, CliError> {
+        let close = |(path, mut file): (PathBuf, BufWriter<File>)| {
+            file.flush().map_err(|e| cannot_write(&path, &e)).map(|()| path)
+        };
+        self.files.into_iter().map(close).collect()
+    }
+}
+
+fn cannot_write(path: &Path, error: &std::io::Error) -> CliError {
+    CliError::failed(format!("cannot write {}: {error}", path.display()))
+}
+
+fn write_flight(scenario: Scenario, seed: u64, storage: FrameStorage, out: &Path) -> CliResult {
+    let name = scenario.name.clone();
+    let frames = (scenario.duration_s * scenario.config.camera.fps).round() as u64;
+    let world = Arc::new(World::new(scenario, seed));
+    let config = world.scenario().config.to_toml().map_err(CliError::config)?;
+    let mut writer = CaptureWriter::create(out, &config, world.scenario().start).map_err(CliError::failed)?;
+    let mut truths = TruthFiles::create(out, &world)?;
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let mut flight = Flight::new(Arc::clone(&world), storage, threads);
+    // Shown on a terminal only: indicatif hides it elsewhere.
+    let bar = indicatif::ProgressBar::new(frames);
+    bar.set_style(
+        indicatif::ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} frames, {eta} to go")
+            .expect("the template is valid"),
+    );
+    bar.set_message(name.clone());
+    while let Some(event) = flight.next() {
+        let event = event?;
+        writer.write(&event).map_err(CliError::failed)?;
+        if let (EventBody::Frame(_), Some(frame)) = (&event.body, flight.frame_truth()) {
+            truths.frame(&world, frame)?;
+            bar.inc(1);
+        }
+    }
+    bar.finish_and_clear();
+    writer.finish().map_err(CliError::failed)?;
+    let beside: Vec<_> = truths.finish()?.iter().map(|p| p.display().to_string()).collect();
+    let written = bar.position();
+    eprintln!("{}: {name}, seed {seed}, {written} frames; truth in {}", out.display(), beside.join(", "));
+    Ok(())
+}
