@@ -25,12 +25,13 @@ impl Line {
         Self { byte, free_at: None, stream, reads: VecDeque::new() }
     }
 
-    /// Sends bytes whose first arrives at `t_first`, or as soon as the line is free.
+    /// Sends bytes the first of which begins at `t_first`, or as soon as the line is free.
     pub(super) fn send(&mut self, bytes: &[u8], t_first: MonoTime) {
-        let mut arrival = match self.free_at {
+        let begin = match self.free_at {
             Some(free) if free > t_first => free,
             _ => t_first,
         };
+        let mut arrival = begin + self.byte;
         let mut rest = bytes;
         while !rest.is_empty() {
             let length = (self.stream.uniform(1.0, MOST_BYTES) as usize).min(rest.len());
@@ -45,7 +46,7 @@ impl Line {
             arrival += self.byte;
             rest = after;
         }
-        self.free_at = Some(arrival);
+        self.free_at = Some(arrival - self.byte);
     }
 
     /// When the next read returns.

@@ -117,7 +117,7 @@ fn samples_arrive_in_order_and_repeat() {
 #[test]
 fn sensor_errors_have_the_figures_asked_for() {
     let (mut velocity, mut heading, mut tilt, mut pixels) = ([0.0; 2], [0.0; 2], [0.0; 2], [0.0; 2]);
-    let mut add = |sum: &mut [f64; 2], error: f64| {
+    let add = |sum: &mut [f64; 2], error: f64| {
         sum[0] += error * error;
         sum[1] += 1.0;
     };

@@ -10,7 +10,7 @@ const SIDE_LOG2: usize = SIDE.trailing_zeros() as usize;
 /// Noise octaves: cells of 1, 2, 4, … texels.
 const OCTAVES: usize = 9;
 /// Amplitude of the finest octave, grey levels rms, and by how much each coarser one grows.
-const FINEST: (f32, f32) = (4.0, 1.22);
+const FINEST: (f32, f32) = (3.0, 1.26);
 
 /// A seamless square of ground, repeated in both directions.
 #[derive(Clone, Debug)]
