@@ -12,3 +12,5 @@ pub mod reload;
 pub mod report;
 pub mod supervise;
 pub mod truth;
+pub mod export;
+pub mod replay;

@@ -4,11 +4,14 @@ mod calibrate;
 mod check_config;
 mod detect;
 mod error;
+mod export;
 mod keys;
 mod montecarlo;
 mod report;
 mod store;
 mod simulate;
+
+mod replay;
 
 pub use error::{CliError, CliResult};
 
@@ -28,6 +31,10 @@ pub struct Cli {
 enum Command {
     /// Calibrate the camera and how it is mounted
     Calibrate(calibrate::Args),
+    /// Run a recorded capture or flight through the pipeline that flies
+    Replay(replay::Args),
+    /// Write the outputs of a flight for other tools
+    Export(export::Args),
     /// Say what is wrong with a configuration, or print the effective one
     CheckConfig(check_config::Args),
     /// Make the certificates with which payloads and ground stations know each other
@@ -57,6 +64,8 @@ pub fn main() -> ExitCode {
     };
     let result = match cli.command {
         Command::Calibrate(args) => calibrate::run(&args),
+        Command::Replay(args) => replay::run(&args),
+        Command::Export(args) => export::run(&args),
         Command::CheckConfig(args) => check_config::run(&args),
         Command::Keys(args) => keys::run(&args),
         Command::Montecarlo(args) => montecarlo::run(&args),

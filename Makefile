@@ -1,0 +1,59 @@
+# Everything a newcomer needs: `make demo` shows it, `make test` proves it.
+# System packages are installed when missing (with sudo only where needed); nothing is done when present.
+
+CARGO ?= cargo
+VENV  ?= target/venv
+DEMO  ?= demo
+
+.PHONY: help setup setup-python build demo test test-python check lint docs clean
+
+help:
+	@echo "make demo     build, simulate a flight, replay it, compare with the truth, write a report page"
+	@echo "make test     every test"
+	@echo "make check    format, lints, documentation, shipped configurations, licences"
+	@echo "make bench    the benchmarks under benches/"
+	@echo "make deb      a Debian package in target/debian"
+	@echo "make hil      the virtual payload computer: install, boot, fly, compare"
+
+# What the build needs of the system: a C compiler for the compression libraries, and clang's library
+# for the camera bindings.
+setup:
+	@sh tests/setup/packages.sh build-essential libclang-dev pkg-config
+
+# What tests in other languages need: readers of our files written by other people.
+setup-python: setup
+	@sh tests/setup/packages.sh python3 python3-venv
+	@sh tests/setup/venv.sh $(VENV) tests/python/requirements.txt
+
+build: setup
+	$(CARGO) build --release --locked
+
+demo: build
+	@sh tests/demo.sh target/release/windhover $(DEMO)
+
+test: setup-python
+	$(CARGO) test --locked --no-fail-fast
+	$(MAKE) test-python
+
+# The flight file opened by readers that know nothing of us.
+test-python: setup-python
+	$(CARGO) build --locked
+	$(VENV)/bin/python -m unittest discover -s tests/python -p 'test_*.py' -v
+
+check: lint docs
+	for file in config/*.toml; do target/debug/windhover check-config $$file > /dev/null || exit 1; done
+	sh .ci/deny
+
+lint: setup
+	$(CARGO) fmt --check
+	$(CARGO) clippy --locked --all-targets -- -D warnings
+
+docs: setup
+	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --no-deps --document-private-items
+
+bench: setup
+	$(CARGO) bench --locked
+
+clean:
+	$(CARGO) clean
+	rm -rf $(DEMO)

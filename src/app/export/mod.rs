@@ -1,0 +1,71 @@
+//! The outputs of a flight for other tools: CSV, GeoJSON, KML.
+
+mod csv;
+mod geojson;
+mod kml;
+mod tracks;
+
+use std::path::{Path, PathBuf};
+
+use crate::io::mcap_read::{McapReader, ReadError};
+
+/// A format of `windhover export`.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, clap::ValueEnum)]
+pub enum Format {
+    /// Tables with a header row, one file a kind of output
+    Csv,
+    /// Tracks and positions for GIS
+    Geojson,
+    /// Moving tracks for Google Earth
+    Kml,
+}
+
+/// Why a flight could not be exported.
+#[derive(Debug, thiserror::Error)]
+pub enum ExportError {
+    /// The flight could not be read.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// A file could not be written.
+    #[error("cannot write {}: {source}", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The recording holds no outputs.
+    #[error("{} holds no estimates: it is a capture; make a flight of it with `windhover replay`", path.display())]
+    NoOutputs {
+        /// The recording.
+        path: PathBuf,
+    },
+}
+
+/// What an export wrote, and what of the flight was damaged.
+#[derive(Clone, PartialEq, Eq, Debug, Default)]
+pub struct Exported {
+    /// Files written.
+    pub files: Vec<PathBuf>,
+    /// Damage met in the flight.
+    pub warnings: Vec<String>,
+}
+
+/// Writes a flight's outputs into the directory `out`.
+pub fn export(flight: &Path, format: Format, out: &Path) -> Result<Exported, ExportError> {
+    let reader = McapReader::open(flight)?;
+    std::fs::create_dir_all(out).map_err(|source| write_error(out, source))?;
+    let exported = match format {
+        Format::Csv => csv::export(reader, out)?,
+        Format::Geojson => geojson::export(reader, out)?,
+        Format::Kml => kml::export(reader, out)?,
+    };
+    if exported.files.is_empty() {
+        return Err(ExportError::NoOutputs { path: flight.to_owned() });
+    }
+    Ok(exported)
+}
+
+fn write_error(path: &Path, source: std::io::Error) -> ExportError {
+    ExportError::Write { path: path.to_owned(), source }
+}

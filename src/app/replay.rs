@@ -1,0 +1,272 @@
+//! Replay: a recording through the very pipeline that flies.
+
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread;
+use std::time::Duration;
+
+use crate::config::{Config, ConfigError};
+use crate::io::capture::{CaptureItem, CaptureReader, attached_config};
+use crate::io::clock::HostClock;
+use crate::io::mcap_read::ReadError;
+use crate::io::mcap_write::{McapWriter, WriteError};
+use crate::io::records::{Recorder, topic};
+use crate::msg::{Event, EventBody};
+use crate::pipeline::{DecodedFrame, FrameFault, Output, Pipeline, Ticks};
+use crate::time::{MonoTime, Span};
+
+/// Events read and frames decoded ahead of the pipeline.
+const AHEAD: usize = 16;
+
+/// Why a recording could not be replayed.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// The recording could not be read.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// The flight could not be written.
+    #[error(transparent)]
+    Write(#[from] WriteError),
+    /// No configuration anywhere.
+    #[error("{} has no configuration attached: give one with --config FILE", path.display())]
+    NoConfig {
+        /// The recording.
+        path: PathBuf,
+    },
+    /// The attached configuration is wrong.
+    #[error("the configuration attached to {}: {source}", path.display())]
+    BadConfig {
+        /// The recording.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: ConfigError,
+    },
+    /// Nothing in the recording is of use.
+    #[error("{} holds no serial bytes and no frames", path.display())]
+    Nothing {
+        /// The recording.
+        path: PathBuf,
+    },
+}
+
+/// What happens during a replay, for whoever watches.
+pub enum Step<'a> {
+    /// The pipeline said something.
+    Output(&'a Output),
+    /// Bytes of the recording done, and in all.
+    Progress(u64, u64),
+    /// Damage met in the recording.
+    Warning(&'a str),
+}
+
+/// What a replay did.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub struct Summary {
+    /// Events replayed.
+    pub events: u64,
+    /// Frames among them.
+    pub frames: u64,
+    /// Length of the recording.
+    pub recorded: Span,
+    /// How long the replay took.
+    pub took: Span,
+}
+
+/// The configuration attached to a recording.
+pub fn config_of(recording: &Path) -> Result<Config, ReplayError> {
+    let text =
+        attached_config(recording)?.ok_or_else(|| ReplayError::NoConfig { path: recording.to_owned() })?;
+    Config::parse(&text).map_err(|source| ReplayError::BadConfig { path: recording.to_owned(), source })
+}
+
+/// Replays a recording; writes a flight where `out` says so; with `realtime`, at the pace at which it
+/// was recorded.
+pub fn replay(
+    recording: &Path,
+    config: &Config,
+    out: Option<&Path>,
+    realtime: bool,
+    watch: &mut dyn FnMut(Step<'_>),
+) -> Result<Summary, ReplayError> {
+    let reader = CaptureReader::open(recording)?;
+    let mut run = Run::new(config, realtime);
+    let want_rgb = run.pipeline.wants_rgb();
+    let (sender, receiver) = sync_channel(AHEAD);
+    thread::scope(|scope| {
+        scope.spawn(move || read_ahead(reader, want_rgb, &sender));
+        run.all(&receiver, out, watch)
+    })?;
+    if run.summary.events == 0 {
+        return Err(ReplayError::Nothing { path: recording.to_owned() });
+    }
+    run.summary.took = run.clock.now() - run.started;
+    Ok(run.summary)
+}
+
+/// What the reading thread hands over.
+enum Ahead {
+    Item(Box<CaptureItem>, Option<Result<DecodedFrame, FrameFault>>, (u64, u64)),
+    Warning(String),
+}
+
+/// Reads and decodes ahead; the pipeline's thread sees items in order whatever this one's pace.
+fn read_ahead(mut reader: CaptureReader, want_rgb: bool, sender: &SyncSender<Ahead>) {
+    while let Some(item) = reader.next() {
+        let prepared = match item.event.as_ref().map(|e| &e.body) {
+            Some(EventBody::Frame(frame)) => Some(Pipeline::prepare(frame, want_rgb)),
+            _ => None,
+        };
+        let warnings = reader.take_warnings().into_iter().map(Ahead::Warning);
+        let progress = reader.progress();
+        let item = std::iter::once(Ahead::Item(Box::new(item), prepared, progress));
+        for ahead in warnings.chain(item) {
+            if sender.send(ahead).is_err() {
+                return;
+            }
+        }
+    }
+    for warning in reader.take_warnings() {
+        if sender.send(Ahead::Warning(warning)).is_err() {
+            return;
+        }
+    }
+}
+
+struct Run<'a> {
+    config: &'a Config,
+    pipeline: Pipeline,
+    recorder: Recorder,
+    outputs: Vec<Output>,
+    summary: Summary,
+    clock: HostClock,
+    started: MonoTime,
+    pace: Option<Pace>,
+    first: Option<MonoTime>,
+    last: MonoTime,
+    ticks: Ticks,
+}
+
+impl<'a> Run<'a> {
+    fn new(config: &'a Config, realtime: bool) -> Self {
+        let clock = HostClock::start();
+        Self {
+            config,
+            pipeline: Pipeline::new(config),
+            recorder: Recorder::new(config),
+            outputs: Vec::new(),
+            summary: Summary::default(),
+            clock,
+            started: clock.now(),
+            pace: realtime.then(Pace::default),
+            first: None,
+            last: MonoTime::default(),
+            ticks: Ticks::default(),
+        }
+    }
+
+    fn all(
+        &mut self,
+        receiver: &Receiver<Ahead>,
+        out: Option<&Path>,
+        watch: &mut dyn FnMut(Step<'_>),
+    ) -> Result<(), ReplayError> {
+        let mut writer = None;
+        for ahead in receiver {
+            let (item, prepared, (done, total)) = match ahead {
+                Ahead::Warning(words) => {
+                    watch(Step::Warning(&words));
+                    continue;
+                }
+                Ahead::Item(item, prepared, progress) => (item, prepared, progress),
+            };
+            let t = item.raw.log_time;
+            if let (None, Some(path)) = (&writer, out) {
+                writer = Some(self.begin(path, t)?);
+            }
+            watch(Step::Progress(done, total));
+            if let Some(writer) = &mut writer
+                && !topic::is_output(&item.raw.channel.topic)
+            {
+                writer.copy(&item.raw)?;
+            }
+            let Some(event) = item.event else { continue };
+            if let Some(pace) = &mut self.pace {
+                pace.wait_until(t, &self.clock);
+            }
+            for tick in self.ticks.until(t) {
+                let event = Event { t_recv: tick, seq: event.seq, body: EventBody::Tick };
+                self.pipeline.handle(&event, &mut self.outputs);
+                self.deliver(tick, writer.as_mut(), watch)?;
+            }
+            self.count(t, &event.body);
+            self.pipeline.handle_prepared(&event, prepared, &mut self.outputs);
+            self.deliver(t, writer.as_mut(), watch)?;
+        }
+        self.pipeline.finish(&mut self.outputs);
+        self.deliver(self.last, writer.as_mut(), watch)?;
+        if let Some(writer) = writer {
+            writer.finish()?;
+        }
+        Ok(())
+    }
+
+    fn begin(&self, path: &Path, t: MonoTime) -> Result<FlightWriter, ReplayError> {
+        let text = self.config.to_toml().unwrap_or_default();
+        let mut writer = McapWriter::create(path, &text, t)?;
+        for record in self.recorder.opening(t) {
+            writer.write(&record)?;
+        }
+        Ok(writer)
+    }
+
+    fn count(&mut self, t: MonoTime, body: &EventBody) {
+        let first = *self.first.get_or_insert(t);
+        self.last = t;
+        self.summary.recorded = t - first;
+        self.summary.events += 1;
+        self.summary.frames += u64::from(matches!(body, EventBody::Frame(_)));
+    }
+
+    fn deliver(
+        &mut self,
+        t: MonoTime,
+        mut writer: Option<&mut FlightWriter>,
+        watch: &mut dyn FnMut(Step<'_>),
+    ) -> Result<(), ReplayError> {
+        let mut records = Vec::new();
+        for output in self.outputs.drain(..) {
+            watch(Step::Output(&output));
+            if let Some(writer) = writer.as_deref_mut() {
+                self.recorder.output(&output, t, &mut records);
+                for record in records.drain(..) {
+                    writer.write(&record)?;
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+type FlightWriter = McapWriter<std::io::BufWriter<std::fs::File>>;
+
+/// Holds a replay to the pace at which it was recorded.
+#[derive(Default)]
+struct Pace {
+    behind: Option<Span>,
+}
+
+impl Pace {
+    /// Longest single wait: a gap in the recording is not sat through.
+    const LONGEST: Span = Span::from_ns(2_000_000_000);
+
+    fn wait_until(&mut self, recorded: MonoTime, clock: &HostClock) {
+        let now = clock.now();
+        let behind = *self.behind.get_or_insert(now - recorded);
+        let wait = (recorded + behind) - now;
+        if wait > Self::LONGEST || wait < -Self::LONGEST {
+            self.behind = Some(now - recorded);
+        } else if wait > Span::ZERO {
+            thread::sleep(Duration::from_nanos(wait.ns().unsigned_abs()));
+        }
+    }
+}

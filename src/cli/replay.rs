@@ -1,0 +1,99 @@
+//! `windhover replay CAPTURE [--config FILE] [--out FLIGHT] [--realtime]`
+
+use std::path::PathBuf;
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::{CliError, CliResult};
+use crate::app::replay::{self, ReplayError, Step};
+use crate::app::{config_file, events, health};
+use crate::config::Config;
+use crate::pipeline::Output;
+
+/// Run a recorded capture or flight through the pipeline that flies: the same bytes and frames give
+/// the same estimates.
+#[derive(clap::Args, Debug)]
+#[command(after_help = "Examples:
+  windhover replay capture.mcap --out flight.mcap      # with the configuration attached to it
+  windhover replay capture.mcap --config other.toml --out flight.mcap
+  windhover replay FLIGHTS/20261118T150405Z --log --realtime   # watch yesterday's flight again")]
+pub(super) struct Args {
+    /// Capture or flight: an .mcap file, or a directory of segments
+    capture: PathBuf,
+    /// Configuration [default: the one attached to the capture]
+    #[arg(long)]
+    config: Option<PathBuf>,
+    /// Write the flight: everything the capture has, and the outputs
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// At the pace at which it was recorded, instead of as fast as it goes
+    #[arg(long)]
+    realtime: bool,
+    /// Print the log an operator would have tailed, on standard error
+    #[arg(long)]
+    log: bool,
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    let config = match &args.config {
+        Some(file) => config_file::load(file).map_err(CliError::config)?,
+        None => replay::config_of(&args.capture).map_err(|error| match error {
+            ReplayError::BadConfig { .. } | ReplayError::NoConfig { .. } => CliError::config(error),
+            other => CliError::failed(other),
+        })?,
+    };
+    if args.out.as_ref().is_some_and(|out| same_file(out, &args.capture)) {
+        return Err(CliError::usage("--out names the capture itself; a replay never writes over its source"));
+    }
+    let bar = progress_bar();
+    let summary =
+        replay::replay(&args.capture, &config, args.out.as_deref(), args.realtime, &mut |step| match step {
+            Step::Progress(done, total) => {
+                bar.set_length(total);
+                bar.set_position(done);
+            }
+            Step::Warning(words) => bar.suspend(|| eprintln!("windhover: {words}")),
+            Step::Output(output) => {
+                if args.log
+                    && let Some(line) = log_line(output, &config)
+                {
+                    bar.suspend(|| eprintln!("{line}"));
+                }
+            }
+        })?;
+    bar.finish_and_clear();
+    eprintln!(
+        "replayed {:.1} s and {} frames in {:.1} s: {:.1} times real time",
+        summary.recorded.s(),
+        summary.frames,
+        summary.took.s(),
+        summary.recorded.s() / summary.took.s().max(1e-3)
+    );
+    if let Some(out) = &args.out {
+        eprintln!("wrote {}", out.display());
+    }
+    Ok(())
+}
+
+/// The line an operator would tail, if the output makes one.
+fn log_line(output: &Output, config: &Config) -> Option<String> {
+    match output {
+        Output::Notice(notice) => Some(events::line_of_notice(notice).text()),
+        Output::Health(now) => Some(health::line(now, config, None).text()),
+        _ => None,
+    }
+}
+
+fn same_file(a: &std::path::Path, b: &std::path::Path) -> bool {
+    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
+}
+
+/// A bar of bytes on a terminal; nothing where standard error is a file.
+fn progress_bar() -> ProgressBar {
+    let style = ProgressStyle::with_template("{wide_bar} {percent:>3} %  {elapsed} of about {duration}");
+    let bar = ProgressBar::new(0);
+    match style {
+        Ok(style) => bar.with_style(style),
+        Err(_) => bar,
+    }
+}

@@ -1,0 +1,111 @@
+//! The two serial lines: bytes in, stamped measurements out.
+
+use crate::config::Config;
+use crate::decode::{CompassDecoder, DecodeCounts, GnssDecoder, HeardAttitude, HeardEpoch};
+use crate::msg::{AttitudeSample, GnssEpoch, Stamped};
+use crate::time::{MonoTime, Span};
+
+/// Time on the wire: ten bits a byte (8N1).
+fn on_the_wire(bytes: usize, baud: u32) -> Span {
+    Span::from_s(bytes as f64 * 10.0 / f64::from(baud.max(1)))
+}
+
+/// What was refused so far, and the reasons.
+fn refused(counts: &DecodeCounts) -> (u64, String) {
+    let reasons: Vec<String> = counts.refusals().map(|(why, n)| format!("{n} {}", why.words())).collect();
+    (counts.refused_total(), reasons.join(", "))
+}
+
+/// GPS bytes to epochs at their time of validity.
+pub(super) struct GpsLine {
+    decoder: GnssDecoder,
+    heard: Vec<HeardEpoch>,
+    baud: u32,
+    latency: Span,
+}
+
+impl GpsLine {
+    pub(super) fn new(config: &Config) -> Self {
+        Self {
+            decoder: GnssDecoder::new(),
+            heard: Vec::new(),
+            baud: config.gps.baud,
+            latency: Span::from_ms(config.gps.latency_ms),
+        }
+    }
+
+    pub(super) fn push(
+        &mut self,
+        bytes: &[u8],
+        t_recv: MonoTime,
+        seq: u64,
+        out: &mut Vec<Stamped<GnssEpoch>>,
+    ) {
+        self.decoder.push(bytes, t_recv, &mut self.heard);
+        self.stamp(seq, out);
+    }
+
+    pub(super) fn tick(&mut self, now: MonoTime, seq: u64, out: &mut Vec<Stamped<GnssEpoch>>) {
+        self.decoder.tick(now, &mut self.heard);
+        self.stamp(seq, out);
+    }
+
+    pub(super) fn finish(&mut self, out: &mut Vec<Stamped<GnssEpoch>>) {
+        self.decoder.flush(&mut self.heard);
+        self.stamp(u64::MAX, out);
+    }
+
+    fn stamp(&mut self, seq: u64, out: &mut Vec<Stamped<GnssEpoch>>) {
+        for heard in self.heard.drain(..) {
+            let began = heard.t_first_byte - on_the_wire(heard.bytes_before_end, self.baud);
+            let t_valid = began - self.latency;
+            out.push(Stamped { t_valid, t_recv: heard.t_last_byte, seq, value: heard.epoch });
+        }
+    }
+
+    pub(super) fn clock_sigma(&self) -> Option<Span> {
+        None
+    }
+
+    pub(super) fn refused(&self) -> (u64, String) {
+        refused(self.decoder.counts())
+    }
+}
+
+/// Compass bytes to samples at their time of validity.
+pub(super) struct CompassLine {
+    decoder: CompassDecoder,
+    heard: Vec<HeardAttitude>,
+    baud: u32,
+    latency: Span,
+}
+
+impl CompassLine {
+    pub(super) fn new(config: &Config) -> Self {
+        Self {
+            decoder: CompassDecoder::new(config.compass.format),
+            heard: Vec::new(),
+            baud: config.compass.baud,
+            latency: Span::from_ms(config.compass.latency_ms),
+        }
+    }
+
+    pub(super) fn push(
+        &mut self,
+        bytes: &[u8],
+        t_recv: MonoTime,
+        seq: u64,
+        out: &mut Vec<Stamped<AttitudeSample>>,
+    ) {
+        self.decoder.push(bytes, t_recv, &mut self.heard);
+        for heard in self.heard.drain(..) {
+            let length = heard.bytes + heard.bytes_after;
+            let t_valid = heard.t_recv - on_the_wire(length, self.baud) - self.latency;
+            out.push(Stamped { t_valid, t_recv: heard.t_recv, seq, value: heard.sample });
+        }
+    }
+
+    pub(super) fn refused(&self) -> (u64, String) {
+        refused(self.decoder.counts())
+    }
+}

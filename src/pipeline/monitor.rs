@@ -1,0 +1,240 @@
+//! Health once a second, and notices where something changes.
+
+use std::collections::BTreeMap;
+
+use super::output::{Health, Notice, NoticeKind, Output, SourceHealth, TargetHealth};
+use crate::config::Config;
+use crate::msg::{Disposition, FixKind, Source, TargetEstimate, TrackStatus};
+use crate::time::{MonoTime, Span};
+
+/// Health is told this often.
+const HEALTH_PERIOD: Span = Span::from_ns(1_000_000_000);
+/// A source that says nothing for this long is silent.
+const SILENCE: Span = Span::from_ns(1_500_000_000);
+
+/// Counts one source.
+#[derive(Clone, Copy, Default)]
+struct SourceCount {
+    total: u64,
+    at_last_health: u64,
+    last: Option<MonoTime>,
+    refused: u64,
+    refused_told: u64,
+    dropped: u64,
+    silent: bool,
+}
+
+/// Watches what flows and says what an operator should know.
+pub(super) struct Monitor {
+    names: Vec<String>,
+    gps: SourceCount,
+    compass: SourceCount,
+    camera: SourceCount,
+    fix: FixKind,
+    sats: Option<u32>,
+    clock_sigma: Option<Span>,
+    targets: Vec<TargetHealth>,
+    dispositions: BTreeMap<Disposition, u64>,
+    began: Option<MonoTime>,
+    next_health: Option<MonoTime>,
+}
+
+impl Monitor {
+    pub(super) fn new(config: &Config) -> Self {
+        let lost = |target| TargetEstimate {
+            t_valid: MonoTime::default(),
+            frame: 0,
+            target,
+            status: TrackStatus::Lost,
+            state: None,
+        };
+        Self {
+            names: config.target.iter().map(|t| t.name.clone()).collect(),
+            gps: SourceCount::default(),
+            compass: SourceCount::default(),
+            camera: SourceCount::default(),
+            fix: FixKind::None,
+            sats: None,
+            clock_sigma: None,
+            targets: (0..config.target.len())
+                .map(|i| TargetHealth { frames_seen: 0, last: lost(i) })
+                .collect(),
+            dispositions: BTreeMap::new(),
+            began: None,
+            next_health: None,
+        }
+    }
+
+    fn source(&mut self, source: Source) -> &mut SourceCount {
+        match source {
+            Source::Gps => &mut self.gps,
+            Source::Compass => &mut self.compass,
+            Source::Camera => &mut self.camera,
+        }
+    }
+
+    /// Time has come to `t`: health that is due, silences that have lasted long enough. Both fall on
+    /// the recording's own clock, so that a replay says the same.
+    pub(super) fn advance(&mut self, t: MonoTime, out: &mut Vec<Output>) {
+        let began = *self.began.get_or_insert(t);
+        let mut due = *self.next_health.get_or_insert(began + HEALTH_PERIOD);
+        if t - due > Span::from_s(60.0) {
+            out.push(notice(t, NoticeKind::ClockJump, None, format!("time leapt by {:.0} s", (t - due).s())));
+            due = t;
+        }
+        while t >= due {
+            self.silences(due, out);
+            out.push(Output::Health(Box::new(self.health(due))));
+            due += HEALTH_PERIOD;
+        }
+        self.next_health = Some(due);
+    }
+
+    fn silences(&mut self, t: MonoTime, out: &mut Vec<Output>) {
+        let began = self.began.unwrap_or(t);
+        for source in [Source::Gps, Source::Compass, Source::Camera] {
+            let count = self.source(source);
+            let quiet = t - count.last.unwrap_or(began);
+            if !count.silent && quiet >= SILENCE {
+                count.silent = true;
+                let detail = format!("nothing to use from the {} for {:.1} s", source.name(), quiet.s());
+                out.push(notice(t, NoticeKind::SourceSilent, Some(source), detail));
+            }
+        }
+    }
+
+    fn health(&mut self, t: MonoTime) -> Health {
+        let figures = |count: &mut SourceCount| {
+            let rate_hz = (count.total - count.at_last_health) as f64 / HEALTH_PERIOD.s();
+            count.at_last_health = count.total;
+            SourceHealth {
+                rate_hz,
+                age: count.last.map(|last| t - last),
+                total: count.total,
+                refused: count.refused,
+                dropped: count.dropped,
+            }
+        };
+        let health = Health {
+            t,
+            gps: figures(&mut self.gps),
+            compass: figures(&mut self.compass),
+            camera: figures(&mut self.camera),
+            fix: self.fix,
+            sats: self.sats,
+            clock_sigma: self.clock_sigma,
+            targets: self.targets.clone(),
+            dispositions: self.dispositions.clone(),
+        };
+        self.targets.iter_mut().for_each(|target| target.frames_seen = 0);
+        health
+    }
+
+    /// A source gave something that can be used.
+    pub(super) fn heard(&mut self, source: Source, t: MonoTime, out: &mut Vec<Output>) {
+        let count = self.source(source);
+        count.total += 1;
+        if count.silent {
+            count.silent = false;
+            let quiet = count.last.map_or(String::new(), |last| format!(" after {:.1} s", (t - last).s()));
+            let detail = format!("the {} is back{quiet}", source.name());
+            out.push(notice(t, NoticeKind::SourceBack, Some(source), detail));
+        }
+        self.source(source).last = Some(t);
+    }
+
+    /// How many pieces of a source's bytes were refused so far, and the last reason.
+    pub(super) fn refused(
+        &mut self,
+        source: Source,
+        t: MonoTime,
+        total: u64,
+        why: &str,
+        out: &mut Vec<Output>,
+    ) {
+        let count = self.source(source);
+        count.refused = total;
+        if total > count.refused_told {
+            let detail = format!("{} refused from the {}: {why}", total - count.refused_told, source.name());
+            count.refused_told = total;
+            out.push(notice(t, NoticeKind::BytesRefused, Some(source), detail));
+        }
+    }
+
+    /// A frame could not be used.
+    pub(super) fn frame_unusable(&mut self, t: MonoTime, why: String, out: &mut Vec<Output>) {
+        self.camera.refused += 1;
+        out.push(notice(t, NoticeKind::FrameUnusable, Some(Source::Camera), why));
+    }
+
+    /// Something was lost before it could be recorded.
+    pub(super) fn dropped(&mut self, source: Source, t: MonoTime, lost: u32, out: &mut Vec<Output>) {
+        self.source(source).dropped += u64::from(lost);
+        let detail = format!("{lost} lost from the {} before they could be recorded", source.name());
+        out.push(notice(t, NoticeKind::Dropped, Some(source), detail));
+    }
+
+    /// The receiver's fix and the state of the time fit.
+    pub(super) fn fix(
+        &mut self,
+        t: MonoTime,
+        fix: FixKind,
+        sats: Option<u32>,
+        clock_sigma: Option<Span>,
+        out: &mut Vec<Output>,
+    ) {
+        let had = self.fix != FixKind::None;
+        let has = fix != FixKind::None;
+        if has && !had {
+            let satellites = sats.map_or(String::new(), |n| format!(", {n} satellites"));
+            let kind = if fix == FixKind::ThreeD { "3d" } else { "2d" };
+            let detail = format!("the receiver has a {kind} fix{satellites}");
+            out.push(notice(t, NoticeKind::FixAcquired, Some(Source::Gps), detail));
+        } else if had && !has {
+            let detail = "the receiver has no fix".to_owned();
+            out.push(notice(t, NoticeKind::FixLost, Some(Source::Gps), detail));
+        }
+        (self.fix, self.sats, self.clock_sigma) = (fix, sats, clock_sigma);
+    }
+
+    /// A frame in which a marker of the target was seen.
+    pub(super) fn seen(&mut self, target: usize) {
+        if let Some(target) = self.targets.get_mut(target) {
+            target.frames_seen += 1;
+        }
+    }
+
+    /// A target's estimate.
+    pub(super) fn estimate(&mut self, estimate: &TargetEstimate, t: MonoTime, out: &mut Vec<Output>) {
+        let Some(target) = self.targets.get_mut(estimate.target) else { return };
+        let before = target.last.status;
+        target.last = *estimate;
+        let name = &self.names[estimate.target];
+        let (kind, detail) = match (before, estimate.status) {
+            (TrackStatus::Lost | TrackStatus::Acquiring, TrackStatus::Tracking) => {
+                (NoticeKind::TargetTracking, format!("tracking {name}"))
+            }
+            (TrackStatus::Coasting, TrackStatus::Tracking) => {
+                (NoticeKind::TargetTracking, format!("tracking {name} again"))
+            }
+            (TrackStatus::Tracking, TrackStatus::Coasting) => {
+                (NoticeKind::TargetCoasting, format!("no marker of {name} in view, predicting"))
+            }
+            (TrackStatus::Tracking | TrackStatus::Coasting, TrackStatus::Lost) => {
+                (NoticeKind::TargetLost, format!("lost {name}"))
+            }
+            _ => return,
+        };
+        out.push(notice(t, kind, None, detail));
+    }
+
+    /// What became of a measurement.
+    pub(super) fn disposition(&mut self, disposition: Disposition) {
+        *self.dispositions.entry(disposition).or_default() += 1;
+    }
+}
+
+/// A notice as an output.
+pub(super) fn notice(t: MonoTime, kind: NoticeKind, source: Option<Source>, detail: String) -> Output {
+    Output::Notice(Notice { t, kind, source, detail })
+}

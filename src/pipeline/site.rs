@@ -1,0 +1,96 @@
+//! Where the flight is: the NED origin, the ground, the declination, settled by the first fixes.
+
+use crate::config::{Config, Declination, GroundSource};
+use crate::estimate::Site;
+use crate::geo::{self, Geodetic, Ground, LocalFrame};
+use crate::msg::{FixKind, GnssEpoch};
+
+/// Fixes whose median height is the ground where the ground is where the aircraft took off.
+const TAKEOFF_FIXES: usize = 5;
+/// Fixes to wait for a date before the World Magnetic Model is given up.
+const DATE_PATIENCE: usize = 50;
+
+/// Collects first fixes until the site is settled.
+pub(super) struct SiteFinder {
+    first: Option<Geodetic>,
+    heights_m: Vec<f64>,
+    seen: usize,
+}
+
+/// A settled site, and what an operator should know of its declination.
+pub(super) struct SettledSite {
+    pub(super) site: Site,
+    pub(super) declination_notice: Option<String>,
+}
+
+impl SiteFinder {
+    pub(super) fn new() -> Self {
+        Self { first: None, heights_m: Vec::with_capacity(TAKEOFF_FIXES), seen: 0 }
+    }
+
+    /// Takes a fix; the site when it is settled.
+    pub(super) fn offer(&mut self, epoch: &GnssEpoch, config: &Config) -> Option<SettledSite> {
+        let at = position(epoch)?;
+        let first = *self.first.get_or_insert(at);
+        self.seen += 1;
+        let geoid_m = epoch.geoid_m.unwrap_or(0.0);
+        let ground_height_m = match (config.ground.elevation_msl_m, config.ground.source) {
+            (Some(elevation_msl_m), _) => elevation_msl_m + geoid_m,
+            (None, Some(GroundSource::Takeoff)) => {
+                self.heights_m.push(at.height_m);
+                if self.heights_m.len() < TAKEOFF_FIXES {
+                    return None;
+                }
+                median(&mut self.heights_m)
+            }
+            (None, None) => first.height_m,
+        };
+        let (declination_rad, declination_notice) = self.declination(epoch, at, config)?;
+        let datum = config.datum.map_or(Geodetic { height_m: ground_height_m, ..first }, |d| Geodetic {
+            lat_deg: d.lat_deg,
+            lon_deg: d.lon_deg,
+            height_m: d.height_m,
+        });
+        let ground = Ground::Flat { down_m: datum.height_m - ground_height_m };
+        let site = Site { frame: LocalFrame::new(datum), ground, declination_rad };
+        Some(SettledSite { site, declination_notice })
+    }
+
+    /// Declination in radians and what to say of it; `None` while waiting for a date.
+    fn declination(&self, epoch: &GnssEpoch, at: Geodetic, config: &Config) -> Option<(f64, Option<String>)> {
+        if let Some(figure) = config.compass.declination_deg {
+            return Some((figure.to_radians(), None));
+        }
+        let Some(Declination::Wmm) = config.compass.declination else {
+            return Some((0.0, None));
+        };
+        let Some(utc) = epoch.utc else {
+            let waited = self.seen >= DATE_PATIENCE;
+            let words = "the receiver tells no date, so no declination from the World Magnetic Model: \
+                         headings are magnetic; set compass.declination_deg";
+            return waited.then(|| (0.0, Some(words.to_owned())));
+        };
+        Some(match geo::declination(at, utc) {
+            Ok(angle) => {
+                let words =
+                    format!("declination {:.2} deg from the World Magnetic Model", angle.to_degrees());
+                (angle, Some(words))
+            }
+            Err(error) => (0.0, Some(error.to_string())),
+        })
+    }
+}
+
+/// A three-dimensional position above the ellipsoid.
+fn position(epoch: &GnssEpoch) -> Option<Geodetic> {
+    if epoch.fix != FixKind::ThreeD {
+        return None;
+    }
+    let height_m = epoch.alt_msl_m? + epoch.geoid_m.unwrap_or(0.0);
+    Some(Geodetic { lat_deg: epoch.lat_deg?, lon_deg: epoch.lon_deg?, height_m })
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
