@@ -3,7 +3,7 @@
 use crate::config::Config;
 use crate::decode::{CompassDecoder, DecodeCounts, GnssDecoder, HeardAttitude, HeardEpoch};
 use crate::msg::{AttitudeSample, GnssEpoch, Stamped};
-use crate::time::{MonoTime, Span};
+use crate::time::{GnssClock, MonoTime, Span, SteadyClock};
 
 /// Time on the wire: ten bits a byte (8N1).
 fn on_the_wire(bytes: usize, baud: u32) -> Span {
@@ -20,17 +20,22 @@ fn refused(counts: &DecodeCounts) -> (u64, String) {
 pub(super) struct GpsLine {
     decoder: GnssDecoder,
     heard: Vec<HeardEpoch>,
+    clock: GnssClock,
+    clock_sigma: Option<Span>,
     baud: u32,
     latency: Span,
 }
 
 impl GpsLine {
     pub(super) fn new(config: &Config) -> Self {
+        let latency = Span::from_ms(config.gps.latency_ms);
         Self {
             decoder: GnssDecoder::new(),
             heard: Vec::new(),
+            clock: GnssClock::new(latency),
+            clock_sigma: None,
             baud: config.gps.baud,
-            latency: Span::from_ms(config.gps.latency_ms),
+            latency,
         }
     }
 
@@ -58,13 +63,25 @@ impl GpsLine {
     fn stamp(&mut self, seq: u64, out: &mut Vec<Stamped<GnssEpoch>>) {
         for heard in self.heard.drain(..) {
             let began = heard.t_first_byte - on_the_wire(heard.bytes_before_end, self.baud);
-            let t_valid = began - self.latency;
+            if let (true, Some(time_of_day_ns)) = (heard.opens_burst, heard.epoch.time_of_day_ns) {
+                self.clock.observe(time_of_day_ns, began);
+            }
+            // An epoch without a time, or one the fit does not know, was true a latency ago.
+            let fitted = heard.epoch.time_of_day_ns.and_then(|of_day| self.clock.host_time_of(of_day, began));
+            self.clock_sigma = fitted.map(|(_, sigma)| sigma);
+            let t_valid = fitted.map_or(began - self.latency, |(t, _)| t);
             out.push(Stamped { t_valid, t_recv: heard.t_last_byte, seq, value: heard.epoch });
         }
     }
 
+    /// One-sigma of the fit from UTC to host time.
     pub(super) fn clock_sigma(&self) -> Option<Span> {
-        None
+        self.clock_sigma
+    }
+
+    /// The fit, for those who mark the receiver's seconds.
+    pub(super) fn clock(&mut self) -> &mut GnssClock {
+        &mut self.clock
     }
 
     pub(super) fn refused(&self) -> (u64, String) {
@@ -76,6 +93,7 @@ impl GpsLine {
 pub(super) struct CompassLine {
     decoder: CompassDecoder,
     heard: Vec<HeardAttitude>,
+    clock: SteadyClock,
     baud: u32,
     latency: Span,
 }
@@ -85,6 +103,7 @@ impl CompassLine {
         Self {
             decoder: CompassDecoder::new(config.compass.format),
             heard: Vec::new(),
+            clock: SteadyClock::new(),
             baud: config.compass.baud,
             latency: Span::from_ms(config.compass.latency_ms),
         }
@@ -100,7 +119,8 @@ impl CompassLine {
         self.decoder.push(bytes, t_recv, &mut self.heard);
         for heard in self.heard.drain(..) {
             let length = heard.bytes + heard.bytes_after;
-            let t_valid = heard.t_recv - on_the_wire(length, self.baud) - self.latency;
+            let began = heard.t_recv - on_the_wire(length, self.baud);
+            let t_valid = self.clock.smooth(began) - self.latency;
             out.push(Stamped { t_valid, t_recv: heard.t_recv, seq, value: heard.sample });
         }
     }

@@ -107,6 +107,11 @@ impl Pipeline {
         }
     }
 
+    /// The receiver's pulse marked a whole second of UTC at this host time.
+    pub fn pulse(&mut self, edge: MonoTime) {
+        self.gps.clock().observe_pulse(edge);
+    }
+
     /// The pure part of a frame's handling, which may run ahead on other threads.
     pub fn prepare(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault> {
         frame::decode(frame, want_rgb)
