@@ -5,7 +5,8 @@
 //! Gaussian). Its kind and size are not known: each candidate is fitted by Newton's method (both
 //! log-densities are concave, so there is one maximum), weighed by its evidence in Laplace's
 //! approximation, and the line is the mean over all. For symmetric jitter it runs through the
-//! middle, for one-sided jitter along the lower edge, where nothing was late.
+//! middle, for one-sided jitter along the lower edge, where nothing was late. A small part of the
+//! arrivals may be anywhere, so that single wild ones do not count.
 
 /// A point: time in seconds, arrival in milliseconds.
 pub(super) type Point = (f64, f64);
@@ -16,6 +17,9 @@ const SIZES_MS: [f64; 8] = [0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0];
 const NOISE_PARTS: [f64; 2] = [1.0 / 16.0, 0.2];
 /// Least normal noise, milliseconds: what stamping a read costs.
 const NOISE_MIN_MS: f64 = 0.1;
+/// Part of the arrivals that have nothing to do with the jitter, and their density over a second.
+const WILD_PART: f64 = 0.01;
+const WILD_DENSITY: f64 = WILD_PART / 1_000.0;
 /// Newton steps at most; from the line before, two or three do.
 const STEPS_MAX: usize = 30;
 /// Candidates lighter than the heaviest by more than this (log) are looked at seldom.
@@ -193,7 +197,13 @@ impl Candidate {
         for &(t, x) in points {
             let dt = t - t_mean;
             let (log, slope, bend) = self.shape.log_density(x - line.0 - line.1 * dt);
-            sum.log += log;
+            // Beside the jitter, a few arrivals may be anywhere; what a point counts is how far it is
+            // not one of these.
+            let density = (1.0 - WILD_PART) * log.exp();
+            let mixed = density + WILD_DENSITY;
+            let trust = density / mixed;
+            let (slope, bend) = (trust * slope, trust * bend);
+            sum.log += mixed.ln();
             sum.gradient[0] -= slope;
             sum.gradient[1] -= slope * dt;
             sum.curvature[0] -= bend;
