@@ -2,6 +2,7 @@
 
 mod calibrate;
 mod check_config;
+mod decode;
 mod detect;
 mod error;
 mod export;
@@ -37,6 +38,8 @@ enum Command {
     Export(export::Args),
     /// Say what is wrong with a configuration, or print the effective one
     CheckConfig(check_config::Args),
+    /// Decode a raw serial log of a GPS receiver or a compass
+    Decode(decode::Args),
     /// Make the certificates with which payloads and ground stations know each other
     Keys(keys::Args),
     /// Predict how well the ground is located from here: the paper's error analysis
@@ -67,6 +70,7 @@ pub fn main() -> ExitCode {
         Command::Replay(args) => replay::run(&args),
         Command::Export(args) => export::run(&args),
         Command::CheckConfig(args) => check_config::run(&args),
+        Command::Decode(args) => decode::run(&args),
         Command::Keys(args) => keys::run(&args),
         Command::Montecarlo(args) => montecarlo::run(&args),
         Command::Report(args) => report::run(&args),

@@ -1,0 +1,340 @@
+//! `windhover decode gps|compass FILE`
+
+use std::fmt::Display;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use super::{CliError, CliResult};
+use crate::config::CompassFormat;
+use crate::decode::{CompassDecoder, CompassReading, DecodeCounts, GnssDecoder, HeardAttitude, HeardEpoch};
+use crate::msg::{FixKind, GnssEpoch};
+use crate::time::{MonoTime, NS_PER_S, UtcTime};
+
+/// Decode a raw serial log: what the receiver or compass said, and what was refused.
+#[derive(clap::Args, Debug)]
+pub(super) struct Args {
+    #[command(subcommand)]
+    device: Device,
+}
+
+#[derive(clap::Subcommand, Debug)]
+enum Device {
+    /// Epochs of a GPS receiver
+    Gps(GpsArgs),
+    /// Readings of a digital compass
+    Compass(CompassArgs),
+}
+
+#[derive(clap::Args, Debug)]
+struct GpsArgs {
+    /// Serial log
+    file: PathBuf,
+    /// One JSON object an epoch
+    #[arg(long)]
+    json: bool,
+    /// What the receiver speaks: NMEA with Garmin's own sentences is all there is
+    #[arg(long, value_enum, default_value = "nmea")]
+    format: GpsFormat,
+}
+
+#[derive(clap::ValueEnum, Clone, Copy, Debug)]
+enum GpsFormat {
+    Nmea,
+}
+
+#[derive(clap::Args, Debug)]
+struct CompassArgs {
+    /// Serial log
+    file: PathBuf,
+    /// One JSON object a reading
+    #[arg(long)]
+    json: bool,
+    /// What the compass speaks; by default the format that understands most of the log
+    #[arg(long, value_enum)]
+    format: Option<Format>,
+}
+
+/// Formats as the configuration names them.
+#[derive(clap::ValueEnum, Clone, Copy, PartialEq, Debug)]
+enum Format {
+    Tcm2,
+    Os5000,
+    Hmr3000,
+    Revolution,
+    Pni,
+    Pashr,
+    Nmea,
+}
+
+impl Format {
+    const fn of_config(self) -> CompassFormat {
+        match self {
+            Self::Tcm2 => CompassFormat::Tcm2,
+            Self::Os5000 => CompassFormat::Os5000,
+            Self::Hmr3000 => CompassFormat::Hmr3000,
+            Self::Revolution => CompassFormat::Revolution,
+            Self::Pni => CompassFormat::Pni,
+            Self::Pashr => CompassFormat::Pashr,
+            Self::Nmea => CompassFormat::Nmea,
+        }
+    }
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    let mut out = std::io::BufWriter::new(std::io::stdout().lock());
+    let counts = match &args.device {
+        Device::Gps(gps) => {
+            // One format today; the option is there so that scripts need not change with a second.
+            let GpsFormat::Nmea = gps.format;
+            decode_gps(&read(&gps.file)?, gps.json, &mut out)
+        }
+        Device::Compass(compass) => {
+            decode_compass(&read(&compass.file)?, compass.format, compass.json, &mut out)
+        }
+    };
+    let counts = counts.and_then(|counts| out.flush().map(|()| counts));
+    match counts {
+        Ok(counts) => {
+            eprintln!("{counts}");
+            Ok(())
+        }
+        // Whoever read the output has seen enough.
+        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        Err(error) => Err(CliError::failed(format!("standard output: {error}"))),
+    }
+}
+
+fn read(file: &Path) -> Result<Vec<u8>, CliError> {
+    std::fs::read(file).map_err(|error| CliError::failed(format!("{}: {error}", file.display())))
+}
+
+/// A JSON object an epoch, in the contract's order.
+#[derive(Serialize)]
+struct EpochJson {
+    utc: Option<String>,
+    fix: &'static str,
+    lat_deg: Option<f64>,
+    lon_deg: Option<f64>,
+    alt_msl_m: Option<f64>,
+    geoid_m: Option<f64>,
+    speed_mps: Option<f64>,
+    course_deg: Option<f64>,
+    vel_ned_mps: Option<[Option<f64>; 3]>,
+    hpe_m: Option<f64>,
+    vpe_m: Option<f64>,
+    sats: Option<u32>,
+    hdop: Option<f64>,
+}
+
+impl EpochJson {
+    fn of(epoch: &GnssEpoch) -> Self {
+        Self {
+            utc: utc_text(epoch),
+            fix: fix_name(epoch.fix),
+            lat_deg: epoch.lat_deg,
+            lon_deg: epoch.lon_deg,
+            alt_msl_m: epoch.alt_msl_m,
+            geoid_m: epoch.geoid_m,
+            speed_mps: epoch.speed_mps,
+            course_deg: epoch.course_deg,
+            vel_ned_mps: epoch.vel_ned_mps.map(|v| [Some(v.x), Some(v.y), epoch.vel_has_down.then_some(v.z)]),
+            hpe_m: epoch.hpe_m,
+            vpe_m: epoch.vpe_m,
+            sats: epoch.sats,
+            hdop: epoch.hdop,
+        }
+    }
+}
+
+const fn fix_name(fix: FixKind) -> &'static str {
+    match fix {
+        FixKind::None => "none",
+        FixKind::TwoD => "2d",
+        FixKind::ThreeD => "3d",
+    }
+}
+
+/// UTC with its date; second 60 of a leap minute as the receiver said it.
+fn utc_text(epoch: &GnssEpoch) -> Option<String> {
+    let utc = epoch.utc?;
+    if epoch.time_of_day_ns.is_some_and(|ns| ns >= 86_400 * NS_PER_S) {
+        let second_before = UtcTime::from_unix_ns(utc.unix_ns() - NS_PER_S).to_string();
+        return Some(second_before.replacen(":59.", ":60.", 1));
+    }
+    Some(utc.to_string())
+}
+
+fn decode_gps(bytes: &[u8], json: bool, out: &mut impl Write) -> std::io::Result<DecodeCounts> {
+    let (mut decoder, mut heard) = (GnssDecoder::patient(), Vec::new());
+    decoder.push(bytes, MonoTime::default(), &mut heard);
+    decoder.flush(&mut heard);
+    if !json {
+        writeln!(
+            out,
+            "{:<24} {:>4} {:>13} {:>14} {:>9} {:>8} {:>7} {:>6} {:>23} {:>6} {:>6} {:>4} {:>5}",
+            "utc",
+            "fix",
+            "lat_deg",
+            "lon_deg",
+            "alt_msl_m",
+            "geoid_m",
+            "m/s",
+            "course",
+            "vel_ned_mps",
+            "hpe_m",
+            "vpe_m",
+            "sats",
+            "hdop"
+        )?;
+    }
+    for HeardEpoch { epoch, .. } in &heard {
+        if json {
+            let line = serde_json::to_string(&EpochJson::of(epoch)).map_err(std::io::Error::other)?;
+            writeln!(out, "{line}")?;
+        } else {
+            epoch_row(epoch, out)?;
+        }
+    }
+    Ok(decoder.counts().clone())
+}
+
+fn epoch_row(epoch: &GnssEpoch, out: &mut impl Write) -> std::io::Result<()> {
+    let fixed = |value: Option<f64>, digits: usize| value.map(|value| format!("{value:.digits$}"));
+    let velocity = epoch.vel_ned_mps.map(|v| {
+        let down = if epoch.vel_has_down { format!("{:.2}", v.z) } else { "-".to_owned() };
+        format!("{:.2} {:.2} {down}", v.x, v.y)
+    });
+    writeln!(
+        out,
+        "{:<24} {:>4} {:>13} {:>14} {:>9} {:>8} {:>7} {:>6} {:>23} {:>6} {:>6} {:>4} {:>5}",
+        or_dash(utc_text(epoch)),
+        fix_name(epoch.fix),
+        or_dash(fixed(epoch.lat_deg, 8)),
+        or_dash(fixed(epoch.lon_deg, 8)),
+        or_dash(fixed(epoch.alt_msl_m, 2)),
+        or_dash(fixed(epoch.geoid_m, 2)),
+        or_dash(fixed(epoch.speed_mps, 2)),
+        or_dash(fixed(epoch.course_deg, 1)),
+        or_dash(velocity),
+        or_dash(fixed(epoch.hpe_m, 1)),
+        or_dash(fixed(epoch.vpe_m, 1)),
+        or_dash(epoch.sats),
+        or_dash(fixed(epoch.hdop, 1)),
+    )
+}
+
+fn or_dash(value: Option<impl Display>) -> String {
+    value.map_or_else(|| "-".to_owned(), |value| value.to_string())
+}
+
+/// A JSON object a reading, in the contract's order.
+#[derive(Serialize)]
+struct ReadingJson {
+    heading_deg: Option<f64>,
+    pitch_deg: Option<f64>,
+    roll_deg: Option<f64>,
+    #[serde(rename = "true")]
+    is_true: bool,
+    valid: bool,
+}
+
+fn decode_compass(
+    bytes: &[u8],
+    format: Option<Format>,
+    json: bool,
+    out: &mut impl Write,
+) -> std::io::Result<DecodeCounts> {
+    let (heard, counts) = match format {
+        Some(format) => decode_as(bytes, format),
+        None => likeliest(bytes),
+    };
+    if !json {
+        writeln!(
+            out,
+            "{:>11} {:>9} {:>9} {:>5} {:>5}",
+            "heading_deg", "pitch_deg", "roll_deg", "true", "valid"
+        )?;
+    }
+    for HeardAttitude { reading, .. } in &heard {
+        let CompassReading { heading_deg, pitch_deg, roll_deg, heading_is_true, .. } = *reading;
+        let valid = reading.is_valid();
+        if json {
+            let object = ReadingJson { heading_deg, pitch_deg, roll_deg, is_true: heading_is_true, valid };
+            writeln!(out, "{}", serde_json::to_string(&object).map_err(std::io::Error::other)?)?;
+        } else {
+            let angle = |value: Option<f64>| or_dash(value.map(|deg| format!("{deg:.2}")));
+            let (heading, pitch, roll) = (angle(heading_deg), angle(pitch_deg), angle(roll_deg));
+            writeln!(out, "{heading:>11} {pitch:>9} {roll:>9} {heading_is_true:>5} {valid:>5}")?;
+        }
+    }
+    Ok(counts)
+}
+
+fn decode_as(bytes: &[u8], format: Format) -> (Vec<HeardAttitude>, DecodeCounts) {
+    let (mut decoder, mut heard) = (CompassDecoder::new(format.of_config()), Vec::new());
+    decoder.push(bytes, MonoTime::default(), &mut heard);
+    (heard, decoder.counts().clone())
+}
+
+/// The decoding by the format that understands most: whole attitudes first, then any reading. A
+/// device's own format goes before plain NMEA.
+fn likeliest(bytes: &[u8]) -> (Vec<HeardAttitude>, DecodeCounts) {
+    let own = [Format::Hmr3000, Format::Revolution, Format::Pashr, Format::Tcm2, Format::Os5000, Format::Pni];
+    let understood = |heard: &[HeardAttitude]| {
+        let angles = |r: &CompassReading| [r.heading_deg, r.pitch_deg, r.roll_deg].iter().flatten().count();
+        heard.iter().map(|heard| angles(&heard.reading)).sum::<usize>()
+    };
+    let mut best = decode_as(bytes, Format::Nmea);
+    for format in own {
+        let other = decode_as(bytes, format);
+        if understood(&other.0) > understood(&best.0) {
+            best = other;
+        }
+    }
+    best
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn gps_json(text: &str) -> Vec<serde_json::Value> {
+        let mut out = Vec::new();
+        decode_gps(text.as_bytes(), true, &mut out).expect("memory can be written");
+        String::from_utf8_lossy(&out).lines().map(|line| serde_json::from_str(line).expect("JSON")).collect()
+    }
+
+    #[test]
+    fn an_epoch_is_one_object_with_null_where_nothing_was_said() {
+        let rmc = "$GPRMC,150405.2,A,3004.17608,N,08534.52362,W,000.2,358.5,181126,003.4,W,D*01\r\n";
+        let objects = gps_json(rmc);
+        assert_eq!(objects.len(), 1);
+        let epoch = &objects[0];
+        assert_eq!(epoch["utc"], "2026-11-18T15:04:05.200Z");
+        assert_eq!((&epoch["fix"], &epoch["alt_msl_m"]), (&"2d".into(), &serde_json::Value::Null));
+        assert_eq!(epoch["vel_ned_mps"][2], serde_json::Value::Null);
+        assert_eq!(epoch.as_object().map(serde_json::Map::len), Some(13));
+    }
+
+    #[test]
+    fn a_leap_second_is_told_as_the_receiver_does() {
+        let epoch = GnssEpoch {
+            utc: Some(UtcTime::from_unix_ns(1_483_228_800_500_000_000)),
+            time_of_day_ns: Some(86_400_500_000_000),
+            ..GnssEpoch::default()
+        };
+        assert_eq!(utc_text(&epoch).as_deref(), Some("2016-12-31T23:59:60.500Z"));
+    }
+
+    #[test]
+    fn the_format_of_a_compass_log_is_recognised() {
+        let mut out = Vec::new();
+        let counts = decode_compass(b"$PTNTHTM,14223,N,169,N,-43,N,13641,2454*15\r\n", None, true, &mut out);
+        assert_eq!(counts.map(|counts| counts.used).ok(), Some(1));
+        let object: serde_json::Value = serde_json::from_slice(&out).expect("JSON");
+        assert!((object["heading_deg"].as_f64().expect("a figure") - 78.13).abs() < 0.01);
+        assert_eq!((&object["true"], &object["valid"]), (&false.into(), &true.into()));
+    }
+}
