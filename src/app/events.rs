@@ -31,16 +31,15 @@ pub enum Event {
     Device(NoteKind),
     /// The pipeline says something.
     Pipeline(NoticeKind),
-    /// A flight was begun on the data card.
-    FlightBegun,
-    /// A flight was closed on the data card.
+    /// A flight was closed because power is going.
     FlightClosed,
-    /// The data card refuses or is full.
-    CardFault,
-    /// The data card is used again.
-    CardBack,
-    /// Something to know about the data card.
-    CardNote,
+    /// The store says something about the data card; names are the store's own.
+    Card {
+        /// Its fixed name.
+        name: &'static str,
+        /// Whether the operator should do something.
+        warning: bool,
+    },
     /// A ground station is connected.
     LinkUp,
     /// A ground station went away.
@@ -93,11 +92,9 @@ impl Event {
             Self::DeviceDown => row("device_down", Warn, 30),
             Self::Device(note) => device_row(note),
             Self::Pipeline(notice) => pipeline_row(notice),
-            Self::FlightBegun => row("flight_begun", Info, 0),
-            Self::FlightClosed => row("flight_closed", Info, 0),
-            Self::CardFault => row("card_fault", Error, 10),
-            Self::CardBack => row("card_back", Info, 0),
-            Self::CardNote => row("card_note", Warn, 1),
+            Self::FlightClosed => row("flight_closed", Warn, 0),
+            Self::Card { name, warning: true } => row(name, Warn, 5),
+            Self::Card { name, warning: false } => row(name, Info, 0),
             Self::LinkUp => row("link_up", Info, 0),
             Self::LinkDown => row("link_down", Warn, 0),
             Self::LinkFault => row("link_fault", Warn, 30),
@@ -214,11 +211,7 @@ mod tests {
             Event::Stopped,
             Event::DeviceUp,
             Event::DeviceDown,
-            Event::FlightBegun,
             Event::FlightClosed,
-            Event::CardFault,
-            Event::CardBack,
-            Event::CardNote,
             Event::LinkUp,
             Event::LinkDown,
             Event::LinkFault,

@@ -1,16 +1,22 @@
 //! Wiring: configuration files, the task graph, supervision, the operator log, reports.
 
+pub mod brain;
+pub mod card;
 pub mod config_file;
 pub mod devices;
 pub mod events;
+pub mod export;
 pub mod flight;
 pub mod health;
 pub mod inbox;
 pub mod log;
+pub mod outlets;
 pub mod presence;
 pub mod reload;
-pub mod report;
-pub mod supervise;
-pub mod truth;
-pub mod export;
 pub mod replay;
+pub mod report;
+pub mod run;
+pub mod supervise;
+pub mod topology;
+pub mod truth;
+mod watch;

@@ -6,13 +6,14 @@ mod decode;
 mod detect;
 mod error;
 mod export;
+mod generate;
 mod keys;
 mod montecarlo;
-mod report;
-mod store;
-mod simulate;
-
 mod replay;
+mod report;
+mod run;
+mod simulate;
+mod store;
 
 pub use error::{CliError, CliResult};
 
@@ -36,6 +37,11 @@ enum Command {
     Replay(replay::Args),
     /// Write the outputs of a flight for other tools
     Export(export::Args),
+    /// Write manual pages and shell completions
+    #[command(hide = true)]
+    Generate(generate::Args),
+    /// Run the daemon: read the sensors, estimate, record, send
+    Run(run::Args),
     /// Say what is wrong with a configuration, or print the effective one
     CheckConfig(check_config::Args),
     /// Decode a raw serial log of a GPS receiver or a compass
@@ -69,6 +75,8 @@ pub fn main() -> ExitCode {
         Command::Calibrate(args) => calibrate::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Export(args) => export::run(&args),
+        Command::Generate(args) => generate::run(&args),
+        Command::Run(args) => run::run(&args),
         Command::CheckConfig(args) => check_config::run(&args),
         Command::Decode(args) => decode::run(&args),
         Command::Keys(args) => keys::run(&args),

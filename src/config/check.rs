@@ -196,7 +196,6 @@ impl Config {
     fn check_daemon(&self) -> Result<(), ConfigError> {
         within("daemon.answer_within_s", self.daemon.answer_within_s, 1.0, 600.0)?;
         within("daemon.frame_queue", self.daemon.frame_queue as f64, 1.0, 30.0)?;
-        within("daemon.jpeg_quality", f64::from(self.daemon.jpeg_quality), 1.0, 100.0)?;
         if let Some(volts) = self.power.low_voltage_v {
             within("power.low_voltage_v", volts, 0.1, 1_000.0)?;
         }

@@ -13,13 +13,11 @@ pub struct DaemonConfig {
     /// Frames that wait for the pipeline; when one more comes, the oldest is dropped and recorded as
     /// dropped. More frames mean more latency under load, never more throughput.
     pub frame_queue: usize,
-    /// Frames are recorded as JPEG of this quality (1 to 100) where the camera gives raw ones.
-    pub jpeg_quality: u8,
 }
 
 impl Default for DaemonConfig {
     fn default() -> Self {
-        Self { optional: Vec::new(), answer_within_s: 5.0, frame_queue: 3, jpeg_quality: 90 }
+        Self { optional: Vec::new(), answer_within_s: 5.0, frame_queue: 3 }
     }
 }
 

@@ -1,0 +1,58 @@
+#!/usr/bin/env bash
+# Builds the virtual payload computer: Debian from its packages, our package installed as a user would,
+# a read-only root image and an empty data card. What is there already is not built again.
+#   hil/build.sh WINDHOVER.deb [DIRECTORY]
+set -euo pipefail
+here=$(cd "$(dirname "$0")" && pwd)
+deb=$(realpath "$1")
+out=$(realpath -m "${2:-target/hil}")
+suite=${SUITE:-bookworm}
+packages=linux-image-amd64,systemd,systemd-sysv,udev,kmod,v4l-utils,iproute2,dbus,dmsetup,e2fsprogs
+mkdir -p "$out"
+
+if [ "$(id -u)" != 0 ]; then
+    echo "hil/build.sh: run as root (it makes device nodes and file owners for the image)" >&2
+    exit 1
+fi
+
+base="$out/base-$suite-$(echo "$packages" | sha256sum | cut -c1-8).tar"
+if [ ! -f "$base" ]; then
+    echo "== Debian $suite"
+    mmdebstrap --quiet --variant=minbase --include="$packages" "$suite" "$base.part"
+    mv "$base.part" "$base"
+fi
+
+root="$out/root"
+rm -rf "$root"
+mkdir "$root"
+tar -xf "$base" -C "$root"
+
+echo "== apt install ./$(basename "$deb")"
+cp "$deb" "$root/tmp/windhover.deb"
+chroot "$root" apt-get install -y --no-install-recommends -o Dpkg::Use-Pty=0 /tmp/windhover.deb >"$out/apt.log" 2>&1 ||
+    { cat "$out/apt.log" >&2; exit 1; }
+rm "$root/tmp/windhover.deb"
+
+# The bench's own parts: camera driver, card, control line. Nothing here touches the package's files
+# but its configuration, which is the user's to write.
+cp -a "$here/guest/." "$root/"
+chmod 755 "$root/usr/local/sbin/"*
+install -m 644 "$here/windhover.toml" "$root/etc/windhover/windhover.toml"
+echo payload >"$root/etc/hostname"
+cat >"$root/etc/fstab" <<'FSTAB'
+/dev/vda / ext4 ro 0 1
+LABEL=WINDHOVER /var/lib/windhover ext4 noatime,nofail,x-systemd.device-timeout=30s 0 2
+FSTAB
+chroot "$root" systemctl --quiet enable windhover.service bench-camera.service bench-control.service
+chroot "$root" systemctl --quiet mask serial-getty@ttyS0.service serial-getty@ttyS1.service systemd-timesyncd.service \
+    apt-daily.timer apt-daily-upgrade.timer dpkg-db-backup.timer systemd-random-seed.service
+chroot "$root" passwd --quiet -d root
+
+cp "$root"/boot/vmlinuz-* "$out/vmlinuz"
+cp "$root"/boot/initrd.img-* "$out/initrd"
+echo "== image"
+rm -f "$out/root.img"
+size=$(($(du -sm "$root" | cut -f1) + 200))
+mkfs.ext4 -q -L root -d "$root" "$out/root.img" "${size}M"
+rm -rf "$root"
+ls -la "$out"

@@ -1,0 +1,193 @@
+"""The virtual payload computer: an emulated PC with Debian's kernel, UARTs, a camera and a data card."""
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from pathlib import Path
+
+
+class Failure(Exception):
+    """An assertion of a scenario that does not hold; says what was seen instead."""
+
+
+class Machine:
+    """One boot after another of the same computer with the same data card.
+
+    `directory` holds vmlinuz, initrd and root.img of build.sh; `work` gets the card, sockets and logs.
+    """
+
+    def __init__(self, directory, work, card_mb=400):
+        self.directory, self.work = Path(directory), Path(work)
+        self.work.mkdir(parents=True, exist_ok=True)
+        self.card = self.work / "card.img"
+        self.console = self.work / "console.log"
+        self.boots = 0
+        self.process = None
+        self.new_card(card_mb)
+
+    def new_card(self, megabytes):
+        """An empty data card."""
+        self.card.unlink(missing_ok=True)
+        with open(self.card, "wb") as file:
+            file.truncate(megabytes << 20)
+        subprocess.run(["mkfs.ext4", "-q", "-F", "-L", "WINDHOVER", str(self.card)], check=True)
+
+    def socket_path(self, name):
+        """Path of one of the machine's sockets: gps, compass, frames, control."""
+        return str(self.work / name)
+
+    def boot(self, cpus=2):
+        """Starts the machine; returns at once."""
+        for name in ("gps", "compass", "frames", "control"):
+            Path(self.socket_path(name)).unlink(missing_ok=True)
+        self.boots += 1
+        self.booted_at = time.monotonic()
+        channels = []
+        for index, name in enumerate(("gps", "compass")):
+            channels += ["-chardev", f"socket,id={name},path={self.socket_path(name)},server=on,wait=off"]
+            channels += ["-serial", f"chardev:{name}"]
+        for name in ("frames", "control"):
+            channels += ["-chardev", f"socket,id={name},path={self.socket_path(name)},server=on,wait=off"]
+            channels += ["-device", f"virtserialport,chardev={name},name=bench.{name}"]
+        with open(self.console, "ab") as console:
+            console.write(f"\n===== boot {self.boots} =====\n".encode())
+        command = [
+            "qemu-system-x86_64", "-accel", "tcg,thread=multi", "-cpu", "max", "-smp", str(cpus), "-m", "1024",
+            "-nographic", "-nodefaults", "-no-reboot",
+            "-kernel", str(self.directory / "vmlinuz"), "-initrd", str(self.directory / "initrd"),
+            "-append", "root=/dev/vda ro console=ttyS0 systemd.volatile=state quiet random.trust_cpu=on",
+            "-drive", f"file={self.directory / 'root.img'},if=virtio,format=raw,readonly=on",
+            "-drive", f"file={self.card},if=ide,format=raw,cache=none",
+            "-device", "virtio-serial-pci",
+            "-chardev", f"file,id=console,path={self.console},append=on", "-serial", "chardev:console",
+            *channels,
+            "-netdev", "user,id=net,hostfwd=udp:127.0.0.1:17447-:7447", "-device", "virtio-net-pci,netdev=net",
+        ]
+        with open(self.work / "qemu.log", "ab") as log:
+            self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        self.control = None
+
+    def since_boot(self):
+        """Seconds since power came on."""
+        return time.monotonic() - self.booted_at
+
+    def _connect(self, name, seconds):
+        limit = time.monotonic() + seconds
+        while True:
+            try:
+                channel = socket.socket(socket.AF_UNIX)
+                channel.connect(self.socket_path(name))
+                return channel
+            except OSError:
+                if time.monotonic() > limit or self.process.poll() is not None:
+                    raise Failure(f"the emulator does not open {name}; see {self.work}/qemu.log")
+                time.sleep(0.1)
+
+    def wait_for_control(self, seconds=180):
+        """Waits until the guest answers on its control line."""
+        self.control = self._connect("control", 10)
+        self.control.settimeout(seconds)
+        self.answers = b""
+        self._answer(r"bench-control: up", seconds)
+
+    def _answer(self, pattern, seconds):
+        limit = time.monotonic() + seconds
+        expression = re.compile(pattern.encode())
+        while True:
+            found = expression.search(self.answers)
+            if found:
+                before, self.answers = self.answers[: found.start()], self.answers[found.end():]
+                return before.decode(errors="replace"), found
+            if time.monotonic() > limit:
+                raise Failure(f"the guest does not answer ({pattern}); console: {self.console}")
+            self.control.settimeout(max(0.1, limit - time.monotonic()))
+            try:
+                data = self.control.recv(65536)
+            except TimeoutError:
+                continue
+            if not data:
+                raise Failure("the guest went away")
+            self.answers += data
+
+    def run(self, command, seconds=60, check=True):
+        """Runs a command in the guest; its output."""
+        self.control.sendall(command.encode() + b"\n")
+        text, found = self._answer(r"bench-control: exit (\d+)\r?\n", seconds)
+        code = int(found.group(1))
+        if check and code != 0:
+            raise Failure(f"{command!r} in the guest: exit {code}: {text.strip()[-400:]}")
+        return text.replace("\r", "").strip()
+
+    def journal(self, since="-60min"):
+        """The daemon's log."""
+        return self.run(f"journalctl -u windhover -o cat --no-pager --since='{since}'", 60)
+
+    def wait_journal(self, words, seconds, after=0):
+        """Waits for a line of the daemon's log that holds all of `words`, after line number `after`."""
+        limit = time.monotonic() + seconds
+        while True:
+            lines = self.journal().splitlines()
+            for number, line in enumerate(lines):
+                if number >= after and all(word in line for word in words):
+                    return line, number + 1
+            if time.monotonic() > limit:
+                tail = "\n".join(lines[-15:])
+                raise Failure(f"no line with {words} in {seconds} s; the last lines:\n{tail}")
+            time.sleep(1)
+
+    def service(self, what):
+        """A property of the daemon's unit, as systemctl shows it."""
+        return self.run(f"systemctl show windhover -p {what} --value")
+
+    def power_cut(self):
+        """Power goes, this instant."""
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait()
+
+    def shut_down(self, seconds=60):
+        """Shuts down as a user would."""
+        try:
+            self.control.sendall(b"systemctl poweroff\n")
+            self.process.wait(seconds)
+        except (subprocess.TimeoutExpired, OSError):
+            self.power_cut()
+            raise Failure("the machine does not shut down")
+
+    def stop(self):
+        """Ends the machine, however it is."""
+        if self.process and self.process.poll() is None:
+            self.power_cut()
+
+    def flights(self):
+        """Copies the flights off the card (the machine is off); the flight directories, oldest first."""
+        out = self.work / "flights"
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir()
+        # The journal is replayed first, as the next mount would.
+        subprocess.run(["e2fsck", "-p", str(self.card)], stdout=subprocess.DEVNULL, check=False)
+        subprocess.run(["debugfs", "-R", f"rdump /FLIGHTS {out}", str(self.card)],
+                       stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=True)
+        folder = out / "FLIGHTS"
+        return sorted(p for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
+
+
+class Feed:
+    """A simulated flight that runs into the machine's lines in real time."""
+
+    def __init__(self, machine, feeder, capture):
+        self.log = open(machine.work / "feed.log", "ab")
+        sockets = [machine.socket_path(name) for name in ("gps", "compass", "frames")]
+        self.process = subprocess.Popen([feeder, capture, *sockets], stdout=self.log, stderr=self.log)
+
+    def running(self):
+        return self.process.poll() is None
+
+    def stop(self):
+        if self.running():
+            self.process.terminate()
+        self.process.wait()
+        self.log.close()

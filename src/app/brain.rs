@@ -1,0 +1,159 @@
+//! The pipeline's task: takes events in order, has them recorded, handles them, passes on what follows.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use crate::config::Config;
+use crate::msg::{Event, EventBody, TargetEstimate};
+use crate::pipeline::{Health, Output, Pipeline, Ticks};
+use crate::time::{MonoTime, Span};
+
+use super::card::CardOrders;
+use super::devices::Surroundings;
+use super::events::{self, Event as OperatorEvent};
+use super::health::{self, Figures, Latencies};
+use super::outlets::Outlets;
+use super::supervise::Heart;
+
+/// What the health task and the pipeline's task show each other. Copies are the same board.
+#[derive(Clone, Debug, Default)]
+pub struct Board(Arc<Mutex<Shown>>);
+
+/// What is on the board.
+#[derive(Clone, Debug, Default)]
+pub struct Shown {
+    /// Figures that only a running daemon has; the health task keeps them.
+    pub figures: Figures,
+    /// The pipeline's last health; the pipeline's task keeps it.
+    pub health: Option<Health>,
+}
+
+impl Board {
+    /// Looks at the board, or changes it.
+    pub fn with<T>(&self, look: impl FnOnce(&mut Shown) -> T) -> T {
+        look(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}
+
+/// How long the task waits for an event before it beats and lets time pass.
+const PATIENCE: Duration = Duration::from_millis(20);
+
+/// Longest that is spent on what waits when the end was asked for.
+const LAST_CALL: Span = Span::from_ns(500_000_000);
+
+/// Runs the pipeline until the end is asked for and everything that waits is handled.
+pub fn run(
+    config: &Config,
+    around: &Surroundings,
+    board: &Board,
+    outlets: Outlets,
+    orders: &CardOrders,
+    heart: &Heart,
+) {
+    let mut brain = Brain {
+        config,
+        around,
+        board,
+        outlets,
+        pipeline: Pipeline::new(config),
+        ticks: Ticks::default(),
+        latencies: Latencies::default(),
+        outputs: Vec::new(),
+    };
+    let mut end = None;
+    loop {
+        heart.beat();
+        if around.stop.asked() {
+            let now = around.clock.now();
+            if now - *end.get_or_insert(now) > LAST_CALL {
+                break;
+            }
+        }
+        match around.inbox.take(PATIENCE) {
+            Some(event) => brain.handle(&event),
+            None if around.stop.asked() => break,
+            None => brain.pass_time(),
+        }
+    }
+    brain.finish();
+    orders.last_word.ask();
+}
+
+struct Brain<'a> {
+    config: &'a Config,
+    around: &'a Surroundings,
+    board: &'a Board,
+    outlets: Outlets,
+    pipeline: Pipeline,
+    ticks: Ticks,
+    latencies: Latencies,
+    outputs: Vec<Output>,
+}
+
+impl Brain<'_> {
+    fn pass_time(&mut self) {
+        let now = self.around.clock.now();
+        for t in self.ticks.until(now) {
+            let tick = self.around.inbox.number(t, EventBody::Tick);
+            self.pipeline.handle(&tick, &mut self.outputs);
+            self.pass_on(t);
+        }
+    }
+
+    fn handle(&mut self, event: &Event) {
+        for t in self.ticks.until(event.t_recv) {
+            let tick = Event { t_recv: t, seq: event.seq, body: EventBody::Tick };
+            self.pipeline.handle(&tick, &mut self.outputs);
+            self.pass_on(t);
+        }
+        // Recorded first: what the pipeline stumbles over is on the card.
+        self.outlets.event(event);
+        self.pipeline.handle(event, &mut self.outputs);
+        self.pass_on(event.t_recv);
+    }
+
+    fn finish(&mut self) {
+        self.pipeline.finish(&mut self.outputs);
+        self.pass_on(self.around.clock.now());
+    }
+
+    /// Passes on what followed from what was heard at `t`.
+    fn pass_on(&mut self, t: MonoTime) {
+        let outputs = std::mem::take(&mut self.outputs);
+        for output in &outputs {
+            match output {
+                Output::Notice(notice) => {
+                    let about = notice.source.map_or("", crate::msg::Source::name);
+                    let line = events::line_of_notice(notice);
+                    let event = OperatorEvent::Pipeline(notice.kind);
+                    // A target's notices tell its name in their words only.
+                    let key = if about.is_empty() { notice.detail.clone() } else { about.to_owned() };
+                    self.around.log.tell_keyed(notice.t, event, key, |_| line);
+                }
+                Output::Health(health) => self.health(health),
+                Output::Estimate(estimate) => self.estimate(estimate),
+                _ => {}
+            }
+            self.outlets.output(output, t);
+        }
+        self.outputs = outputs;
+        self.outputs.clear();
+    }
+
+    fn estimate(&mut self, estimate: &TargetEstimate) {
+        if estimate.target == 0 {
+            self.latencies.push(self.around.clock.now() - estimate.t_valid);
+        }
+    }
+
+    fn health(&mut self, health: &Health) {
+        let (p50, p99) = (self.latencies.quantile(0.5), self.latencies.quantile(0.99));
+        let figures = self.board.with(|shown| {
+            shown.figures.latency_p50 = p50;
+            shown.figures.latency_p99 = p99;
+            shown.health = Some(health.clone());
+            shown.figures.clone()
+        });
+        self.around.log.write(health::line(health, self.config, Some(&figures)));
+    }
+}

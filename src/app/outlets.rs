@@ -1,0 +1,87 @@
+//! Where events and outputs go beside the operator's log: the data card and the link.
+
+use std::sync::Arc;
+
+use crate::config::Config;
+use crate::io::records::{Record, Recorder};
+use crate::msg::{Event, GnssEpoch, MarkerDetection, Stamped};
+use crate::pipeline::Output;
+use crate::time::{MonoTime, UtcTime};
+
+use super::card::Slot;
+
+/// The data card and the link, from the pipeline's side. Nothing here waits.
+pub struct Outlets {
+    slot: Slot,
+    recorder: Recorder,
+    records: Vec<Record>,
+    began: Option<MonoTime>,
+    dated: bool,
+    opened: bool,
+}
+
+impl Outlets {
+    /// For a pipeline of this configuration.
+    pub fn new(config: &Config, slot: Slot) -> Self {
+        Self {
+            slot,
+            recorder: Recorder::new(config),
+            records: Vec::new(),
+            began: None,
+            dated: false,
+            opened: false,
+        }
+    }
+
+    /// Keeps an event as it was heard.
+    pub fn event(&mut self, event: &Event) {
+        self.began.get_or_insert(event.t_recv);
+        let Some(store) = self.slot.get() else {
+            self.opened = false;
+            return;
+        };
+        // A flight opened anew begins with what every flight begins with, and wants its date again.
+        if !std::mem::replace(&mut self.opened, true) {
+            self.dated = false;
+            for record in self.recorder.opening(event.t_recv) {
+                store.record(Arc::new(record), None);
+            }
+        }
+        store.event(event);
+    }
+
+    /// Keeps and sends an output that followed from what was heard at `t`.
+    pub fn output(&mut self, output: &Output, t: MonoTime) {
+        self.recorder.output(output, t, &mut self.records);
+        let store = self.slot.get();
+        if let Some(store) = &store {
+            match output {
+                Output::Fix(epoch) => self.date(epoch, store),
+                Output::Detections { markers, .. } => store.watch(pixels(markers)),
+                _ => {}
+            }
+        }
+        for record in self.records.drain(..) {
+            let record = Arc::new(record);
+            if let Some(store) = &store {
+                store.record(Arc::clone(&record), None);
+            }
+        }
+    }
+
+    /// The flight's name is the UTC of its start, as the receiver tells it.
+    fn date(&mut self, epoch: &Stamped<GnssEpoch>, store: &crate::io::store::StoreHandle) {
+        if let (false, Some(utc), Some(began)) = (self.dated, epoch.value.utc, self.began) {
+            let start = UtcTime::from_unix_ns(utc.unix_ns() - (epoch.t_valid - began).ns());
+            self.dated = store.set_start(start);
+        }
+    }
+}
+
+/// Pixels of everything seen of vehicles.
+fn pixels(markers: &[MarkerDetection]) -> impl Iterator<Item = (f64, f64)> + '_ {
+    markers.iter().flat_map(|marker| {
+        let corners = marker.corners_px.unwrap_or([marker.center_px; 4]);
+        corners.map(|corner| (corner.x, corner.y))
+    })
+}

@@ -1,0 +1,51 @@
+//! `windhover generate`: manual pages and shell completions out of the command line itself.
+
+use std::path::{Path, PathBuf};
+
+use clap::CommandFactory;
+use clap_complete::Shell;
+
+use super::{Cli, CliError, CliResult};
+
+/// Write manual pages or shell completions, made from the command line itself, into a directory.
+#[derive(clap::Args, Debug)]
+pub(super) struct Args {
+    /// What to write
+    #[arg(value_enum)]
+    what: What,
+    /// Directory, made where missing
+    directory: PathBuf,
+}
+
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+enum What {
+    /// Manual pages, one a command
+    Man,
+    /// Completions for bash, zsh and fish
+    Completions,
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    let failed = |error: std::io::Error| {
+        CliError::failed(format!("cannot write into {}: {error}", args.directory.display()))
+    };
+    std::fs::create_dir_all(&args.directory).map_err(failed)?;
+    match args.what {
+        What::Man => man(&args.directory),
+        What::Completions => completions(&args.directory),
+    }
+    .map_err(failed)
+}
+
+fn man(directory: &Path) -> std::io::Result<()> {
+    let mut command = Cli::command();
+    command.build();
+    clap_mangen::generate_to(command, directory)
+}
+
+fn completions(directory: &Path) -> std::io::Result<()> {
+    for shell in [Shell::Bash, Shell::Zsh, Shell::Fish] {
+        clap_complete::generate_to(shell, &mut Cli::command(), "windhover", directory)?;
+    }
+    Ok(())
+}

@@ -1,0 +1,22 @@
+//! `windhover run`
+
+use std::path::PathBuf;
+
+use super::{CliError, CliResult};
+use crate::app::run::{self, RunError};
+
+/// Run the daemon: read the sensors, estimate, record, send, until SIGTERM. SIGHUP reads the
+/// configuration again.
+#[derive(clap::Args, Debug)]
+pub(super) struct Args {
+    /// Configuration file
+    #[arg(long, value_name = "FILE", default_value = "/etc/windhover/windhover.toml")]
+    config: PathBuf,
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    run::run(&args.config).map_err(|error| match error {
+        RunError::Config(error) => CliError::config(error),
+        error => CliError::failed(error),
+    })
+}

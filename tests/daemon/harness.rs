@@ -1,0 +1,222 @@
+//! A running `windhover run`: its configuration, its lines over pseudo-terminals, its log.
+
+use std::fs::File;
+use std::io::Write;
+use std::os::fd::OwnedFd;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use rustix::process::{Pid, Signal, kill_process};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use tempfile::TempDir;
+use windhover::io::clock::HostClock;
+use windhover::time::{MonoTime, Span};
+
+/// A serial line by a stable name: its near end is a link that can be taken away and put back.
+pub struct Line {
+    link: PathBuf,
+    far: Option<File>,
+}
+
+impl Line {
+    pub fn new(link: PathBuf) -> Self {
+        let mut line = Self { link, far: None };
+        line.plug();
+        line
+    }
+
+    /// Puts a new line under the same name.
+    pub fn plug(&mut self) {
+        let far: OwnedFd = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a pseudo-terminal");
+        grantpt(&far).expect("granted");
+        unlockpt(&far).expect("unlocked");
+        let name = ptsname(&far, Vec::new()).expect("named").into_string().expect("ASCII");
+        let _ = std::fs::remove_file(&self.link);
+        std::os::unix::fs::symlink(name, &self.link).expect("linked");
+        self.far = Some(File::from(far));
+    }
+
+    /// Takes the line away.
+    pub fn unplug(&mut self) {
+        let _ = std::fs::remove_file(&self.link);
+        self.far = None;
+    }
+
+    pub fn send(&mut self, bytes: &[u8]) {
+        if let Some(far) = &mut self.far {
+            // Bytes for a line that nobody reads are lost, as on a real one.
+            let _ = far.write_all(bytes);
+        }
+    }
+}
+
+/// `$body*HH` with its line end.
+pub fn sentence(body: &str) -> String {
+    let sum = body.bytes().fold(0u8, |sum, byte| sum ^ byte);
+    format!("${body}*{sum:02X}\r\n")
+}
+
+/// A hovering helicopter's receiver and compass, at the real pace, on two lines that can be shared.
+pub struct Feeder {
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<(Line, Line)>>,
+}
+
+impl Feeder {
+    pub fn start(mut gps: Line, mut compass: Line) -> Self {
+        let stop = Arc::new(AtomicBool::new(false));
+        let asked = stop.clone();
+        let thread = std::thread::spawn(move || {
+            let mut n = 0u32;
+            while !asked.load(Ordering::Acquire) {
+                if n % 4 == 0 {
+                    gps.send(epoch(n / 4).as_bytes());
+                }
+                compass.send(sentence("C123.4P-0.5R0.3T21.0").as_bytes());
+                n += 1;
+                std::thread::sleep(Duration::from_millis(50));
+            }
+            (gps, compass)
+        });
+        Self { stop, thread: Some(thread) }
+    }
+
+    /// Ends feeding and gives the lines back.
+    pub fn stop(mut self) -> (Line, Line) {
+        self.stop.store(true, Ordering::Release);
+        self.thread.take().expect("running").join().expect("fed")
+    }
+}
+
+/// One epoch of a 5 Hz receiver over Lisbon.
+fn epoch(n: u32) -> String {
+    let (seconds, tenths) = (n / 5, n % 5 * 2);
+    let time = format!("1504{:02}.{tenths}", seconds % 60);
+    let rmc = sentence(&format!("GPRMC,{time},A,3842.20000,N,00911.00000,W,000.0,000.0,181126,003.4,W"));
+    let gga = sentence(&format!("GPGGA,{time},3842.20000,N,00911.00000,W,1,09,0.9,43.0,M,50.0,M,,"));
+    rmc + &gga
+}
+
+/// A flight computer's worth of files: configuration, lines, card, recorded camera.
+pub struct Bench {
+    pub folder: TempDir,
+}
+
+impl Bench {
+    pub fn new() -> Self {
+        let bench = Self { folder: tempfile::tempdir().expect("a folder") };
+        bench.write_camera(600, 0.1);
+        bench.configure(|text| text);
+        bench
+    }
+
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    pub fn config(&self) -> PathBuf {
+        self.path("windhover.toml")
+    }
+
+    /// Writes the configuration, changed by `change`.
+    pub fn configure(&self, change: impl FnOnce(String) -> String) {
+        let text = include_str!("bench.toml").replace("BENCH", &self.folder.path().to_string_lossy());
+        std::fs::write(self.config(), change(text)).expect("written");
+    }
+
+    /// A recorded camera: a grey frame every `period_s`.
+    fn write_camera(&self, frames: u32, period_s: f64) {
+        let folder = self.path("camera");
+        std::fs::create_dir(&folder).expect("created");
+        let pixels = vec![90u8; 320 * 256];
+        std::fs::write(folder.join("grey.pgm"), [b"P5\n320 256\n255\n".as_slice(), &pixels].concat())
+            .expect("written");
+        let rows = (0..frames).map(|n| format!("{:.3},grey.pgm\n", f64::from(n) * period_s));
+        let list: String = std::iter::once("time_s,file\n".to_owned()).chain(rows).collect();
+        std::fs::write(folder.join("times.csv"), list).expect("written");
+    }
+
+    pub fn lines(&self) -> (Line, Line) {
+        (Line::new(self.path("gps")), Line::new(self.path("compass")))
+    }
+
+    pub fn start(&self) -> Daemon {
+        Daemon::start(&self.config(), &self.path("log"))
+    }
+}
+
+/// The running daemon.
+pub struct Daemon {
+    child: Child,
+    log: PathBuf,
+    clock: HostClock,
+}
+
+impl Daemon {
+    pub fn start(config: &Path, log: &Path) -> Self {
+        let file = File::options().create(true).append(true).open(log).expect("a log");
+        let child = Command::new(env!("CARGO_BIN_EXE_windhover"))
+            .args(["run", "--config"])
+            .arg(config)
+            .stdin(Stdio::null())
+            .stderr(file)
+            .spawn()
+            .expect("started");
+        Self { child, log: log.to_owned(), clock: HostClock::start() }
+    }
+
+    pub fn log(&self) -> String {
+        std::fs::read_to_string(&self.log).expect("a log")
+    }
+
+    /// The first line after `skip` lines that holds all of `words`, and how many lines came before
+    /// the one after it; fails after `seconds`.
+    pub fn wait_from(&self, skip: usize, words: &[&str], seconds: f64) -> (String, usize) {
+        let limit = self.clock.now() + Span::from_s(seconds);
+        loop {
+            let log = self.log();
+            let found = log.lines().enumerate().skip(skip).find(|(_, l)| words.iter().all(|w| l.contains(w)));
+            if let Some((number, line)) = found {
+                return (line.to_owned(), number + 1);
+            }
+            assert!(self.clock.now() < limit, "no line with {words:?} in {seconds} s; the log:\n{log}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    pub fn wait(&self, words: &[&str], seconds: f64) -> (String, usize) {
+        self.wait_from(0, words, seconds)
+    }
+
+    pub fn now(&self) -> MonoTime {
+        self.clock.now()
+    }
+
+    pub fn signal(&self, signal: Signal) {
+        let pid = Pid::from_raw(self.child.id().cast_signed()).expect("a process");
+        kill_process(pid, signal).expect("signalled");
+    }
+
+    /// Waits for the end; how it ended and how long it took.
+    pub fn ended(mut self, seconds: f64) -> (ExitStatus, Span) {
+        let began = self.clock.now();
+        loop {
+            if let Some(status) = self.child.try_wait().expect("a child") {
+                return (status, self.clock.now() - began);
+            }
+            assert!(self.clock.now() - began < Span::from_s(seconds), "still runs; the log:\n{}", self.log());
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+}
+
+impl Drop for Daemon {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}

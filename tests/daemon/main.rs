@@ -1,0 +1,123 @@
+//! The real binary over pseudo-terminals at the real pace, with a recorded camera: everything but the
+//! V4L2 call is what flies.
+
+mod harness;
+
+use std::process::Command;
+use std::time::Duration;
+
+use harness::{Bench, Feeder};
+use rustix::process::Signal;
+use windhover::time::Span;
+
+#[test]
+fn from_start_to_ready_to_the_end() {
+    // Given a receiver, a compass and a camera.
+    let bench = Bench::new();
+    let (gps, compass) = bench.lines();
+    let daemon = bench.start();
+    let feeder = Feeder::start(gps, compass);
+
+    // When they deliver, then the daemon is ready, and tells how it does every second.
+    daemon.wait(&["event=ready"], 10.0);
+    let (_, seen) = daemon.wait(&["event=health"], 3.0);
+    let (line, _) = daemon.wait_from(seen, &["event=health", "fix=3d"], 4.0);
+    for field in ["gps_hz=", "compass_hz=", "camera_hz=", "card=", "link=", "dropped=", "cpu_pct=", "mem_mb="] {
+        assert!(line.contains(field), "{field} in {line}");
+    }
+
+    // When it is asked to end, then it does within two seconds and says so.
+    daemon.signal(Signal::TERM);
+    let log = bench.path("log");
+    let (status, took) = daemon.ended(4.0);
+    assert!(status.success(), "{status}");
+    assert!(took < Span::from_s(2.0), "{took:?}");
+    let text = std::fs::read_to_string(log).expect("a log");
+    assert!(text.lines().last().is_some_and(|line| line.contains("event=stopped")), "{text}");
+    feeder.stop();
+}
+
+#[test]
+fn devices_come_and_go() {
+    // Given a daemon without any device.
+    let bench = Bench::new();
+    bench.configure(|text| text.replace("capture:", "capture-loop:"));
+    let daemon = bench.start();
+    for device in ["gps", "compass"] {
+        daemon.wait(&["event=device_down", device, "fault=missing"], 3.0);
+    }
+
+    // When they come, then it is ready.
+    let (gps, compass) = bench.lines();
+    let feeder = Feeder::start(gps, compass);
+    let (_, seen) = daemon.wait(&["event=ready"], 15.0);
+
+    // When the compass goes away, then that is told, and the daemon flies on.
+    let (gps, mut compass) = feeder.stop();
+    compass.unplug();
+    let (_, seen) = daemon.wait_from(seen, &["event=device_down", "about=compass", "fault=unplugged"], 3.0);
+
+    // When it comes back under another number, with the GPS speaking rubbish, then both are used.
+    let mut gps = gps;
+    gps.send(&[0xff; 900]);
+    compass.plug();
+    let feeder = Feeder::start(gps, compass);
+    daemon.wait_from(seen, &["event=device_up", "about=compass"], 8.0);
+    daemon.wait_from(seen, &["event=device_garbled", "about=gps"], 5.0);
+    let (_, seen) = daemon.wait_from(seen, &["event=health"], 3.0);
+    let (line, _) = daemon.wait_from(seen, &["event=health", "level=info"], 5.0);
+    assert!(!line.contains("compass_hz=0.0"), "{line}");
+    feeder.stop();
+}
+
+#[test]
+fn the_configuration_is_read_again() {
+    let bench = Bench::new();
+    let daemon = bench.start();
+    daemon.wait(&["event=started"], 5.0);
+    daemon.wait(&["event=device_up", "about=camera"], 5.0);
+
+    // When a level changes and a line speed too, then one takes effect and the other is told.
+    bench.configure(|text| format!("{}\n[log]\nlevel = \"error\"\n", text.replace("38400", "19200")));
+    daemon.signal(Signal::HUP);
+    daemon.wait(&["event=reloaded", "log.level"], 3.0);
+    daemon.wait(&["event=needs_restart", "gps.baud: 38400 → 19200"], 3.0);
+    let lines = daemon.log().lines().count();
+    std::thread::sleep(Duration::from_millis(1_500));
+    assert_eq!(daemon.log().lines().count(), lines, "nothing but errors is shown now");
+
+    // When the file is broken, then the old configuration stays.
+    bench.configure(|text| text.replace("baud = 38400", "baud = \"fast\""));
+    daemon.signal(Signal::HUP);
+    daemon.wait(&["event=reload_refused", "the old one stays"], 3.0);
+}
+
+#[test]
+fn failing_power_is_told() {
+    let bench = Bench::new();
+    let battery = bench.path("sys/class/power_supply/BAT0");
+    std::fs::create_dir_all(&battery).expect("created");
+    let volts = |microvolts: &str| std::fs::write(battery.join("voltage_now"), microvolts).expect("written");
+    volts("12100000");
+    let daemon = bench.start();
+    daemon.wait(&["event=health", "supply_v=12.10"], 5.0);
+    volts("9800000");
+    daemon.wait(&["event=power_going", "9.80 V"], 6.0);
+    volts("11500000");
+    daemon.wait(&["event=power_back"], 4.0);
+}
+
+#[test]
+fn a_bad_configuration_is_exit_code_78() {
+    let bench = Bench::new();
+    bench.configure(|text| text.replace("38400", "38401"));
+    let output = Command::new(env!("CARGO_BIN_EXE_windhover"))
+        .args(["run", "--config"])
+        .arg(bench.config())
+        .output()
+        .expect("run");
+    assert_eq!(output.status.code(), Some(78));
+    let error = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(error.contains("windhover.toml") && error.contains("gps.baud"), "{error}");
+    assert!(error.lines().count() <= 2, "{error}");
+}
