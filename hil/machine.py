@@ -10,6 +10,10 @@ import time
 from pathlib import Path
 
 
+# Where the serial lines sit on the PCI bus.
+SERIAL_SLOTS = {"gps": "0x10", "compass": "0x11"}
+
+
 class Failure(Exception):
     """An assertion of a scenario that does not hold; says what was seen instead."""
 
@@ -49,7 +53,8 @@ class Machine:
         channels = []
         for index, name in enumerate(("gps", "compass")):
             channels += ["-chardev", f"socket,id={name},path={self.socket_path(name)},server=on,wait=off"]
-            channels += ["-serial", f"chardev:{name}"]
+            # PCI, so that the driver can let go of one and take it back: /dev/ttyS4 and /dev/ttyS5.
+            channels += ["-device", f"pci-serial,chardev={name},addr={SERIAL_SLOTS[name]}"]
         for name in ("frames", "control"):
             channels += ["-chardev", f"socket,id={name},path={self.socket_path(name)},server=on,wait=off"]
             channels += ["-device", f"virtserialport,chardev={name},name=bench.{name}"]
@@ -121,6 +126,16 @@ class Machine:
         if check and code != 0:
             raise Failure(f"{command!r} in the guest: exit {code}: {text.strip()[-400:]}")
         return text.replace("\r", "").strip()
+
+    def unplug_serial(self, name):
+        """Takes a serial line away from its driver, as pulling the adapter does."""
+        slot = f"0000:00:{int(SERIAL_SLOTS[name], 16):02x}.0"
+        self.run(f"echo {slot} > /sys/bus/pci/drivers/serial/unbind")
+        return slot
+
+    def plug_serial(self, slot):
+        """Gives it back."""
+        self.run(f"echo {slot} > /sys/bus/pci/drivers/serial/bind")
 
     def journal(self, since="-60min"):
         """The daemon's log."""

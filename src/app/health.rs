@@ -16,7 +16,7 @@ pub struct Figures {
     pub latency_p99: Option<Span>,
     /// State of the data card in a word, and its figures.
     pub card: CardFigures,
-    /// State of the link in a word.
+    /// State of the link in a word; empty where there is none.
     pub link: String,
     /// Temperature, degrees Celsius.
     pub temperature_c: Option<f64>,
@@ -120,13 +120,17 @@ fn of_daemon(mut line: Line, figures: &Figures) -> Line {
     };
     line = span(line, "latency_p50_ms", figures.latency_p50);
     line = span(line, "latency_p99_ms", figures.latency_p99);
-    line = line.with("card", figures.card.state.as_str());
+    if !figures.card.state.is_empty() {
+        line = line.with("card", figures.card.state.as_str());
+    }
     line = figure(line, "card_free_mb", figures.card.free_mb, 0);
     line = span(line, "card_sync_p99_ms", figures.card.sync_p99);
     if figures.card.dropped > 0 {
         line = line.count("card_dropped", figures.card.dropped);
     }
-    line = line.with("link", figures.link.as_str());
+    if !figures.link.is_empty() {
+        line = line.with("link", figures.link.as_str());
+    }
     line = figure(line, "temp_c", figures.temperature_c, 1);
     line = figure(line, "supply_v", figures.voltage_v, 2);
     line = figure(line, "cpu_pct", figures.cpu_percent, 0);

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use crate::io::device::RawFrame;
 use crate::msg::{Event, EventBody, FramePayload, Source};
-use crate::time::MonoTime;
+use crate::time::{MonoTime, Span};
 
 /// Reads of the serial lines that wait: more than ten seconds' worth. A pipeline that is further
 /// behind than this does not answer, and the watchdog has it started again.
@@ -128,8 +128,9 @@ impl Lanes {
     }
 
     fn number(&mut self, t: MonoTime, body: EventBody) -> Event {
-        // Two threads may stamp and put in the other order, microseconds apart.
-        let t_recv = self.last.map_or(t, |last| t.max(last));
+        // Two threads may stamp and put in the other order, microseconds apart; and no two events share
+        // an instant, so that a recording sorted by time has this order.
+        let t_recv = self.last.map_or(t, |last| t.max(last + Span::from_ns(1)));
         self.last = Some(t_recv);
         let seq = self.next_seq;
         self.next_seq += 1;

@@ -76,6 +76,7 @@ pub fn start(config: &Config, clock: HostClock, log: &Log) -> std::io::Result<Gr
         inbox: Arc::new(Inbox::new(config.daemon.frame_queue)),
     };
     let board = Board::default();
+    board.with(|shown| shown.figures.link = "off".into());
     let mut tasks = Supervisor::new(clock);
 
     let (slot, orders) = (Slot::default(), CardOrders::default());

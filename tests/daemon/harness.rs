@@ -110,6 +110,7 @@ impl Bench {
     pub fn new() -> Self {
         let bench = Self { folder: tempfile::tempdir().expect("a folder") };
         bench.write_camera(600, 0.1);
+        std::fs::create_dir(bench.path("card")).expect("created");
         bench.configure(|text| text);
         bench
     }
@@ -142,6 +143,26 @@ impl Bench {
 
     pub fn lines(&self) -> (Line, Line) {
         (Line::new(self.path("gps")), Line::new(self.path("compass")))
+    }
+
+    /// Flights on the card, oldest first.
+    pub fn flights(&self) -> Vec<PathBuf> {
+        let entries = std::fs::read_dir(self.path("card/FLIGHTS")).expect("flights");
+        let mut flights: Vec<PathBuf> = entries.map(|entry| entry.expect("an entry").path()).collect();
+        flights.sort();
+        flights
+    }
+
+    /// Runs another command of the program to its end; what it wrote to standard output.
+    pub fn command(&self, args: &[&str]) -> String {
+        let output = Command::new(env!("CARGO_BIN_EXE_windhover"))
+            .args(args)
+            .current_dir(self.folder.path())
+            .output()
+            .expect("run");
+        let error = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.success(), "windhover {args:?}: {error}");
+        String::from_utf8(output.stdout).expect("UTF-8")
     }
 
     pub fn start(&self) -> Daemon {
@@ -199,6 +220,12 @@ impl Daemon {
     pub fn signal(&self, signal: Signal) {
         let pid = Pid::from_raw(self.child.id().cast_signed()).expect("a process");
         kill_process(pid, signal).expect("signalled");
+    }
+
+    /// Ends the process as a crash would.
+    pub fn kill(mut self) {
+        self.child.kill().expect("killed");
+        self.child.wait().expect("a child");
     }
 
     /// Waits for the end; how it ended and how long it took.

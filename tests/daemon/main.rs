@@ -8,6 +8,8 @@ use std::time::Duration;
 
 use harness::{Bench, Feeder};
 use rustix::process::Signal;
+use windhover::io::capture::CaptureReader;
+use windhover::msg::EventBody;
 use windhover::time::Span;
 
 #[test]
@@ -120,4 +122,48 @@ fn a_bad_configuration_is_exit_code_78() {
     let error = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(error.contains("windhover.toml") && error.contains("gps.baud"), "{error}");
     assert!(error.lines().count() <= 2, "{error}");
+}
+
+#[test]
+fn what_was_recorded_survives_a_crash_and_replays_to_the_same() {
+    // Given a flight that ends with kill -9 in the middle of writing.
+    let bench = Bench::new();
+    let (gps, compass) = bench.lines();
+    let daemon = bench.start();
+    let feeder = Feeder::start(gps, compass);
+    let (_, seen) = daemon.wait(&["event=ready"], 10.0);
+    let (_, seen) = daemon.wait_from(seen, &["event=health"], 3.0);
+    let (_, seen) = daemon.wait_from(seen, &["event=health"], 3.0);
+    daemon.wait_from(seen, &["event=health"], 3.0);
+    daemon.kill();
+
+    // When the daemon is started again, then it is ready again, and the first flight is whole up to
+    // its last second.
+    let daemon = bench.start();
+    let before = daemon.log().lines().count();
+    let (_, seen) = daemon.wait_from(before, &["event=ready"], 10.0);
+    let (_, seen) = daemon.wait_from(seen, &["event=health"], 3.0);
+    daemon.wait_from(seen, &["event=health"], 3.0);
+    daemon.signal(Signal::TERM);
+    assert!(daemon.ended(4.0).0.success());
+    feeder.stop();
+    let flights = bench.flights();
+    assert_eq!(flights.len(), 2, "{flights:?}");
+    let frames = |flight| {
+        let events = CaptureReader::open(flight).expect("readable").filter_map(|item| item.event);
+        events.filter(|event| matches!(event.body, EventBody::Frame(_))).count()
+    };
+    assert!(frames(&flights[0]) >= 15, "{} frames before the crash", frames(&flights[0]));
+
+    // When the second flight is replayed, then the helicopter's own states are those that flew.
+    let flight = flights[1].to_string_lossy().into_owned();
+    bench.command(&["replay", &flight, "--out", "again.mcap"]);
+    bench.command(&["export", &flight, "--format", "csv", "--out", "flown"]);
+    bench.command(&["export", "again.mcap", "--format", "csv", "--out", "replayed"]);
+    let read = |folder| std::fs::read_to_string(bench.path(folder).join("ownship.csv")).expect("a table");
+    let (flown, replayed) = (read("flown"), read("replayed"));
+    assert!(flown.lines().count() > 10, "{flown}");
+    for (number, (flown, replayed)) in flown.lines().zip(replayed.lines()).enumerate() {
+        assert_eq!(flown, replayed, "row {number}");
+    }
 }
