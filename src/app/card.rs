@@ -61,7 +61,8 @@ pub fn run(
     heart: &Heart,
 ) {
     if !config.store.enabled {
-        board.with(|shown| shown.figures.card = CardFigures { state: "off".into(), ..CardFigures::default() });
+        board
+            .with(|shown| shown.figures.card = CardFigures { state: "off".into(), ..CardFigures::default() });
         around.presence.set(Part::Store, PartState::Delivers);
         while !around.stop.asked() {
             heart.beat();

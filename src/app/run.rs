@@ -42,10 +42,14 @@ pub fn run(config_path: &Path) -> Result<(), RunError> {
     tell_of_panics(&log);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let result = runtime.block_on(daemon(config_path.to_owned(), config, clock, &log));
-    log.tell(Event::Stopped, "", match &result {
-        Ok(()) => "everything is written".to_owned(),
-        Err(error) => error.to_string(),
-    });
+    log.tell(
+        Event::Stopped,
+        "",
+        match &result {
+            Ok(()) => "everything is written".to_owned(),
+            Err(error) => error.to_string(),
+        },
+    );
     drop(log_thread);
     result
 }

@@ -171,10 +171,14 @@ impl Watch {
             Err(error) => log.tell(Event::ReloadRefused, "", format!("{error}; the old one stays")),
             Ok(read) => {
                 let told = reload::differences(&self.config, &read);
-                log.tell(Event::Reloaded, "", match told.now.as_slice() {
-                    [] => "nothing that can change in flight has changed".to_owned(),
-                    changes => changes.join(", "),
-                });
+                log.tell(
+                    Event::Reloaded,
+                    "",
+                    match told.now.as_slice() {
+                        [] => "nothing that can change in flight has changed".to_owned(),
+                        changes => changes.join(", "),
+                    },
+                );
                 if !told.restart.is_empty() {
                     log.tell(Event::NeedsRestart, "", told.restart.join(", "));
                 }

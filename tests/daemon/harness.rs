@@ -14,7 +14,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use tempfile::TempDir;
 use windhover::io::clock::HostClock;
-use windhover::time::{MonoTime, Span};
+use windhover::time::Span;
 
 /// A serial line by a stable name: its near end is a link that can be taken away and put back.
 pub struct Line {
@@ -31,7 +31,7 @@ impl Line {
 
     /// Puts a new line under the same name.
     pub fn plug(&mut self) {
-        let far: OwnedFd = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a pseudo-terminal");
+        let far: OwnedFd = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("a pseudo-terminal");
         grantpt(&far).expect("granted");
         unlockpt(&far).expect("unlocked");
         let name = ptsname(&far, Vec::new()).expect("named").into_string().expect("ASCII");
@@ -211,10 +211,6 @@ impl Daemon {
 
     pub fn wait(&self, words: &[&str], seconds: f64) -> (String, usize) {
         self.wait_from(0, words, seconds)
-    }
-
-    pub fn now(&self) -> MonoTime {
-        self.clock.now()
     }
 
     pub fn signal(&self, signal: Signal) {

@@ -24,7 +24,8 @@ fn from_start_to_ready_to_the_end() {
     daemon.wait(&["event=ready"], 10.0);
     let (_, seen) = daemon.wait(&["event=health"], 3.0);
     let (line, _) = daemon.wait_from(seen, &["event=health", "fix=3d"], 4.0);
-    for field in ["gps_hz=", "compass_hz=", "camera_hz=", "card=", "link=", "dropped=", "cpu_pct=", "mem_mb="] {
+    for field in ["gps_hz=", "compass_hz=", "camera_hz=", "card=", "link=", "dropped=", "cpu_pct=", "mem_mb="]
+    {
         assert!(line.contains(field), "{field} in {line}");
     }
 
