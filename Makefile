@@ -5,7 +5,7 @@ CARGO ?= cargo
 VENV  ?= target/venv
 DEMO  ?= demo
 
-.PHONY: help setup setup-python build demo test test-python check lint docs clean
+.PHONY: help setup setup-python build demo test test-python check lint docs clean deb hil hil-long
 
 help:
 	@echo "make demo     build, simulate a flight, replay it, compare with the truth, write a report page"
@@ -13,7 +13,8 @@ help:
 	@echo "make check    format, lints, documentation, shipped configurations, licences"
 	@echo "make bench    the benchmarks under benches/"
 	@echo "make deb      a Debian package in target/debian"
-	@echo "make hil      the virtual payload computer: install, boot, fly, compare"
+	@echo "make hil      the virtual payload computer: install, boot, fly, compare (as root)"
+	@echo "make hil-long the same with every scenario"
 
 # What the build needs of the system: a C compiler for the compression libraries, and clang's library
 # for the camera bindings.
@@ -53,6 +54,18 @@ docs: setup
 
 bench: setup
 	$(CARGO) bench --locked
+
+# The package: binary, unit, configuration, rules, manual and completions out of the command line.
+deb: build
+	target/release/windhover generate man target/generated/man
+	target/release/windhover generate completions target/generated/completions
+	test -x target/tools/bin/cargo-deb || $(CARGO) install cargo-deb --version 3.8.0 --locked --root target/tools
+	target/tools/bin/cargo-deb --no-build --locked
+
+hil hil-long: deb
+	@sh tests/setup/packages.sh qemu-system-x86 mmdebstrap e2fsprogs python3
+	$(CARGO) build --release --locked --examples
+	sh hil/fly.sh $(if $(filter hil-long,$@),--long,)
 
 clean:
 	$(CARGO) clean
