@@ -31,7 +31,8 @@ impl Line {
 
     /// Puts a new line under the same name.
     pub fn plug(&mut self) {
-        let far: OwnedFd = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("a pseudo-terminal");
+        let far: OwnedFd = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)
+            .expect("a pseudo-terminal");
         grantpt(&far).expect("granted");
         unlockpt(&far).expect("unlocked");
         let name = ptsname(&far, Vec::new()).expect("named").into_string().expect("ASCII");

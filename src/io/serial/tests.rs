@@ -13,7 +13,8 @@ use super::*;
 
 /// The far end of a pseudo-terminal and the name of its near end.
 fn pty() -> (File, String) {
-    let far: OwnedFd = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("a pseudo-terminal");
+    let far: OwnedFd =
+        openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("a pseudo-terminal");
     grantpt(&far).expect("granted");
     unlockpt(&far).expect("unlocked");
     let name = ptsname(&far, Vec::new()).expect("named").into_string().expect("ASCII");
