@@ -12,6 +12,17 @@ pub(super) struct Bitmap {
 }
 
 impl Bitmap {
+    /// From one truth value a pixel.
+    #[cfg(test)]
+    pub fn from_pixels(width: usize, height: usize, dark: &[bool]) -> Self {
+        let per_row = width.div_ceil(64);
+        let mut words = vec![0; per_row * height];
+        for (i, _) in dark.iter().enumerate().filter(|(_, d)| **d) {
+            words[i / width * per_row + i % width / 64] |= 1 << (i % width % 64);
+        }
+        Self { width, height, words }
+    }
+
     /// The words of a row.
     pub fn row(&self, v: usize) -> &[u64] {
         let per_row = self.width.div_ceil(64);

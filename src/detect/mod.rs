@@ -8,6 +8,7 @@ mod family;
 mod frame;
 mod homography;
 mod pattern;
+mod noise;
 mod payload;
 mod pyramid;
 mod quad;

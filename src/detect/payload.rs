@@ -2,7 +2,7 @@
 
 use super::family::{Family, Word};
 use super::homography::{Homography, narrow, wide};
-use super::pyramid::{Pyramid, level_from_frame};
+use super::pyramid::Pyramid;
 use super::quad::{Quad, bilinear, distance};
 use crate::msg::ImageView;
 
@@ -36,15 +36,14 @@ impl Grid {
         let edge = (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).sum::<f32>() / 4.0;
         // Averaging over the cell: the level in which a cell is two to four pixels wide.
         let cell = edge / family.width as f32;
-        let level = ((cell / 2.2).max(1.0).log2() as usize).min(pyramid.top());
-        let image = pyramid.level(image, level);
+        let level = pyramid.for_size(image, cell, 2.0);
         let (side, pad) = (family.grid_side(), family.pad);
         let mut values = [0.0; MOST * MOST];
         for y in 0..side {
             for x in 0..side {
                 let centre = |k: usize| k as f64 + 0.5 - pad as f64;
                 let p = narrow(h.apply(centre(x), centre(y)));
-                values[y * side + x] = bilinear(image, p.map(|c| level_from_frame(c, level)));
+                values[y * side + x] = bilinear(level.image, p.map(|c| level.from_frame(c)));
             }
         }
         Some(Self { side, pad, values })

@@ -1,72 +1,115 @@
-//! Box-averaged image pyramid: each level halves the one below.
+//! Box-averaged image pyramid: a first reduction by 3/2 or 2, then halvings.
 //!
-//! Pixel `i` of a level covers pixels `2i` and `2i + 1` of the level below, so that with pixel centres at
-//! integers `u_below = 2 u + 0.5`.
+//! A pixel is the mean of the square of frame pixels it covers. With pixel centres at integers, a level of
+//! scale `s` relates to the frame by `u_frame + ½ = s (u_level + ½)`.
 
 use super::simd::Simd;
 use crate::msg::{GrayImage, ImageView};
 
-/// Levels below the frame itself, biggest first.
+/// How the first level comes from the frame.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Base {
+    /// It is the frame.
+    Full,
+    /// Three pixels become two.
+    TwoThirds,
+    /// Two pixels become one.
+    Half,
+}
+
+/// An image and how many frame pixels are one of its own.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(super) struct Level<'a> {
+    pub image: ImageView<'a>,
+    pub scale: f32,
+}
+
+impl Level<'_> {
+    /// Coordinates in this level of coordinates in the frame.
+    pub fn from_frame(&self, u: f32) -> f32 {
+        (u + 0.5) / self.scale - 0.5
+    }
+
+    /// Coordinates in the frame of coordinates in this level.
+    pub fn to_frame(&self, u: f32) -> f32 {
+        (u + 0.5) * self.scale - 0.5
+    }
+}
+
+/// Levels below the frame itself, biggest first; keeps its buffers.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Pyramid {
     levels: Vec<GrayImage>,
-    used: usize,
+    scales: Vec<f32>,
 }
 
-/// Most halvings: a cell of a tag as wide as the largest image is then a few pixels.
+/// Most levels: a cell of a tag as wide as the largest image is then a few pixels.
 const MOST_LEVELS: usize = 8;
 
 impl Pyramid {
     /// Builds as many levels as leave at least `least` pixels on the shorter side.
-    pub fn build(&mut self, image: ImageView<'_>, least: usize, simd: Simd) {
-        self.used = 0;
+    pub fn build(&mut self, image: ImageView<'_>, base: Base, least: usize, simd: Simd) {
+        self.scales.clear();
+        let mut scale = 1.0;
         let (mut width, mut height) = (image.width, image.height);
-        while self.used < MOST_LEVELS && (width / 2).min(height / 2) >= least.max(1) {
-            (width, height) = (width / 2, height / 2);
-            if self.levels.len() == self.used {
+        for n in 0..MOST_LEVELS {
+            let first_by_thirds = n == 0 && base == Base::TwoThirds;
+            let reduced = |size: usize| if first_by_thirds { size / 3 * 2 } else { size / 2 };
+            if reduced(width).min(reduced(height)) < least.max(1) {
+                break;
+            }
+            (width, height) = (reduced(width), reduced(height));
+            scale *= if first_by_thirds { 1.5 } else { 2.0 };
+            if self.levels.len() == n {
                 self.levels.push(GrayImage::default());
             }
-            let (below, rest) = self.levels.split_at_mut(self.used);
+            let (below, rest) = self.levels.split_at_mut(n);
             let level = &mut rest[0];
             (level.width, level.height, level.stride) = (width, height, width);
             level.data.resize(width * height, 0);
-            halve(below.last().map_or(image, |b| b.view()), level, simd);
-            self.used += 1;
+            let below = below.last().map_or(image, |b| b.view());
+            if first_by_thirds {
+                two_thirds(below, level, simd);
+            } else {
+                halve(below, level, simd);
+            }
+            self.scales.push(scale);
         }
     }
 
-    /// Level 0 is `image`, level `n` is halved `n` times; the smallest where there is none so small.
-    pub fn level<'a>(&'a self, image: ImageView<'a>, n: usize) -> ImageView<'a> {
-        match n.min(self.used) {
-            0 => image,
-            n => self.levels[n - 1].view(),
+    /// How many levels there are, the frame included.
+    pub fn len(&self) -> usize {
+        self.scales.len() + 1
+    }
+
+    /// Level 0 is the frame.
+    pub fn level<'a>(&'a self, image: ImageView<'a>, n: usize) -> Level<'a> {
+        match n {
+            0 => Level { image, scale: 1.0 },
+            n => Level { image: self.levels[n - 1].view(), scale: self.scales[n - 1] },
         }
     }
 
-    /// The highest level.
-    pub fn top(&self) -> usize {
-        self.used
+    /// The coarsest level in which something `size` frame pixels wide still is `least` pixels wide.
+    pub fn for_size<'a>(&'a self, image: ImageView<'a>, size: f32, least: f32) -> Level<'a> {
+        let n = self.scales.iter().take_while(|&&scale| size >= least * scale).count();
+        self.level(image, n)
     }
 }
 
 /// Averages 2×2 blocks, halves rounded up; an odd last row or column is left out.
 fn halve(from: ImageView<'_>, to: &mut GrayImage, simd: Simd) {
-    for v in 0..to.height {
-        let (above, below) = (from.row(2 * v), from.row(2 * v + 1));
-        simd.halve_rows(above, below, &mut to.data[v * to.stride..v * to.stride + to.width]);
+    for (v, row) in to.data.chunks_exact_mut(to.width).enumerate() {
+        simd.halve_rows(from.row(2 * v), from.row(2 * v + 1), row);
     }
 }
 
-/// Coordinates in the frame of coordinates in a level.
-pub(super) fn frame_from_level(u: f32, level: usize) -> f32 {
-    let scale = (1u32 << level) as f32;
-    (u + 0.5) * scale - 0.5
-}
-
-/// Coordinates in a level of coordinates in the frame.
-pub(super) fn level_from_frame(u: f32, level: usize) -> f32 {
-    let scale = (1u32 << level) as f32;
-    (u + 0.5) / scale - 0.5
+/// Averages blocks of 3/2×3/2; what is left over on the right and below is left out.
+fn two_thirds(from: ImageView<'_>, to: &mut GrayImage, simd: Simd) {
+    for (k, rows) in to.data.chunks_exact_mut(2 * to.width).enumerate() {
+        let (first, second) = rows.split_at_mut(to.width);
+        simd.two_thirds_rows([from.row(3 * k), from.row(3 * k + 1), from.row(3 * k + 2)], [first, second]);
+    }
 }
 
 #[cfg(test)]
@@ -75,16 +118,20 @@ mod tests {
 
     #[test]
     fn a_ramp_keeps_its_place() {
-        let ramp = GrayImage::from_vec(64, 8, (0..512).map(|i| (i % 64 * 4) as u8).collect()).expect("size");
-        let mut pyramid = Pyramid::default();
-        pyramid.build(ramp.view(), 2, Simd::best());
-        assert_eq!(pyramid.top(), 2);
-        for n in 1..=2 {
-            let level = pyramid.level(ramp.view(), n);
-            for u in 0..level.width {
-                let expected = 4.0 * frame_from_level(u as f32, n);
-                assert!((f32::from(level.row(0)[u]) - expected).abs() <= 1.0);
-                assert!((level_from_frame(frame_from_level(u as f32, n), n) - u as f32).abs() < 1e-5);
+        let ramp = GrayImage::from_vec(60, 12, (0..720).map(|i| (i % 60 * 4) as u8).collect()).expect("size");
+        for (base, scales) in
+            [(Base::Half, vec![1.0, 2.0, 4.0]), (Base::TwoThirds, vec![1.0, 1.5, 3.0]), (Base::Full, vec![1.0, 2.0, 4.0])]
+        {
+            let mut pyramid = Pyramid::default();
+            pyramid.build(ramp.view(), base, 3, Simd::best());
+            assert_eq!((0..pyramid.len()).map(|n| pyramid.level(ramp.view(), n).scale).collect::<Vec<_>>(), scales);
+            for n in 0..pyramid.len() {
+                let level = pyramid.level(ramp.view(), n);
+                for u in 0..level.image.width {
+                    let expected = 4.0 * level.to_frame(u as f32);
+                    assert!((f32::from(level.image.row(0)[u]) - expected).abs() <= 1.0);
+                    assert!((level.from_frame(level.to_frame(u as f32)) - u as f32).abs() < 1e-5);
+                }
             }
         }
     }
@@ -92,9 +139,11 @@ mod tests {
     #[test]
     fn tiny_images_have_no_levels() {
         for (width, height) in [(1, 1), (1, 90), (3, 3)] {
-            let mut pyramid = Pyramid::default();
-            pyramid.build(GrayImage::new(width, height).view(), 2, Simd::best());
-            assert_eq!(pyramid.top(), 0);
+            for base in [Base::Full, Base::TwoThirds, Base::Half] {
+                let mut pyramid = Pyramid::default();
+                pyramid.build(GrayImage::new(width, height).view(), base, 4, Simd::best());
+                assert_eq!(pyramid.len(), 1);
+            }
         }
     }
 }

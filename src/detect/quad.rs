@@ -21,18 +21,23 @@ pub(super) struct SizeLimits {
 /// Shortest side over longest at which a square is still read: 70° off its normal, and blur.
 const LEAST_ASPECT: f32 = 0.25;
 
+/// Largest share of its hull that a border with the dark cells it holds together covers.
+const MOST_FILL: f32 = 0.93;
+
 /// Whether a component can be a tag's border, by box and area alone.
 pub(super) fn may_be_border(c: &Component, limits: SizeLimits, width: usize, height: usize) -> bool {
     let (w, h) = (c.width() as f32, c.height() as f32);
     let (short, long) = (w.min(h), w.max(h));
-    // A square's box is 1 to √2 of its edge; blur and threshold may eat a pixel.
+    // A square's box is 1 to √2 of its edge; blur and threshold may eat a pixel. A tag of the least size
+    // seen aslant is shorter one way and longer the other.
     let size_fits = long + 1.0 >= limits.least && short <= 1.5 * limits.most;
-    let shape_fits =
-        short >= LEAST_ASPECT * limits.least && short >= LEAST_ASPECT * 0.8 * long && short >= 4.0;
-    // A ring a sixth of the edge wide, turned by 45°, fills a quarter of its box.
-    let fill_fits = c.area as f32 >= 0.15 * w * h;
-    let inside =
-        c.left > 0 && c.top > 0 && usize::from(c.right) + 1 < width && usize::from(c.bottom) + 1 < height;
+    let shape_fits = short + 1.0 >= 0.55 * limits.least && short >= LEAST_ASPECT * long;
+    // A border is a quarter to a half of its tag; of a large one only a rim is dark against what is near.
+    let fill_fits = c.area as f32 >= (0.17 * w * h).min(2.0 * (w + h));
+    let inside = c.left > 0
+        && c.top > 0
+        && usize::from(c.right) + 1 < width
+        && usize::from(c.bottom) + 1 < height;
     size_fits && shape_fits && fill_fits && inside
 }
 
@@ -45,9 +50,16 @@ pub(super) struct QuadFinder {
 impl QuadFinder {
     /// The quadrilateral that a component's hull nearly is, half a pixel outside the centres of its
     /// outermost pixels; `None` where the hull is of another shape.
-    pub fn quad(&mut self, component: &Component, outline: Outline<'_>) -> Option<Quad> {
+    pub fn quad(&mut self, component: &Component, outline: Outline<'_>, limits: SizeLimits) -> Option<Quad> {
         self.find_hull(component, outline);
         let hull_area = polygon_area(&self.hull);
+        // What its pixels cover, not only their centres.
+        let covered = hull_area + 1.0 + 0.5 * perimeter(&self.hull);
+        let fill = component.area as f32 / covered;
+        // Every tag has light cells inside: at least a seventh of its square.
+        if covered < 0.5 * limits.least * limits.least || fill > MOST_FILL {
+            return None;
+        }
         let quad = largest_quad(&self.hull)?;
         let quad_area = polygon_area(&quad);
         // Corners are blunt by about a pixel: allow their area, and a tenth for bent edges.
@@ -92,7 +104,8 @@ fn cross(a: Point, b: Point, c: Point) -> f32 {
 }
 
 pub(super) fn distance(a: Point, b: Point) -> f32 {
-    (a[0] - b[0]).hypot(a[1] - b[1])
+    let (du, dv) = (a[0] - b[0], a[1] - b[1]);
+    (du * du + dv * dv).sqrt()
 }
 
 /// Area of a polygon, positive where its points run clockwise as seen.
@@ -105,6 +118,12 @@ pub(super) fn polygon_area(points: &[Point]) -> f32 {
         previous = p;
     }
     0.5 * sum
+}
+
+fn perimeter(points: &[Point]) -> f32 {
+    let Some(&last) = points.last() else { return 0.0 };
+    let mut previous = last;
+    points.iter().map(|&p| distance(std::mem::replace(&mut previous, p), p)).sum()
 }
 
 /// The largest quadrilateral with corners among hull points: the farthest point from the middle, the
@@ -185,26 +204,32 @@ pub(super) fn corners_of(lines: &[Line; 4]) -> Option<Quad> {
     Some(quad)
 }
 
-/// How many of 16 pairs of pixels across a quadrilateral's sides are darker inside by `least`, and
-/// how many are lighter inside by as much.
+/// Whether 13 of 16 pairs of pixels across a quadrilateral's sides are darker inside, by `least_step` and
+/// by a tenth of what the outer one is.
 ///
 /// `reach` is how far inside and outside the side the pairs lie, pixels.
-pub(super) fn border_votes(image: ImageView<'_>, quad: &Quad, reach: f32, least: i32) -> (u32, u32) {
-    let (mut right, mut wrong) = (0, 0);
+pub(super) fn border_is_dark(image: ImageView<'_>, quad: &Quad, reach: f32, least_step: f32) -> bool {
+    let mut wrong = 0;
     for i in 0..4 {
         let (a, b) = (quad[i], quad[(i + 1) % 4]);
         let n = Line::through(a, b).n;
         for t in [0.2, 0.4, 0.6, 0.8] {
             let at = [a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])];
             let pixel = |d: f32| nearest(image, [at[0] + d * n[0], at[1] + d * n[1]]);
-            if let (Some(inside), Some(outside)) = (pixel(-reach), pixel(reach)) {
-                let step = i32::from(outside) - i32::from(inside);
-                right += u32::from(step >= least);
-                wrong += u32::from(-step >= least);
+            let dark = match (pixel(-reach), pixel(reach)) {
+                (Some(inside), Some(outside)) => {
+                    let (inside, outside) = (f32::from(inside), f32::from(outside));
+                    outside - inside >= least_step.max(0.1 * outside)
+                }
+                _ => false,
+            };
+            wrong += u32::from(!dark);
+            if wrong > 3 {
+                return false;
             }
         }
     }
-    (right, wrong)
+    true
 }
 
 fn nearest(image: ImageView<'_>, [u, v]: Point) -> Option<u8> {

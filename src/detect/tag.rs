@@ -5,8 +5,9 @@ use super::components::Labeller;
 use super::edges::{EdgeSearch, fit_sides};
 use super::family::Family;
 use super::payload;
-use super::pyramid::{Pyramid, frame_from_level};
-use super::quad::{Quad, QuadFinder, SizeLimits, border_votes, distance, may_be_border};
+use super::noise::noise_sigma;
+use super::pyramid::{Base, Level, Pyramid};
+use super::quad::{Quad, QuadFinder, SizeLimits, border_is_dark, distance, may_be_border};
 use super::simd::Simd;
 use crate::config::TagFamily;
 use crate::msg::{GrayImage, ImageView, MarkerDetection, MarkerId};
@@ -25,6 +26,8 @@ pub struct TagDetector {
     finder: QuadFinder,
     found: Vec<Found>,
     negative: GrayImage,
+    /// Of a frame pixel, grey levels.
+    noise: f32,
 }
 
 /// Part of a frame, pixels.
@@ -66,9 +69,11 @@ struct Found {
     edge: f32,
 }
 
-/// Where between the local minimum and maximum the two binarisations divide, of 256. The lower keeps
-/// a border whole where a shadow's edge crosses the tag, the upper one that is thin and blurred.
-const FRACTIONS: [u16; 2] = [85, 128];
+/// Where between the local minimum and maximum dark and light are divided, of 256. Low keeps a border whole
+/// where a shadow's edge crosses the tag; the coarser levels cost little and are divided a second time
+/// higher up, for borders that are blurred.
+const FRACTIONS_FINE: [u16; 1] = [85];
+const FRACTIONS_COARSE: [u16; 2] = [72, 116];
 
 /// Smallest edge in a level at which a border can be told from its surroundings, pixels.
 const LEAST_EDGE_IN_LEVEL: f32 = 12.0;
@@ -91,6 +96,7 @@ impl TagDetector {
             finder: QuadFinder::default(),
             found: Vec::new(),
             negative: GrayImage::default(),
+            noise: 0.0,
         }
     }
 
@@ -138,47 +144,61 @@ impl TagDetector {
 
     /// Searches an image, or its negative for the families whose border is light.
     fn search(&mut self, image: ImageView<'_>, inverted: bool) {
-        self.pyramid.build(image, 16, self.simd);
-        let base = if self.min_px >= 2.0 * LEAST_EDGE_IN_LEVEL { 1 } else { 0 };
-        for level in (base..=(base + 2).min(self.pyramid.top())).rev() {
-            self.search_level(image, level, inverted);
+        let base = if self.min_px >= LEAST_EDGE_IN_LEVEL * 2.0 {
+            Base::Half
+        } else if self.min_px >= LEAST_EDGE_IN_LEVEL * 1.3 {
+            Base::TwoThirds
+        } else {
+            Base::Full
+        };
+        self.pyramid.build(image, base, 16, self.simd);
+        self.noise = noise_sigma(image);
+        let first = usize::from(base != Base::Full).min(self.pyramid.len() - 1);
+        let last = (first + 2).min(self.pyramid.len() - 1);
+        for n in (first..=last).rev() {
+            let fractions: &[u16] = if n == first { &FRACTIONS_FINE } else { &FRACTIONS_COARSE };
+            self.search_level(image, n, fractions, inverted);
         }
     }
 
-    fn search_level(&mut self, image: ImageView<'_>, level: usize, inverted: bool) {
-        let scale = (1u32 << level) as f32;
-        let limits = SizeLimits { least: (self.min_px / scale).max(8.0), most: f32::MAX };
-        let at_level = self.pyramid.level(image, level);
-        let (width, height) = (at_level.width, at_level.height);
-        self.binariser.measure(at_level, self.simd);
-        let gate = 20;
-        for fraction in FRACTIONS {
-            self.binariser.mark(at_level, gate, fraction, &mut self.bits, self.simd);
+    fn search_level(&mut self, image: ImageView<'_>, n: usize, fractions: &[u16], inverted: bool) {
+        let level = self.pyramid.level(image, n);
+        let limits = SizeLimits { least: (self.min_px / level.scale).max(8.0), most: f32::MAX };
+        let (width, height) = (level.image.width, level.image.height);
+        // Noise alone spans some five sigmas in the 144 pixels of a neighbourhood.
+        let gate = (7.0 * self.noise / level.scale).clamp(12.0, 60.0) as u8;
+        self.binariser.measure(level.image, self.simd);
+        for &fraction in fractions {
+            self.binariser.mark(level.image, gate, fraction, &mut self.bits, self.simd);
             self.labeller.label(&self.bits, |c| may_be_border(c, limits, width, height));
             for (component, outline) in self.labeller.kept() {
-                let Some(quad) = self.finder.quad(component, outline) else { continue };
-                let edge = (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).sum::<f32>() / 4.0;
-                let reach = (edge / 16.0).clamp(0.8, 4.0);
-                let (right, _) = border_votes(at_level, &quad, reach, i32::from(gate) / 3);
-                if right < 12 {
-                    continue;
-                }
-                let search =
-                    EdgeSearch { reach: (edge / 8.0).clamp(1.5, 3.0), least_step: f32::from(gate) / 3.0 };
-                let Some(quad) = fit_sides(at_level, &quad, search) else { continue };
-                let quad = quad.map(|p| p.map(|c| frame_from_level(c, level)));
+                let Some(quad) = self.finder.quad(component, outline, limits) else { continue };
+                let Some(quad) = straighten(level, &quad, gate) else { continue };
                 if self.found.iter().any(|f| same_place(&f.corners, &quad)) {
                     continue;
                 }
-                for family in self.families.iter().filter(|f| f.inverted == inverted) {
-                    if let Some(found) = decode(image, &self.pyramid, &quad, family) {
-                        self.found.push(found);
-                        break;
-                    }
-                }
+                let families = self.families.iter().filter(|f| f.inverted == inverted);
+                self.found.extend(families.filter_map(|f| decode(image, &self.pyramid, &quad, f)).next());
             }
         }
     }
+}
+
+/// A quadrilateral of a level, in frame coordinates, with its sides fitted to the image; `None` where the
+/// image does not step from dark to light along them.
+fn straighten(level: Level<'_>, quad: &Quad, gate: u8) -> Option<Quad> {
+    let edge = mean_edge(quad);
+    let least_step = f32::from(gate) / 3.0;
+    if !border_is_dark(level.image, quad, (edge / 16.0).clamp(0.8, 4.0), least_step) {
+        return None;
+    }
+    let search = EdgeSearch { reach: (edge / 8.0).clamp(1.5, 3.0), least_step };
+    let quad = fit_sides(level.image, quad, search)?;
+    Some(quad.map(|p| p.map(|c| level.to_frame(c))))
+}
+
+fn mean_edge(quad: &Quad) -> f32 {
+    (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).sum::<f32>() / 4.0
 }
 
 fn negate(image: ImageView<'_>, to: &mut GrayImage) {
@@ -196,7 +216,7 @@ fn decode(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family: &Family)
         hamming: reading.word.hamming,
         margin: reading.margin,
         corners,
-        edge: (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).sum::<f32>() / 4.0,
+        edge: mean_edge(quad),
     })
 }
 

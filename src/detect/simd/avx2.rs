@@ -30,6 +30,39 @@ pub(super) unsafe fn halve_rows(above: &[u8], below: &[u8], to: &mut [u8]) {
 /// # Safety
 /// The processor must have AVX2.
 #[target_feature(enable = "avx2")]
+pub(super) unsafe fn two_thirds_rows(rows: [&[u8]; 3], to: [&mut [u8]; 2]) {
+    let [first, second] = to;
+    let width = rows.iter().map(|r| r.len()).min().unwrap_or(0);
+    // A block is 24 pixels; its second load reaches four pixels beyond it.
+    let blocks = (width.saturating_sub(4) / 24).min(first.len() / 16).min(second.len() / 16);
+    // Pixels 0 1, 1 2 of every three as pairs, to be weighed 2 1, 1 2.
+    let pairs = _mm256_broadcastsi128_si256(_mm_setr_epi8(0, 1, 1, 2, 3, 4, 4, 5, 6, 7, 7, 8, 9, 10, 10, 11));
+    let weights = _mm256_set1_epi32(0x0201_0102);
+    let ninth = _mm256_set1_epi16(scalar::NINTH);
+    for block in 0..blocks {
+        // SAFETY: `block < blocks` keeps 28 pixels of each row and 16 of each output inside.
+        unsafe {
+            let across = |r: usize| {
+                let at = rows[r].as_ptr().add(block * 24);
+                let low = _mm256_castsi128_si256(_mm_loadu_si128(at.cast()));
+                let both = _mm256_inserti128_si256(low, _mm_loadu_si128(at.add(12).cast()), 1);
+                _mm256_maddubs_epi16(_mm256_shuffle_epi8(both, pairs), weights)
+            };
+            let (a, b, c) = (across(0), across(1), across(2));
+            let above = _mm256_mulhrs_epi16(_mm256_add_epi16(_mm256_add_epi16(a, a), b), ninth);
+            let below = _mm256_mulhrs_epi16(_mm256_add_epi16(_mm256_add_epi16(c, c), b), ninth);
+            let packed = _mm256_permute4x64_epi64(_mm256_packus_epi16(above, below), 0b11_01_10_00);
+            _mm_storeu_si128(first.as_mut_ptr().add(block * 16).cast(), _mm256_castsi256_si128(packed));
+            _mm_storeu_si128(second.as_mut_ptr().add(block * 16).cast(), _mm256_extracti128_si256(packed, 1));
+        }
+    }
+    let rest = rows.map(|r| &r[blocks * 24..]);
+    scalar::two_thirds_rows(rest, [&mut first[blocks * 16..], &mut second[blocks * 16..]]);
+}
+
+/// # Safety
+/// The processor must have AVX2.
+#[target_feature(enable = "avx2")]
 pub(super) unsafe fn tile_range(rows: [&[u8]; TILE], low: &mut [u8], high: &mut [u8]) {
     let width = rows.iter().map(|r| r.len()).min().unwrap_or(0);
     let blocks = (width / 32).min(low.len() / 8).min(high.len() / 8);

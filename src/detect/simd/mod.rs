@@ -47,6 +47,17 @@ impl Simd {
         }
     }
 
+    /// Three rows to two, three pixels to two: `to[0][2k]` = the mean of the first one and a half pixels
+    /// of the first one and a half rows from `3k` on, and so forth, rounded.
+    pub(super) fn two_thirds_rows(self, rows: [&[u8]; 3], to: [&mut [u8]; 2]) {
+        match self.0 {
+            Kind::Scalar => scalar::two_thirds_rows(rows, to),
+            // SAFETY: `best` made this variant only where the processor has AVX2.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx2 => unsafe { avx2::two_thirds_rows(rows, to) },
+        }
+    }
+
     /// Smallest and largest pixel of each 4-pixel-wide tile of four rows of one length; the last tile
     /// may be narrower. `low` and `high` have a place for every tile.
     pub(super) fn tile_range(self, rows: [&[u8]; TILE], low: &mut [u8], high: &mut [u8]) {
@@ -89,6 +100,12 @@ mod tests {
                 to
             };
             prop_assert_eq!(half(a), half(b));
+            let shrunk = |s: Simd| {
+                let (mut a, mut b) = (vec![0; width / 3 * 2], vec![0; width / 3 * 2]);
+                s.two_thirds_rows([row(0), row(1), row(2)], [&mut a, &mut b]);
+                (a, b)
+            };
+            prop_assert_eq!(shrunk(a), shrunk(b));
             let tiles = width.div_ceil(TILE);
             let range = |s: Simd| {
                 let (mut low, mut high) = (vec![0; tiles], vec![0; tiles]);

@@ -9,6 +9,25 @@ pub(super) fn halve_rows(above: &[u8], below: &[u8], to: &mut [u8]) {
     }
 }
 
+/// Ninths as 15-bit fractions: exact to a hundredth of a grey level.
+pub(super) const NINTH: i16 = 3641;
+
+pub(super) fn two_thirds_rows(rows: [&[u8]; 3], to: [&mut [u8]; 2]) {
+    let [first, second] = to;
+    let count = (first.len() / 2).min(second.len() / 2).min(rows[0].len() / 3);
+    let mean = |sum: u16| ((u32::from(sum) * NINTH as u32 + 0x4000) >> 15) as u8;
+    for k in 0..count {
+        let across = rows.map(|row| {
+            let p: [u16; 3] = std::array::from_fn(|i| u16::from(row[3 * k + i]));
+            [2 * p[0] + p[1], p[1] + 2 * p[2]]
+        });
+        for i in 0..2 {
+            first[2 * k + i] = mean(2 * across[0][i] + across[1][i]);
+            second[2 * k + i] = mean(across[1][i] + 2 * across[2][i]);
+        }
+    }
+}
+
 pub(super) fn tile_range(rows: [&[u8]; TILE], low: &mut [u8], high: &mut [u8]) {
     for (tile, (low, high)) in low.iter_mut().zip(high).enumerate() {
         let (mut least, mut most) = (u8::MAX, 0);
