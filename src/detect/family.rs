@@ -30,8 +30,6 @@ pub(super) struct Family {
     pub pad: usize,
     /// Whether the border is light inside a dark ring.
     pub inverted: bool,
-    /// Most wrong bits accepted.
-    pub max_hamming: u8,
     /// Data cells (x, y), first in the word's top bit.
     pub cells: Vec<(i32, i32)>,
     codes: &'static [u64],
@@ -59,7 +57,7 @@ impl Family {
         });
         let max_hamming = max_hamming.min(limit);
         let index = ChunkIndex::new(codes, cells.len(), max_hamming);
-        Self { family, width, pad, inverted, max_hamming, cells, codes, turned, index }
+        Self { family, width, pad, inverted, cells, codes, turned, index }
     }
 
     /// Cells on a side of the sampled grid.
@@ -71,6 +69,21 @@ impl Family {
     pub fn bit(&self, id: u32, cell: usize) -> bool {
         let bit = self.codes[id as usize] >> (self.cells.len() - 1 - cell) & 1 == 1;
         bit != self.inverted
+    }
+
+    /// Whether cell (x, y) of tag `id` is light in the (possibly inverted) image: data, border (dark) or the
+    /// ring around it (light). `None` beyond the ring, where it is not known.
+    pub fn is_light(&self, id: u32, x: i32, y: i32) -> Option<bool> {
+        let w = self.width as i32;
+        let inside = |margin: i32| (margin..w - margin).contains(&x) && (margin..w - margin).contains(&y);
+        if !inside(-1) {
+            return None;
+        }
+        if inside(1) {
+            let cell = self.cells.iter().position(|&c| c == (x, y))?;
+            return Some(self.bit(id, cell));
+        }
+        Some(!inside(0))
     }
 
     /// The word nearest to a grid of bits (`grid_side²`, row by row, true for white), if any is near

@@ -12,6 +12,7 @@ mod noise;
 mod payload;
 mod pyramid;
 mod quad;
+mod refine;
 mod simd;
 mod tag;
 

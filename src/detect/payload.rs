@@ -49,7 +49,7 @@ impl Grid {
         Some(Self { side, pad, values })
     }
 
-    /// Grid indices of the ring of cells `out` cells outside the border (−1: the border itself... 0).
+    /// Grid indices of the ring of cells `out` cells outside the border; 0 is the border itself.
     fn ring(&self, out: usize) -> impl Iterator<Item = usize> + use<> {
         let (side, low) = (self.side, self.pad - out);
         let high = side - 1 - low;
@@ -90,6 +90,93 @@ impl Grid {
         Some(thresholds)
     }
 
+    /// Halfway levels between the border and the ring outside it, one a border cell of each side: top, right,
+    /// bottom, left, by x or y.
+    fn border_levels(&self) -> [[f32; MOST]; 4] {
+        let (low, high) = (self.pad, self.side - 1 - self.pad);
+        let mut levels = [[0.0; MOST]; 4];
+        let at = |x: usize, y: usize| self.values[y * self.side + x];
+        for k in low..=high {
+            let pairs = [
+                (at(k, low), at(k, low - 1)),
+                (at(high, k), at(high + 1, k)),
+                (at(k, high), at(k, high + 1)),
+                (at(low, k), at(low - 1, k)),
+            ];
+            for (level, (inner, outer)) in levels.iter_mut().zip(pairs) {
+                level[k] = 0.5 * (inner + outer);
+            }
+        }
+        levels
+    }
+
+    /// Two levels on either side of a straight line, where the border's levels fall into two groups: a
+    /// shadow's edge across the tag. The line is a least-squares discriminant of the border cells.
+    fn halves_threshold(&self, border: &[[f32; MOST]; 4]) -> Option<[f32; MOST * MOST]> {
+        let (low, high) = (self.pad, self.side - 1 - self.pad);
+        let middle = (self.side - 1) as f32 / 2.0;
+        let (near, far) = (low as f32 - middle, high as f32 - middle);
+        let cells = (low..=high).flat_map(|k| {
+            let t = k as f32 - middle;
+            [(t, near, border[0][k]), (far, t, border[1][k]), (t, far, border[2][k]), (near, t, border[3][k])]
+        });
+        let (least, most) = cells.clone().fold((f32::MAX, f32::MIN), |m, c| (m.0.min(c.2), m.1.max(c.2)));
+        if most < 1.3 * least {
+            return None;
+        }
+        let split = 0.5 * (least + most);
+        let (mut dark, mut lit, mut slope, mut square) = ((0.0, 0.0f32), (0.0, 0.0f32), [0.0f32; 2], 0.0);
+        for (x, y, level) in cells.clone() {
+            let group = if level > split { &mut lit } else { &mut dark };
+            *group = (group.0 + level, group.1 + 1.0);
+            let side = if level > split { 1.0 } else { -1.0 };
+            slope = [slope[0] + side * x, slope[1] + side * y];
+            square += x * x;
+        }
+        let (dark_level, lit_level) = (dark.0 / dark.1.max(1.0), lit.0 / lit.1.max(1.0));
+        let length = (slope[0] * slope[0] + slope[1] * slope[1]).sqrt();
+        if length < 0.2 * square / far.max(1.0) {
+            return None;
+        }
+        let n = [slope[0] / length, slope[1] / length];
+        let along = |x: f32, y: f32| n[0] * x + n[1] * y;
+        // The offset that leaves fewest border cells on the wrong side.
+        let wrong = |offset: f32| {
+            cells.clone().filter(|&(x, y, level)| (along(x, y) > offset) != (level > split)).count()
+        };
+        let reach = (1.5 * far * 2.0) as i32;
+        let offset = (-reach..=reach).map(|k| 0.5 * k as f32).min_by_key(|&offset| wrong(offset))?;
+        let mut thresholds = [0.0; MOST * MOST];
+        for (i, t) in thresholds.iter_mut().enumerate().take(self.side * self.side) {
+            let (x, y) = ((i % self.side) as f32 - middle, (i / self.side) as f32 - middle);
+            let share = (0.5 + along(x, y) - offset).clamp(0.0, 1.0);
+            *t = dark_level + share * (lit_level - dark_level);
+        }
+        Some(thresholds)
+    }
+
+    /// The border's levels carried inwards: the mean of what left and right, above and below say, each
+    /// weighed by its nearness.
+    fn blended_threshold(&self, border: &[[f32; MOST]; 4]) -> [f32; MOST * MOST] {
+        let (low, high) = (self.pad, self.side - 1 - self.pad);
+        let mut thresholds = [0.0; MOST * MOST];
+        for (i, t) in thresholds.iter_mut().enumerate().take(self.side * self.side) {
+            let (x, y) = ((i % self.side).clamp(low, high), (i / self.side).clamp(low, high));
+            let sides = [
+                (border[0][x], y - low),
+                (border[1][y], high - x),
+                (border[2][x], high - y),
+                (border[3][y], x - low),
+            ];
+            let (sum, weights) = sides.iter().fold((0.0, 0.0), |(sum, weights), &(level, distance)| {
+                let weight = 1.0 / (0.3 + distance as f32).powi(2);
+                (sum + weight * level, weights + weight)
+            });
+            *t = sum / weights;
+        }
+        thresholds
+    }
+
     fn read(&self, thresholds: &[f32; MOST * MOST], family: &Family) -> Option<Reading> {
         let cells = self.side * self.side;
         let mut bits = [false; MOST * MOST];
@@ -113,9 +200,17 @@ impl Grid {
     }
 }
 
-/// Reads a quadrilateral given in frame coordinates.
+/// Reads a quadrilateral given in frame coordinates. Illumination is tried as a plane, then as lit and shaded
+/// halves, then as what the border says of each row and column; the first that gives a word counts.
 pub(super) fn read(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family: &Family) -> Option<Reading> {
     let grid = Grid::sample(image, pyramid, quad, family)?;
     let thresholds = grid.plane_threshold()?;
-    grid.read(&thresholds, family)
+    if let Some(reading) = grid.read(&thresholds, family) {
+        return Some(reading);
+    }
+    let border = grid.border_levels();
+    if let Some(reading) = grid.halves_threshold(&border).and_then(|t| grid.read(&t, family)) {
+        return Some(reading);
+    }
+    grid.read(&grid.blended_threshold(&border), family)
 }

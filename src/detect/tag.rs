@@ -3,11 +3,12 @@
 use super::binarise::{Binariser, Bitmap};
 use super::components::Labeller;
 use super::edges::{EdgeSearch, fit_sides};
-use super::family::Family;
+use super::family::{Family, Word};
 use super::payload;
 use super::noise::noise_sigma;
 use super::pyramid::{Base, Level, Pyramid};
 use super::quad::{Quad, QuadFinder, SizeLimits, border_is_dark, distance, may_be_border};
+use super::refine::{Refined, Refiner};
 use super::simd::Simd;
 use crate::config::TagFamily;
 use crate::msg::{GrayImage, ImageView, MarkerDetection, MarkerId};
@@ -24,6 +25,7 @@ pub struct TagDetector {
     bits: Bitmap,
     labeller: Labeller,
     finder: QuadFinder,
+    refiner: Refiner,
     found: Vec<Found>,
     negative: GrayImage,
     /// Of a frame pixel, grey levels.
@@ -61,12 +63,11 @@ impl Region {
 #[derive(Clone, Copy, PartialEq, Debug)]
 struct Found {
     family: TagFamily,
-    id: u32,
-    hamming: u8,
+    word: Word,
     margin: f32,
-    /// In the tag's own order.
+    /// As found, in the tag's own order.
     corners: Quad,
-    edge: f32,
+    refined: Refined,
 }
 
 /// Where between the local minimum and maximum dark and light are divided, of 256. Low keeps a border whole
@@ -94,6 +95,7 @@ impl TagDetector {
             bits: Bitmap::default(),
             labeller: Labeller::default(),
             finder: QuadFinder::default(),
+            refiner: Refiner::default(),
             found: Vec::new(),
             negative: GrayImage::default(),
             noise: 0.0,
@@ -178,7 +180,8 @@ impl TagDetector {
                     continue;
                 }
                 let families = self.families.iter().filter(|f| f.inverted == inverted);
-                self.found.extend(families.filter_map(|f| decode(image, &self.pyramid, &quad, f)).next());
+                let found = families.filter_map(|f| decode(image, &self.pyramid, &quad, f, &mut self.refiner)).next();
+                self.found.extend(found);
             }
         }
     }
@@ -207,17 +210,27 @@ fn negate(image: ImageView<'_>, to: &mut GrayImage) {
     (0..image.height).for_each(|v| to.data.extend(image.row(v).iter().map(|p| !p)));
 }
 
-fn decode(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family: &Family) -> Option<Found> {
+fn decode(
+    image: ImageView<'_>,
+    pyramid: &Pyramid,
+    quad: &Quad,
+    family: &Family,
+    refiner: &mut Refiner,
+) -> Option<Found> {
     let reading = payload::read(image, pyramid, quad, family)?;
-    let corners: Quad = std::array::from_fn(|i| quad[(i + reading.word.turns) % 4]);
-    Some(Found {
-        family: family.family,
-        id: reading.word.id,
-        hamming: reading.word.hamming,
-        margin: reading.margin,
-        corners,
-        edge: mean_edge(quad),
-    })
+    let word = reading.word;
+    let corners: Quad = std::array::from_fn(|i| quad[(i + word.turns) % 4]);
+    let refined = refiner.refine(image, &corners, family, word.id).unwrap_or_else(|| unrefined(&corners));
+    Some(Found { family: family.family, word, margin: reading.margin, corners, refined })
+}
+
+/// Corners as the coarse fit left them: good to about a tenth of a cell.
+fn unrefined(corners: &Quad) -> Refined {
+    let corners = corners.map(|p| Vector2::new(f64::from(p[0]), f64::from(p[1])));
+    let sigma = 0.5 + 0.01 * (corners[2] - corners[0]).norm();
+    let cov = Matrix2::identity() * sigma * sigma;
+    let center = corners.iter().sum::<Vector2<f64>>() / 4.0;
+    Refined { corners, corner_cov: [cov; 4], center, center_cov: cov / 2.0 }
 }
 
 /// Whether two quadrilaterals are of one tag.
@@ -227,16 +240,16 @@ fn same_place(a: &Quad, b: &Quad) -> bool {
 }
 
 fn detection(found: &Found) -> MarkerDetection {
-    let corners = found.corners.map(|p| Vector2::new(f64::from(p[0]), f64::from(p[1])));
-    let center = corners.iter().sum::<Vector2<f64>>() / 4.0;
+    let refined = &found.refined;
+    let corners = refined.corners;
     MarkerDetection {
-        marker: MarkerId::Tag { family: found.family, id: found.id },
-        center_px: center,
-        center_cov_px2: Matrix2::identity() * 0.01,
+        marker: MarkerId::Tag { family: found.family, id: found.word.id },
+        center_px: refined.center,
+        center_cov_px2: refined.center_cov,
         corners_px: Some(corners),
-        corner_cov_px2: [Matrix2::identity() * 0.01; 4],
-        hamming: found.hamming,
+        corner_cov_px2: refined.corner_cov,
+        hamming: found.word.hamming,
         margin: found.margin,
-        size_px: f64::from(found.edge),
+        size_px: (0..4).map(|i| (corners[i] - corners[(i + 1) % 4]).norm()).sum::<f64>() / 4.0,
     }
 }
