@@ -258,11 +258,18 @@ mod tests {
             if seen[first] || !dark(u, v) {
                 continue;
             }
-            let mut c = Component { left: u as u16, right: u as u16, top: v as u16, bottom: v as u16, area: 0 };
+            let mut c =
+                Component { left: u as u16, right: u as u16, top: v as u16, bottom: v as u16, area: 0 };
             let mut stack = vec![(u, v)];
             seen[first] = true;
             while let Some((u, v)) = stack.pop() {
-                c.merge(&Component { left: u as u16, right: u as u16, top: v as u16, bottom: v as u16, area: 1 });
+                c.merge(&Component {
+                    left: u as u16,
+                    right: u as u16,
+                    top: v as u16,
+                    bottom: v as u16,
+                    area: 1,
+                });
                 for nv in v.saturating_sub(1)..(v + 2).min(bits.height) {
                     for nu in u.saturating_sub(1)..(u + 2).min(bits.width) {
                         if dark(nu, nv) && !seen[nv * bits.width + nu] {

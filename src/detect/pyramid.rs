@@ -119,12 +119,17 @@ mod tests {
     #[test]
     fn a_ramp_keeps_its_place() {
         let ramp = GrayImage::from_vec(60, 12, (0..720).map(|i| (i % 60 * 4) as u8).collect()).expect("size");
-        for (base, scales) in
-            [(Base::Half, vec![1.0, 2.0, 4.0]), (Base::TwoThirds, vec![1.0, 1.5, 3.0]), (Base::Full, vec![1.0, 2.0, 4.0])]
-        {
+        for (base, scales) in [
+            (Base::Half, vec![1.0, 2.0, 4.0]),
+            (Base::TwoThirds, vec![1.0, 1.5, 3.0]),
+            (Base::Full, vec![1.0, 2.0, 4.0]),
+        ] {
             let mut pyramid = Pyramid::default();
             pyramid.build(ramp.view(), base, 3, Simd::best());
-            assert_eq!((0..pyramid.len()).map(|n| pyramid.level(ramp.view(), n).scale).collect::<Vec<_>>(), scales);
+            assert_eq!(
+                (0..pyramid.len()).map(|n| pyramid.level(ramp.view(), n).scale).collect::<Vec<_>>(),
+                scales
+            );
             for n in 0..pyramid.len() {
                 let level = pyramid.level(ramp.view(), n);
                 for u in 0..level.image.width {

@@ -34,10 +34,8 @@ pub(super) fn may_be_border(c: &Component, limits: SizeLimits, width: usize, hei
     let shape_fits = short + 1.0 >= 0.55 * limits.least && short >= LEAST_ASPECT * long;
     // A border is a quarter to a half of its tag; of a large one only a rim is dark against what is near.
     let fill_fits = c.area as f32 >= (0.17 * w * h).min(2.0 * (w + h));
-    let inside = c.left > 0
-        && c.top > 0
-        && usize::from(c.right) + 1 < width
-        && usize::from(c.bottom) + 1 < height;
+    let inside =
+        c.left > 0 && c.top > 0 && usize::from(c.right) + 1 < width && usize::from(c.bottom) + 1 < height;
     size_fits && shape_fits && fill_fits && inside
 }
 

@@ -64,7 +64,13 @@ pub(super) struct Refiner {
 impl Refiner {
     /// Refines corners given in the tag's own order; `None` where too few edges are seen or the fit leaves
     /// what was given.
-    pub fn refine(&mut self, image: ImageView<'_>, corners: &Quad, family: &Family, id: u32) -> Option<Refined> {
+    pub fn refine(
+        &mut self,
+        image: ImageView<'_>,
+        corners: &Quad,
+        family: &Family,
+        id: u32,
+    ) -> Option<Refined> {
         let edge = (0..4).map(|i| distance(corners[i], corners[(i + 1) % 4])).sum::<f32>() / 4.0;
         let cell = f64::from(edge) / family.width as f64;
         self.place_points(family, id, cell);
@@ -109,7 +115,11 @@ impl Refiner {
                         let t = (k as f64 + 0.5) / per_cell as f64;
                         let sign = if b { 1.0 } else { -1.0 };
                         let along = (f64::from(y) + t) * scale - 1.0;
-                        self.points.push(EdgePoint { xi: f64::from(x) * scale - 1.0, eta: along, light: [sign, 0.0] });
+                        self.points.push(EdgePoint {
+                            xi: f64::from(x) * scale - 1.0,
+                            eta: along,
+                            light: [sign, 0.0],
+                        });
                     }
                 }
                 if let (Some(a), Some(b)) = (light(y, x - 1), light(y, x))
@@ -119,7 +129,11 @@ impl Refiner {
                         let t = (k as f64 + 0.5) / per_cell as f64;
                         let sign = if b { 1.0 } else { -1.0 };
                         let along = (f64::from(y) + t) * scale - 1.0;
-                        self.points.push(EdgePoint { xi: along, eta: f64::from(x) * scale - 1.0, light: [0.0, sign] });
+                        self.points.push(EdgePoint {
+                            xi: along,
+                            eta: f64::from(x) * scale - 1.0,
+                            light: [0.0, sign],
+                        });
                     }
                 }
             }
@@ -208,7 +222,8 @@ impl Model {
         }
         let s = 1.0 / moved[2];
         let mut theta = Row::zeros();
-        let entries = [h[0] * s, h[1] * s, moved[0] * s, h[3] * s, h[4] * s, moved[1] * s, h[6] * s, h[7] * s];
+        let entries =
+            [h[0] * s, h[1] * s, moved[0] * s, h[3] * s, h[4] * s, moved[1] * s, h[6] * s, h[7] * s];
         theta.rows_mut(0, 8).copy_from_slice(&entries);
         let unit = |a: usize, b: usize| {
             let d = Vector2::new(wide[b][0] - wide[a][0], wide[b][1] - wide[a][1]);

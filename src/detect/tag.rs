@@ -4,8 +4,8 @@ use super::binarise::{Binariser, Bitmap};
 use super::components::Labeller;
 use super::edges::{EdgeSearch, fit_sides};
 use super::family::{Family, Word};
-use super::payload;
 use super::noise::noise_sigma;
+use super::payload;
 use super::pyramid::{Base, Level, Pyramid};
 use super::quad::{Quad, QuadFinder, SizeLimits, border_is_dark, distance, may_be_border};
 use super::refine::{Refined, Refiner};
@@ -180,7 +180,8 @@ impl TagDetector {
                     continue;
                 }
                 let families = self.families.iter().filter(|f| f.inverted == inverted);
-                let found = families.filter_map(|f| decode(image, &self.pyramid, &quad, f, &mut self.refiner)).next();
+                let found =
+                    families.filter_map(|f| decode(image, &self.pyramid, &quad, f, &mut self.refiner)).next();
                 self.found.extend(found);
             }
         }
