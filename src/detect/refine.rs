@@ -78,8 +78,8 @@ impl Refiner {
         let bow = LENS_CURVATURE * f64::from(edge).powi(2) / 8.0;
         let mut information = Information::zeros();
         let mut variance = 0.0;
-        for round in 0..4 {
-            let half = if round == 0 { (0.7 * cell).clamp(1.5, 4.0) } else { (0.5 * cell).clamp(1.25, 2.5) };
+        for round in 0..6 {
+            let half = if round == 0 { (0.7 * cell).clamp(1.5, 6.0) } else { (0.5 * cell).clamp(1.25, 4.0) };
             self.locate(image, &model, half);
             if self.located.len() < 24 {
                 return None;
@@ -96,7 +96,7 @@ impl Refiner {
         let moved = (0..4).map(|i| {
             (refined.corners[i] - Vector2::new(f64::from(corners[i][0]), f64::from(corners[i][1]))).norm()
         });
-        (moved.fold(0.0, f64::max) < (0.8 * cell).max(2.0)).then_some(refined)
+        (moved.fold(0.0, f64::max) < (1.5 * cell).max(2.0)).then_some(refined)
     }
 
     /// Points along every edge between cells of different colour.
