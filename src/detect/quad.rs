@@ -237,15 +237,19 @@ fn nearest(image: ImageView<'_>, [u, v]: Point) -> Option<u8> {
 }
 
 /// Bilinear pixel value; coordinates are clamped to the image.
+#[inline]
 pub(super) fn bilinear(image: ImageView<'_>, [u, v]: Point) -> f32 {
+    if image.width < 2 || image.height < 2 {
+        return nearest(image, [u.clamp(0.0, (image.width - 1) as f32), v.clamp(0.0, (image.height - 1) as f32)])
+            .map_or(0.0, f32::from);
+    }
     let (u, v) = (u.clamp(0.0, (image.width - 1) as f32), v.clamp(0.0, (image.height - 1) as f32));
-    let (iu, iv) = ((u as usize).min(image.width.max(2) - 2), (v as usize).min(image.height.max(2) - 2));
+    let (iu, iv) = ((u as usize).min(image.width - 2), (v as usize).min(image.height - 2));
     let (fu, fv) = (u - iu as f32, v - iv as f32);
     let at = iv * image.stride + iu;
-    let right = usize::from(image.width > 1);
-    let down = if image.height > 1 { image.stride } else { 0 };
-    let p = |offset: usize| f32::from(image.data[at + offset]);
-    let top = p(0) + fu * (p(right) - p(0));
-    let bottom = p(down) + fu * (p(down + right) - p(down));
+    let (above, below) = (&image.data[at..at + 2], &image.data[at + image.stride..at + image.stride + 2]);
+    let p = [above[0], above[1], below[0], below[1]].map(f32::from);
+    let top = p[0] + fu * (p[1] - p[0]);
+    let bottom = p[2] + fu * (p[3] - p[2]);
     top + fv * (bottom - top)
 }

@@ -103,7 +103,7 @@ impl Refiner {
     fn place_points(&mut self, family: &Family, id: u32, cell: f64) {
         self.points.clear();
         let w = family.width as i32;
-        let per_cell = (cell / 1.2).clamp(2.0, 5.0) as usize;
+        let per_cell = (cell / 1.2).clamp(2.0, 4.0) as usize;
         let light = |x: i32, y: i32| family.is_light(id, x, y);
         let scale = 2.0 / f64::from(w);
         for y in 0..w {
@@ -275,39 +275,39 @@ impl Model {
 }
 
 /// Where along `n` from `p` the image steps up, pixels, and how strongly: the centre of mass of the
-/// gradient under a cos² window of half width `half`, which follows the centre it finds. A blurred edge is
+/// gradient under a biweight window of half width `half`, which follows the centre it finds. A blurred edge is
 /// symmetric, and so is the window: the centre is not biased by where the search began.
 fn edge_offset(image: ImageView<'_>, p: Vector2<f64>, n: Vector2<f64>, half: f64) -> Option<(f64, f64)> {
-    const MOST: usize = 32;
-    const SPACING: f64 = 0.5;
-    let reach = ((half * 1.5 / SPACING).ceil() as usize).min(MOST / 2 - 1);
+    const MOST: usize = 16;
+    let spacing = (half * 0.25).max(0.5);
+    let reach = ((half * 1.5 / spacing).ceil() as usize).min(MOST / 2 - 1);
     let count = 2 * reach + 1;
-    let far = p + n * (reach as f64 * SPACING);
-    let near = p - n * (reach as f64 * SPACING);
+    let far = p + n * (reach as f64 * spacing);
+    let near = p - n * (reach as f64 * spacing);
     let inside = |q: Vector2<f64>| {
         q.x >= 0.0 && q.y >= 0.0 && q.x <= (image.width - 1) as f64 && q.y <= (image.height - 1) as f64
     };
     if !(inside(far) && inside(near)) {
         return None;
     }
-    let mut gradients = [0.0f64; MOST];
-    let mut before = f64::from(bilinear(image, [near.x as f32, near.y as f32]));
+    let (start, step) = ([near.x as f32, near.y as f32], [(n.x * spacing) as f32, (n.y * spacing) as f32]);
+    let mut gradients = [0.0f32; MOST];
+    let mut before = bilinear(image, start);
     for (k, gradient) in gradients.iter_mut().enumerate().take(count - 1) {
-        let q = near + n * ((k + 1) as f64 * SPACING);
-        let value = f64::from(bilinear(image, [q.x as f32, q.y as f32]));
+        let along = (k + 1) as f32;
+        let value = bilinear(image, [start[0] + along * step[0], start[1] + along * step[1]]);
         *gradient = value - before;
         before = value;
     }
+    let (half, spacing) = (half as f32, spacing as f32);
     let (mut center, mut mass) = (0.0, 0.0);
     for _ in 0..3 {
         let (mut first, mut sum) = (0.0, 0.0);
         for (k, gradient) in gradients.iter().enumerate().take(count - 1) {
-            let d = (k as f64 + 0.5 - reach as f64) * SPACING - center;
-            if d.abs() < half {
-                let c = (std::f64::consts::FRAC_PI_2 * d / half).cos();
-                first += gradient * c * c * d;
-                sum += gradient * c * c;
-            }
+            let d = (k as f32 + 0.5 - reach as f32) * spacing - center;
+            let taper = (1.0 - (d / half) * (d / half)).max(0.0);
+            first += gradient * taper * taper * d;
+            sum += gradient * taper * taper;
         }
         if !(sum > 3.0) {
             return None;
@@ -318,5 +318,5 @@ fn edge_offset(image: ImageView<'_>, p: Vector2<f64>, n: Vector2<f64>, half: f64
             return None;
         }
     }
-    Some((center, mass))
+    Some((f64::from(center), f64::from(mass)))
 }
