@@ -240,8 +240,11 @@ fn nearest(image: ImageView<'_>, [u, v]: Point) -> Option<u8> {
 #[inline]
 pub(super) fn bilinear(image: ImageView<'_>, [u, v]: Point) -> f32 {
     if image.width < 2 || image.height < 2 {
-        return nearest(image, [u.clamp(0.0, (image.width - 1) as f32), v.clamp(0.0, (image.height - 1) as f32)])
-            .map_or(0.0, f32::from);
+        return nearest(
+            image,
+            [u.clamp(0.0, (image.width - 1) as f32), v.clamp(0.0, (image.height - 1) as f32)],
+        )
+        .map_or(0.0, f32::from);
     }
     let (u, v) = (u.clamp(0.0, (image.width - 1) as f32), v.clamp(0.0, (image.height - 1) as f32));
     let (iu, iv) = ((u as usize).min(image.width - 2), (v as usize).min(image.height - 2));
