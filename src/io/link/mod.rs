@@ -2,5 +2,30 @@
 //!
 //! `docs/link.md` describes the message format and what is guaranteed.
 
+mod backlog;
+mod endpoint;
+mod inbox;
 pub mod keys;
+mod live;
+mod pace;
+mod payload;
+mod ranges;
+mod receive;
+mod sense;
+mod session;
+mod station;
+mod thumbnail;
 pub mod tls;
+mod wire;
+
+pub use backlog::{Backlog, Extent, MemoryBacklog};
+pub use endpoint::{Door, Events, LinkError, LinkEvent, Peer};
+pub use inbox::{Inbox, Progress};
+pub use live::{Class, downlink_class};
+pub use payload::{LinkHandle, LinkStatus, PayloadLink, PayloadSettings, StationStatus};
+pub use ranges::RangeSet;
+pub use station::{
+    Arrival, Channel, FromPayload, OpenStation, PayloadStatus, Recall, StationHandle, StationLink,
+    StationSettings,
+};
+pub use thumbnail::Picture;

@@ -11,6 +11,12 @@ pub mod windhover {
     include!(concat!(env!("OUT_DIR"), "/windhover.rs"));
 }
 
+/// The messages of the wireless link.
+#[expect(missing_docs, reason = "documented where they are defined, in link.proto")]
+pub mod link {
+    include!(concat!(env!("OUT_DIR"), "/windhover.link.rs"));
+}
+
 use prost::Message as _;
 use prost_types::{FileDescriptorSet, Timestamp};
 

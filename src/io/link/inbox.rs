@@ -1,0 +1,213 @@
+//! What a station has of a payload: every number at most once, and what is still missing.
+
+use std::collections::BTreeMap;
+
+use super::ranges::RangeSet;
+use crate::io::proto::link as pb;
+
+/// Ranges asked for at once.
+const WANT_RANGES: usize = 64;
+/// Runs kept in mind; a payload that announces more is not believed.
+const RUNS: usize = 4_096;
+
+/// One run of a payload.
+#[derive(Clone, Debug, Default)]
+struct Run {
+    flight: String,
+    first: u32,
+    end: u32,
+    /// `end` as it was one and two looks ago: what is younger may still be on its way.
+    settled: [u32; 2],
+    have: RangeSet,
+    gone: RangeSet,
+    stored: RangeSet,
+}
+
+impl Run {
+    fn missing(&self) -> impl Iterator<Item = (u32, u32)> + '_ {
+        self.have.missing(self.first.max(self.gone_below()), self.settled[0])
+    }
+
+    /// Everything below this is gone or was never announced.
+    fn gone_below(&self) -> u32 {
+        self.gone.iter().next().filter(|&(first, _)| first == 0).map_or(0, |(_, end)| end)
+    }
+}
+
+/// How complete a station is for one payload.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub struct Progress {
+    /// Records received, once each.
+    pub received: u64,
+    /// Records known to exist and not received.
+    pub missing: u64,
+    /// Records that no longer exist on board.
+    pub gone: u64,
+    /// Records that came again and were dropped.
+    pub repeated: u64,
+}
+
+/// Everything a station knows of one payload's numbers.
+#[derive(Clone, Debug, Default)]
+pub struct Inbox {
+    runs: BTreeMap<u32, Run>,
+    repeated: u64,
+}
+
+impl Inbox {
+    /// The payload tells what it holds of a run. What a station kept of it in earlier lives is asked for
+    /// once (`recall`, by flight and run).
+    pub fn announce(&mut self, extent: &pb::Extent, recall: impl FnOnce(&str, u32) -> RangeSet) {
+        if !self.runs.contains_key(&extent.run) {
+            if self.runs.len() >= RUNS {
+                return;
+            }
+            let have = recall(&extent.flight, extent.run);
+            let run = Run { stored: have.clone(), have, flight: extent.flight.clone(), ..Run::default() };
+            self.runs.insert(extent.run, run);
+        }
+        if let Some(run) = self.runs.get_mut(&extent.run) {
+            run.first = extent.first;
+            run.end = run.end.max(extent.end);
+        }
+    }
+
+    /// Takes a number; tells whether it is new and the run is known.
+    pub fn take(&mut self, run: u32, number: u32) -> bool {
+        let Some(run) = self.runs.get_mut(&run) else { return false };
+        let fresh = run.have.insert(number);
+        self.repeated += u64::from(!fresh);
+        run.end = run.end.max(number.saturating_add(1));
+        fresh
+    }
+
+    /// These numbers no longer exist on board.
+    pub fn gone(&mut self, range: &pb::Range) {
+        let Some(run) = self.runs.get_mut(&range.run) else { return };
+        let end = range.end.min(run.end);
+        let missing: Vec<_> = run.have.missing(range.first, end).collect();
+        for (first, end) in missing {
+            run.gone.insert_range(first, end);
+            run.have.insert_range(first, end);
+            run.stored.insert_range(first, end);
+        }
+    }
+
+    /// Name of a run's flight.
+    pub fn flight(&self, run: u32) -> Option<&str> {
+        self.runs.get(&run).map(|run| run.flight.as_str())
+    }
+
+    /// These numbers are on the station's disk.
+    pub fn stored(&mut self, run: u32, numbers: &RangeSet) {
+        if let Some(run) = self.runs.get_mut(&run) {
+            run.stored.union(numbers);
+        }
+    }
+
+    /// What to tell the payload as stored. The ranges of the oldest numbers are enough for its cursor.
+    pub fn stored_message(&self) -> pb::Stored {
+        let ranges = self.runs.iter().flat_map(|(run, r)| {
+            r.stored.iter().take(4).map(|(first, end)| pb::Range { run: *run, first, end })
+        });
+        pb::Stored { ranges: ranges.take(WANT_RANGES).collect() }
+    }
+
+    /// What to ask for: everything missing that had time to come by itself, oldest first. Each call is a
+    /// look: what appeared since the last but one is given time.
+    pub fn want(&mut self) -> pb::Want {
+        for run in self.runs.values_mut() {
+            run.settled = [run.settled[1], run.end];
+        }
+        let ranges = self
+            .runs
+            .iter()
+            .flat_map(|(run, r)| r.missing().map(|(first, end)| pb::Range { run: *run, first, end }));
+        pb::Want { ranges: ranges.take(WANT_RANGES).collect() }
+    }
+
+    /// How complete it is.
+    pub fn progress(&self) -> Progress {
+        let mut progress = Progress { repeated: self.repeated, ..Progress::default() };
+        for run in self.runs.values() {
+            progress.gone += run.gone.len();
+            progress.received += run.have.len() - run.gone.len();
+            progress.missing += run
+                .have
+                .missing(run.first.max(run.gone_below()), run.end)
+                .map(|(f, e)| u64::from(e - f))
+                .sum::<u64>();
+        }
+        progress
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn extent(first: u32, end: u32) -> pb::Extent {
+        pb::Extent { run: 5, flight: "boot-5".into(), first, end }
+    }
+
+    fn ranges(want: &pb::Want) -> Vec<(u32, u32)> {
+        want.ranges.iter().map(|r| (r.first, r.end)).collect()
+    }
+
+    #[test]
+    fn what_is_young_is_given_time_and_what_is_missing_is_asked_for() {
+        let mut inbox = Inbox::default();
+        inbox.announce(&extent(0, 10), |_, _| RangeSet::of(0, 3));
+        assert!(ranges(&inbox.want()).is_empty(), "a first look asks for nothing");
+        assert!(inbox.take(5, 12), "live");
+        assert!(!inbox.take(5, 12), "the same again");
+        assert!(!inbox.take(5, 1), "stored in an earlier life");
+        assert_eq!(ranges(&inbox.want()), [(3, 10)]);
+        assert_eq!(ranges(&inbox.want()), [(3, 12)]);
+        for number in 3..9 {
+            assert!(inbox.take(5, number));
+        }
+        inbox.gone(&pb::Range { run: 5, first: 9, end: 12 });
+        assert!(ranges(&inbox.want()).is_empty());
+        let progress = inbox.progress();
+        assert_eq!((progress.received, progress.missing, progress.gone, progress.repeated), (10, 0, 3, 2));
+    }
+
+    #[test]
+    fn a_payload_cannot_make_it_grow_without_bound_or_declare_the_future_gone() {
+        let mut inbox = Inbox::default();
+        for run in 0..2 * RUNS as u32 {
+            inbox.announce(&pb::Extent { run, ..extent(0, 1) }, |_, _| RangeSet::new());
+        }
+        assert_eq!(inbox.runs.len(), RUNS);
+        inbox.gone(&pb::Range { run: 0, first: 0, end: u32::MAX });
+        assert!(inbox.take(0, 1), "only what was announced can be gone");
+    }
+
+    #[test]
+    fn stored_is_what_is_on_disk_only() {
+        let mut inbox = Inbox::default();
+        inbox.announce(&extent(0, 10), |_, _| RangeSet::new());
+        for number in 0..6 {
+            inbox.take(5, number);
+        }
+        inbox.stored(5, &RangeSet::of(0, 4));
+        assert_eq!(inbox.stored_message().ranges, [pb::Range { run: 5, first: 0, end: 4 }]);
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn nothing_is_taken_twice(numbers in proptest::collection::vec(0_u32..50, 0..200)) {
+            let mut inbox = Inbox::default();
+            inbox.announce(&extent(0, 0), |_, _| RangeSet::new());
+            let mut taken = std::collections::BTreeSet::new();
+            for number in numbers {
+                proptest::prop_assert_eq!(inbox.take(5, number), taken.insert(number));
+            }
+            let progress = inbox.progress();
+            proptest::prop_assert_eq!(progress.received, taken.len() as u64);
+            let end = taken.last().map_or(0, |n| u64::from(*n) + 1);
+            proptest::prop_assert_eq!(progress.received + progress.missing, end);
+        }
+    }
+}

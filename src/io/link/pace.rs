@@ -1,0 +1,230 @@
+//! How much may be sent now: a bandwidth ceiling, and what the path is found to carry.
+//!
+//! Both are buckets that may go into debt by one message: sending is allowed while the balance is not
+//! negative, so an estimate never waits for more than the message before it.
+
+use std::time::Duration;
+
+use tokio::time::Instant;
+
+use super::sense::Noted;
+
+/// Standing delay in the path above which less is sent. Under the 150 ms that live data may be late at,
+/// above the 25 ms by which a receiver may delay its acknowledgement (RFC 9000, 18.2).
+const QUEUE_LIMIT: Duration = Duration::from_millis(40);
+/// Standing delay below which more is tried.
+const QUEUE_EMPTY: Duration = Duration::from_millis(15);
+/// Where the search begins, bytes a second: carries two vehicles at 15 Hz over the slowest radios.
+const RATE_AT_START: f64 = 10_000.0;
+/// Never less than this, bytes a second: it finds out when the path is back.
+const RATE_LEAST: f64 = 1_500.0;
+/// Never more than this, bytes a second.
+const RATE_MOST: f64 = 50e6;
+/// Silence after which the path counts as cut.
+const SILENCE: Duration = Duration::from_millis(600);
+/// How long the least round-trip time is remembered: twice this at most.
+const BASE_MEMORY: Duration = Duration::from_secs(30);
+
+/// A token bucket that may go into debt.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Bucket {
+    rate: f64,
+    balance: f64,
+    filled: Instant,
+}
+
+impl Bucket {
+    /// Fills at `rate` bytes a second.
+    pub fn new(rate: f64, now: Instant) -> Self {
+        Self { rate, balance: 0.0, filled: now }
+    }
+
+    fn fill(&mut self, now: Instant) {
+        let passed = now.saturating_duration_since(self.filled).as_secs_f64();
+        self.filled = now;
+        // A burst of at most 10 ms, or one packet, is saved up.
+        let most = (self.rate * 0.01).max(100.0);
+        self.balance = (self.balance + passed * self.rate).min(most);
+    }
+
+    /// Time until sending is allowed; zero when it is.
+    pub fn delay(&mut self, now: Instant) -> Duration {
+        self.fill(now);
+        Duration::from_secs_f64((-self.balance / self.rate).max(0.0))
+    }
+
+    /// Takes what was sent.
+    pub fn charge(&mut self, bytes: f64) {
+        self.balance -= bytes;
+    }
+}
+
+/// Finds what a path carries from the delays and losses on it.
+#[derive(Clone, Debug)]
+pub struct Governor {
+    bucket: Bucket,
+    updated: Instant,
+    heard: Instant,
+    delivered: f64,
+    base: [Option<Duration>; 2],
+    base_turned: Instant,
+    queue: Duration,
+    limited: bool,
+    cut: bool,
+}
+
+impl Governor {
+    /// At the beginning of a connection.
+    pub fn new(now: Instant) -> Self {
+        Self {
+            bucket: Bucket::new(RATE_AT_START, now),
+            updated: now,
+            heard: now,
+            delivered: RATE_AT_START,
+            base: [None; 2],
+            base_turned: now,
+            queue: Duration::ZERO,
+            limited: false,
+            cut: false,
+        }
+    }
+
+    /// Bytes a second allowed now.
+    pub fn rate(&self) -> f64 {
+        self.bucket.rate
+    }
+
+    /// Whether the path seems cut: nothing was acknowledged for a while.
+    pub fn is_cut(&self) -> bool {
+        self.cut
+    }
+
+    /// Time until sending is allowed.
+    pub fn delay(&mut self, now: Instant) -> Duration {
+        let delay = self.bucket.delay(now);
+        self.limited |= !delay.is_zero();
+        delay
+    }
+
+    /// Takes what was sent.
+    pub fn charge(&mut self, bytes: f64) {
+        self.bucket.charge(bytes);
+    }
+
+    /// Learns from what was noted since the last call; call it about ten times a second.
+    pub fn update(&mut self, noted: Noted, now: Instant) {
+        let passed = now.saturating_duration_since(self.updated).as_secs_f64().clamp(1e-3, 1.0);
+        self.updated = now;
+        let limited = std::mem::take(&mut self.limited);
+        if noted.acked == 0 {
+            if !self.cut && now.saturating_duration_since(self.heard) > SILENCE + self.queue {
+                self.cut = true;
+                // What was found before may be much more than what comes after.
+                self.set_rate(self.bucket.rate.min(1.5 * RATE_AT_START));
+            }
+            return;
+        }
+        self.heard = now;
+        self.cut = false;
+        let weight = 1.0 - (-passed / 0.3).exp();
+        self.delivered += weight * (noted.acked as f64 / passed - self.delivered);
+        if let Some(rtt) = noted.least_rtt {
+            self.learn_queue(rtt, now);
+        }
+        let lossy = noted.lost > noted.acked;
+        if self.queue > QUEUE_LIMIT || lossy {
+            self.set_rate(self.bucket.rate.min(self.delivered) * if lossy { 1.0 } else { 0.85 });
+        } else if limited && self.queue < QUEUE_EMPTY {
+            let grown = self.bucket.rate * (1.0 + passed);
+            self.set_rate(grown.min(self.bucket.rate.max(1.5 * self.delivered + 1_000.0)));
+        }
+    }
+
+    /// Delay above the least round-trip time of the last half to whole minute.
+    fn learn_queue(&mut self, rtt: Duration, now: Instant) {
+        if now.saturating_duration_since(self.base_turned) > BASE_MEMORY {
+            self.base_turned = now;
+            self.base = [self.base[1], None];
+        }
+        self.base[1] = Some(self.base[1].map_or(rtt, |least| least.min(rtt)));
+        let base = self.base.iter().flatten().min().copied().unwrap_or(rtt);
+        self.queue = rtt.saturating_sub(base);
+    }
+
+    fn set_rate(&mut self, rate: f64) {
+        self.bucket.rate = rate.clamp(RATE_LEAST, RATE_MOST);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(start: Instant, ms: u64) -> Instant {
+        start + Duration::from_millis(ms)
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_bucket_passes_its_rate_and_no_more() {
+        let start = Instant::now();
+        let mut bucket = Bucket::new(6_000.0, start);
+        let mut sent = 0.0;
+        for ms in 0..10_000 {
+            if bucket.delay(at(start, ms)).is_zero() {
+                bucket.charge(240.0);
+                sent += 240.0;
+            }
+        }
+        assert!((59_000.0..=60_500.0).contains(&sent), "{sent} bytes in 10 s");
+    }
+
+    /// A path with a queue: `capacity` bytes a second, `rtt` without queue. Gives the rate found and the
+    /// greatest standing delay after the first five seconds.
+    fn run(capacity: f64, rtt_ms: f64, seconds: u64, start: Instant) -> (f64, f64) {
+        let mut governor = Governor::new(start);
+        let (mut queued, mut worst) = (0.0_f64, 0.0_f64);
+        for tick in 1..=seconds * 10 {
+            let now = at(start, tick * 100);
+            // Everything the bucket allows is sent in messages of 240 bytes.
+            let mut offered = 0.0;
+            while governor.delay(now).is_zero() && offered < 1e6 {
+                governor.charge(240.0);
+                offered += 240.0;
+            }
+            let rate = governor.rate();
+            let offered = offered.max(rate * 0.1);
+            let served = (queued + offered).min(capacity * 0.1);
+            queued += offered - served;
+            let delay_ms = queued / capacity * 1e3;
+            if tick > 50 {
+                worst = worst.max(delay_ms);
+            }
+            let rtt = Duration::from_secs_f64((rtt_ms + delay_ms) * 1e-3);
+            governor.update(Noted { acked: served as u64, lost: 0, least_rtt: Some(rtt) }, now);
+        }
+        (governor.rate(), worst)
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn the_governor_finds_slow_and_fast_paths() {
+        let start = Instant::now();
+        let (rate, worst) = run(6_000.0, 20.0, 60, start);
+        assert!((3_500.0..9_000.0).contains(&rate), "{rate} bytes/s on a path of 6000");
+        assert!(worst < 130.0, "{worst} ms of standing delay");
+        let (rate, _) = run(1e6, 20.0, 60, start);
+        assert!(rate > 4e5, "{rate} bytes/s on a path of 1e6");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn silence_is_a_cut_and_an_acknowledgement_ends_it() {
+        let start = Instant::now();
+        let mut governor = Governor::new(start);
+        for tick in 1..20 {
+            governor.update(Noted::default(), at(start, tick * 100));
+        }
+        assert!(governor.is_cut());
+        let rtt = Some(Duration::from_millis(10));
+        governor.update(Noted { acked: 100, lost: 0, least_rtt: rtt }, at(start, 2_000));
+        assert!(!governor.is_cut() && governor.rate() >= RATE_LEAST);
+    }
+}

@@ -1,0 +1,99 @@
+//! What the acknowledgements of a QUIC connection tell about its path.
+//!
+//! QUIC's own congestion window is opened wide: a window that shrinks on loss would hold estimates back
+//! on a lossy radio, and one that fills during a cut would hold them back after it. What is sent is
+//! limited by [`super::pace`] instead, from the round-trip times and losses noted here.
+
+use std::any::Any;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use quinn::congestion::{Controller, ControllerFactory};
+
+/// Wide enough never to hold anything back; the pacer of QUIC is idle above 2³² bytes.
+const WINDOW: u64 = 1 << 40;
+
+/// What was noted since the last [`Sense::take`].
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub struct Noted {
+    /// Bytes acknowledged.
+    pub acked: u64,
+    /// Bytes given up as lost.
+    pub lost: u64,
+    /// Least round-trip time among the acknowledged packets.
+    pub least_rtt: Option<Duration>,
+}
+
+/// Shared notes of one connection's path.
+#[derive(Clone, Debug, Default)]
+pub struct Sense(Arc<Mutex<Noted>>);
+
+impl Sense {
+    fn notes(&self) -> MutexGuard<'_, Noted> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// What was noted since the last call.
+    pub fn take(&self) -> Noted {
+        std::mem::take(&mut *self.notes())
+    }
+
+    /// The notes of a connection's present path.
+    pub fn of(connection: &quinn::Connection) -> Option<Self> {
+        let controller = connection.congestion_state().into_any().downcast::<SenseController>().ok()?;
+        Some(controller.sense)
+    }
+}
+
+/// Makes a controller for each path.
+#[derive(Debug, Default)]
+pub struct SenseFactory;
+
+impl ControllerFactory for SenseFactory {
+    fn build(self: Arc<Self>, _now: Instant, _mtu: u16) -> Box<dyn Controller> {
+        Box::new(SenseController::default())
+    }
+}
+
+#[derive(Clone, Debug, Default)]
+struct SenseController {
+    sense: Sense,
+}
+
+impl Controller for SenseController {
+    fn on_ack(
+        &mut self,
+        now: Instant,
+        sent: Instant,
+        bytes: u64,
+        _app_limited: bool,
+        _rtt: &quinn_proto::RttEstimator,
+    ) {
+        let rtt = now.saturating_duration_since(sent);
+        let mut notes = self.sense.notes();
+        notes.acked += bytes;
+        notes.least_rtt = Some(notes.least_rtt.map_or(rtt, |least| least.min(rtt)));
+    }
+
+    fn on_congestion_event(&mut self, _now: Instant, _sent: Instant, _persistent: bool, lost: u64) {
+        self.sense.notes().lost += lost;
+    }
+
+    fn on_mtu_update(&mut self, _mtu: u16) {}
+
+    fn window(&self) -> u64 {
+        WINDOW
+    }
+
+    fn clone_box(&self) -> Box<dyn Controller> {
+        Box::new(self.clone())
+    }
+
+    fn initial_window(&self) -> u64 {
+        WINDOW
+    }
+
+    fn into_any(self: Box<Self>) -> Box<dyn Any> {
+        self
+    }
+}

@@ -1,0 +1,280 @@
+//! The station's side of the link: payloads come in or are called; records come out, each once.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use quinn::{Connection, VarInt};
+use tokio::sync::{Notify, mpsc, watch};
+use tokio::time::Instant;
+
+use super::endpoint::{Door, Events, LinkError, LinkEvent, Peer, close};
+use super::inbox::{Inbox, Progress};
+use super::keys::Role;
+use super::ranges::RangeSet;
+use super::receive;
+use super::tls::KeyFiles;
+use crate::io::proto::link::Thumbnail;
+use crate::time::MonoTime;
+
+/// What a station's side of the link is made of.
+#[derive(Clone, Debug)]
+pub struct StationSettings {
+    /// Certificates and keys.
+    pub files: KeyFiles,
+    /// Where payloads that call reach the station.
+    pub listen: Option<SocketAddr>,
+    /// Payloads the station calls.
+    pub dial: Vec<String>,
+    /// Whether it wants thumbnails.
+    pub thumbnails: bool,
+}
+
+/// Topic and schema of what arrives.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct Channel {
+    /// Topic of the flight.
+    pub topic: String,
+    /// Name of the schema.
+    pub schema_name: String,
+    /// The schema as the payload has it; empty where it is the station's own of this name.
+    pub schema: Vec<u8>,
+}
+
+/// A record that arrived for the first time.
+#[derive(Clone, Debug)]
+pub struct Arrival {
+    /// Name of the payload.
+    pub payload: Arc<str>,
+    /// Run of the payload.
+    pub run: u32,
+    /// Name of the run's flight.
+    pub flight: Arc<str>,
+    /// Its number in the run.
+    pub number: u32,
+    /// Topic and schema.
+    pub channel: Arc<Channel>,
+    /// Log clock, the payload's host time.
+    pub log_time: MonoTime,
+    /// When it was true, the payload's host time.
+    pub publish_time: MonoTime,
+    /// The protobuf message.
+    pub data: Vec<u8>,
+    /// Whether it came live, not as back-fill.
+    pub live: bool,
+    /// When it arrived.
+    pub arrived: Instant,
+}
+
+/// What comes out of a station's link.
+#[derive(Clone, Debug)]
+pub enum FromPayload {
+    /// A record, for the first time.
+    Record(Arrival),
+    /// A thumbnail of a payload's camera image.
+    Thumbnail {
+        /// Name of the payload.
+        payload: Arc<str>,
+        /// It.
+        thumbnail: Thumbnail,
+    },
+}
+
+/// What of a run the station kept in earlier lives: by payload, flight and run.
+pub type Recall = Arc<dyn Fn(&str, &str, u32) -> RangeSet + Send + Sync>;
+
+/// How the link to one payload does.
+#[derive(Clone, PartialEq, Debug)]
+pub struct PayloadStatus {
+    /// Its name.
+    pub name: String,
+    /// Whether it is connected.
+    pub connected: bool,
+    /// Where it is, or was last.
+    pub address: SocketAddr,
+    /// Round-trip time, ms.
+    pub rtt_ms: f64,
+    /// Time since anything was heard.
+    pub silent: Duration,
+    /// Bytes received on this connection.
+    pub bytes: u64,
+    /// Records received live.
+    pub live: u64,
+    /// Program and version on board.
+    pub software: String,
+    /// How complete the station is.
+    pub progress: Progress,
+}
+
+pub(super) struct PayloadState {
+    pub(super) inbox: Mutex<Inbox>,
+    pub(super) stored: Notify,
+    pub(super) status: Mutex<PayloadStatus>,
+    pub(super) heard: Mutex<Instant>,
+    connection: Mutex<Connection>,
+}
+
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+pub(super) struct Shared {
+    payloads: Mutex<BTreeMap<String, Arc<PayloadState>>>,
+    pub(super) recall: Recall,
+    pub(super) records: mpsc::Sender<FromPayload>,
+    pub(super) thumbnails: bool,
+    refusals: std::sync::atomic::AtomicU64,
+}
+
+/// Gives the link what it must know of the disk, and tells how it does.
+#[derive(Clone)]
+pub struct StationHandle {
+    shared: Arc<Shared>,
+}
+
+impl StationHandle {
+    /// Numbers of a run are on disk: the payload is told, and may forget them.
+    pub fn stored(&self, payload: &str, run: u32, numbers: &RangeSet) {
+        let state = lock(&self.shared.payloads).get(payload).cloned();
+        if let Some(state) = state {
+            lock(&state.inbox).stored(run, numbers);
+            state.stored.notify_one();
+        }
+    }
+
+    /// How the link to every payload does that was ever connected.
+    pub fn status(&self) -> Vec<PayloadStatus> {
+        let states: Vec<_> = lock(&self.shared.payloads).values().cloned().collect();
+        let of = |state: Arc<PayloadState>| {
+            let mut status = lock(&state.status).clone();
+            let connection = lock(&state.connection).clone();
+            status.connected &= connection.close_reason().is_none();
+            status.rtt_ms = connection.rtt().as_secs_f64() * 1e3;
+            status.address = connection.remote_address();
+            status.bytes = connection.stats().udp_rx.bytes;
+            status.silent = lock(&state.heard).elapsed();
+            status.progress = lock(&state.inbox).progress();
+            status
+        };
+        states.into_iter().map(of).collect()
+    }
+
+    /// Handshakes refused since the start.
+    pub fn refusals(&self) -> u64 {
+        self.shared.refusals.load(std::sync::atomic::Ordering::Relaxed)
+    }
+}
+
+/// The station's side of the link, opened.
+pub struct StationLink {
+    door: Door,
+    dial: Vec<String>,
+    shared: Arc<Shared>,
+    arrivals: mpsc::Receiver<Peer>,
+    events: Events,
+}
+
+/// What [`StationLink::open`] gives: the link to run, its handle, records, events.
+pub type OpenStation = (StationLink, StationHandle, mpsc::Receiver<FromPayload>, mpsc::Receiver<LinkEvent>);
+
+impl StationLink {
+    /// Opens the port.
+    pub fn open(settings: &StationSettings, recall: Recall) -> Result<OpenStation, LinkError> {
+        let (event_sender, event_receiver) = mpsc::channel(256);
+        let events = Events::new(event_sender);
+        let (sender, arrivals) = mpsc::channel(16);
+        let door = Door::open(Role::Station, &settings.files, settings.listen, events.clone(), sender)?;
+        let (records, record_receiver) = mpsc::channel(1_024);
+        let shared = Arc::new(Shared {
+            payloads: Mutex::default(),
+            recall,
+            records,
+            thumbnails: settings.thumbnails,
+            refusals: std::sync::atomic::AtomicU64::new(0),
+        });
+        let handle = StationHandle { shared: Arc::clone(&shared) };
+        let link = Self { door, dial: settings.dial.clone(), shared, arrivals, events };
+        Ok((link, handle, record_receiver, event_receiver))
+    }
+
+    /// The UDP port it has.
+    pub fn local_addr(&self) -> std::io::Result<SocketAddr> {
+        self.door.local_addr()
+    }
+
+    /// Receives until `stop` says so (or its sender is gone).
+    pub async fn run(mut self, mut stop: watch::Receiver<bool>) {
+        let mut tasks = tokio::task::JoinSet::new();
+        tasks.spawn(self.door.clone().listen());
+        tasks.spawn(self.door.clone().watch_keys());
+        for address in self.dial.drain(..) {
+            tasks.spawn(self.door.clone().dial(address));
+        }
+        loop {
+            self.shared.refusals.store(self.events.refusals(), std::sync::atomic::Ordering::Relaxed);
+            tokio::select! {
+                peer = self.arrivals.recv() => {
+                    let Some(peer) = peer else { break };
+                    self.welcome(peer, &mut tasks);
+                }
+                _ = stop.wait_for(|stop| *stop) => break,
+                () = tokio::time::sleep(Duration::from_millis(500)) => {}
+            }
+            while tasks.try_join_next().is_some() {}
+        }
+        self.door.shut().await;
+    }
+
+    /// The state of a payload, made when it first comes; and whether an older connection was still open.
+    fn state_of(&self, peer: &Peer) -> (Arc<PayloadState>, bool) {
+        let mut payloads = lock(&self.shared.payloads);
+        if let Some(state) = payloads.get(&peer.name) {
+            let old = std::mem::replace(&mut *lock(&state.connection), peer.connection.clone());
+            let was_up = old.close_reason().is_none();
+            old.close(VarInt::from_u32(close::SUPERSEDED), b"a newer connection took over");
+            lock(&state.status).connected = true;
+            *lock(&state.heard) = Instant::now();
+            return (Arc::clone(state), was_up);
+        }
+        let status = PayloadStatus {
+            name: peer.name.clone(),
+            connected: true,
+            address: peer.connection.remote_address(),
+            rtt_ms: 0.0,
+            silent: Duration::ZERO,
+            bytes: 0,
+            live: 0,
+            software: String::new(),
+            progress: Progress::default(),
+        };
+        let state = Arc::new(PayloadState {
+            inbox: Mutex::default(),
+            stored: Notify::new(),
+            status: Mutex::new(status),
+            heard: Mutex::new(Instant::now()),
+            connection: Mutex::new(peer.connection.clone()),
+        });
+        payloads.insert(peer.name.clone(), Arc::clone(&state));
+        (state, false)
+    }
+
+    fn welcome(&self, peer: Peer, tasks: &mut tokio::task::JoinSet<()>) {
+        let (state, was_up) = self.state_of(&peer);
+        let (shared, events) = (Arc::clone(&self.shared), self.events.clone());
+        tasks.spawn(async move {
+            let up = || {
+                if !was_up {
+                    let address = peer.connection.remote_address();
+                    events.tell(LinkEvent::Up { peer: peer.name.clone(), address });
+                }
+            };
+            let ended = receive::receive(&shared, &state, &peer, up).await;
+            let ours = lock(&state.connection).stable_id() == peer.connection.stable_id();
+            if ours {
+                lock(&state.status).connected = false;
+                events.ended(&peer, ended);
+            }
+        });
+    }
+}
