@@ -7,6 +7,7 @@ pub mod devices;
 pub mod events;
 pub mod export;
 pub mod flight;
+pub mod ground;
 pub mod health;
 pub mod inbox;
 pub mod log;

@@ -7,6 +7,7 @@ mod detect;
 mod error;
 mod export;
 mod generate;
+mod ground;
 mod keys;
 mod montecarlo;
 mod replay;
@@ -46,6 +47,8 @@ enum Command {
     CheckConfig(check_config::Args),
     /// Decode a raw serial log of a GPS receiver or a compass
     Decode(decode::Args),
+    /// Receive from payloads: keep their flights, show them on a web page, feed other programs
+    Ground(ground::Args),
     /// Make the certificates with which payloads and ground stations know each other
     Keys(keys::Args),
     /// Predict how well the ground is located from here: the paper's error analysis
@@ -79,6 +82,7 @@ pub fn main() -> ExitCode {
         Command::Run(args) => run::run(&args),
         Command::CheckConfig(args) => check_config::run(&args),
         Command::Decode(args) => decode::run(&args),
+        Command::Ground(args) => ground::run(&args),
         Command::Keys(args) => keys::run(&args),
         Command::Montecarlo(args) => montecarlo::run(&args),
         Command::Report(args) => report::run(&args),

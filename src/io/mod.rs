@@ -15,3 +15,4 @@ pub mod proto;
 pub mod records;
 pub mod serial;
 pub mod store;
+pub mod mavlink;

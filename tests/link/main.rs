@@ -2,6 +2,7 @@
 
 mod refused;
 mod relay;
+mod station;
 mod team;
 
 use std::sync::Arc;

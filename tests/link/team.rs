@@ -17,7 +17,7 @@ use windhover::io::link::{
 use windhover::io::records::{Record, Schema};
 use windhover::time::UtcTime;
 
-/// 2026-11-18T00:00:00Z: when the tests' certificates are made.
+/// 2026-11-19T00:00:00Z: when the tests' certificates are made.
 pub const MADE: UtcTime = UtcTime::from_unix_ns(1_795_046_400_000_000_000);
 
 /// An authority in a temporary directory.

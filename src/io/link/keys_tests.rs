@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// 2026-11-18T00:00:00Z.
+/// 2026-11-19T00:00:00Z.
 const NOW: UtcTime = UtcTime::from_unix_ns(1_795_046_400_000_000_000);
 
 fn authority() -> (tempfile::TempDir, Authority) {

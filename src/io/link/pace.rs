@@ -164,8 +164,8 @@ mod tests {
         start + Duration::from_millis(ms)
     }
 
-    #[tokio::test(start_paused = true)]
-    async fn a_bucket_passes_its_rate_and_no_more() {
+    #[test]
+    fn a_bucket_passes_its_rate_and_no_more() {
         let start = Instant::now();
         let mut bucket = Bucket::new(6_000.0, start);
         let mut sent = 0.0;
@@ -186,7 +186,7 @@ mod tests {
         for tick in 1..=seconds * 10 {
             let now = at(start, tick * 100);
             // Everything the bucket allows is sent in messages of 240 bytes.
-            let mut offered = 0.0;
+            let mut offered = 0.0_f64;
             while governor.delay(now).is_zero() && offered < 1e6 {
                 governor.charge(240.0);
                 offered += 240.0;
@@ -205,8 +205,8 @@ mod tests {
         (governor.rate(), worst)
     }
 
-    #[tokio::test(start_paused = true)]
-    async fn the_governor_finds_slow_and_fast_paths() {
+    #[test]
+    fn the_governor_finds_slow_and_fast_paths() {
         let start = Instant::now();
         let (rate, worst) = run(6_000.0, 20.0, 60, start);
         assert!((3_500.0..9_000.0).contains(&rate), "{rate} bytes/s on a path of 6000");
@@ -215,8 +215,8 @@ mod tests {
         assert!(rate > 4e5, "{rate} bytes/s on a path of 1e6");
     }
 
-    #[tokio::test(start_paused = true)]
-    async fn silence_is_a_cut_and_an_acknowledgement_ends_it() {
+    #[test]
+    fn silence_is_a_cut_and_an_acknowledgement_ends_it() {
         let start = Instant::now();
         let mut governor = Governor::new(start);
         for tick in 1..20 {

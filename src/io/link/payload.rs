@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -96,6 +96,14 @@ pub struct LinkStatus {
     pub backlog_bytes: usize,
 }
 
+/// A station's latest connection.
+struct Connected {
+    connection: Connection,
+    status: StationStatus,
+    /// Whether the operator was told that it is up; a connection that takes over inherits it.
+    told: Arc<AtomicBool>,
+}
+
 /// What the sessions share.
 pub(super) struct Shared {
     pub(super) recent: MemoryBacklog,
@@ -105,7 +113,7 @@ pub(super) struct Shared {
     pub(super) thumbnail_width: u32,
     pub(super) picture: watch::Sender<Option<Arc<Picture>>>,
     end: watch::Sender<u32>,
-    stations: Mutex<BTreeMap<String, (Connection, StationStatus)>>,
+    stations: Mutex<BTreeMap<String, Connected>>,
     refused: AtomicU64,
 }
 
@@ -115,7 +123,7 @@ impl Shared {
         self.end.subscribe()
     }
 
-    fn stations(&self) -> MutexGuard<'_, BTreeMap<String, (Connection, StationStatus)>> {
+    fn stations(&self) -> MutexGuard<'_, BTreeMap<String, Connected>> {
         self.stations.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -158,8 +166,8 @@ impl Shared {
     }
 
     pub(super) fn note_status(&self, status: StationStatus) {
-        if let Some((_, kept)) = self.stations().get_mut(&status.name) {
-            *kept = status;
+        if let Some(connected) = self.stations().get_mut(&status.name) {
+            connected.status = status;
         }
     }
 }
@@ -195,7 +203,7 @@ impl LinkHandle {
     /// How the link does, for the health line.
     pub fn status(&self) -> LinkStatus {
         LinkStatus {
-            stations: self.shared.stations().values().map(|(_, status)| status.clone()).collect(),
+            stations: self.shared.stations().values().map(|c| c.status.clone()).collect(),
             refused: self.shared.refused.load(Ordering::Relaxed),
             records: self.shared.recent.end(),
             backlog_bytes: self.shared.recent.bytes(),
@@ -282,22 +290,31 @@ impl PayloadLink {
             wanted: 0,
         };
         let connection = peer.connection.clone();
-        let old = self.shared.stations().insert(peer.name.clone(), (connection.clone(), status));
-        let was_up = old.as_ref().is_some_and(|(old, _)| old.close_reason().is_none());
-        if let Some((old, _)) = old {
-            old.close(VarInt::from_u32(close::SUPERSEDED), b"a newer connection took over");
-        }
+        let told = {
+            let mut stations = self.shared.stations();
+            let old = stations.remove(&peer.name);
+            let open = old.as_ref().filter(|old| old.connection.close_reason().is_none());
+            let told = open.map_or_else(Arc::default, |old| Arc::clone(&old.told));
+            if let Some(old) = old {
+                let code = VarInt::from_u32(close::SUPERSEDED);
+                old.connection.close(code, b"a newer connection took over");
+            }
+            let connected = Connected { connection: connection.clone(), status, told: Arc::clone(&told) };
+            stations.insert(peer.name.clone(), connected);
+            told
+        };
         let (shared, events) = (Arc::clone(&self.shared), self.events.clone());
         tasks.spawn(async move {
             let up = || {
-                if !was_up {
+                if !told.swap(true, Ordering::Relaxed) {
                     let address = peer.connection.remote_address();
                     events.tell(LinkEvent::Up { peer: peer.name.clone(), address });
                 }
             };
             let ended = session::serve(&shared, &peer, up).await;
             let mut stations = shared.stations();
-            let ours = stations.get(&peer.name).is_some_and(|(c, _)| c.stable_id() == connection.stable_id());
+            let ours =
+                stations.get(&peer.name).is_some_and(|c| c.connection.stable_id() == connection.stable_id());
             if ours {
                 stations.remove(&peer.name);
                 events.ended(&peer, ended);

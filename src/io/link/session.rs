@@ -102,7 +102,10 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 pub(super) async fn serve(shared: &Arc<Shared>, peer: &Peer, up: impl Fn()) -> Ended {
     let connection = peer.connection.clone();
     let outcome = match tokio::time::timeout(GREETING, greet(shared, &connection)).await {
-        Ok(Ok((control_out, control_in, hello))) => run(shared, peer, control_out, control_in, hello).await,
+        Ok(Ok((control_out, control_in, hello))) => {
+            up();
+            run(shared, peer, control_out, control_in, hello).await
+        }
         Ok(Err(e)) => Err(e),
         Err(_) => Err(WireError::Ended("no greeting".into())),
     };

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -113,6 +114,8 @@ pub(super) struct PayloadState {
     pub(super) status: Mutex<PayloadStatus>,
     pub(super) heard: Mutex<Instant>,
     connection: Mutex<Connection>,
+    /// Whether the operator was told that it is up.
+    told: AtomicBool,
 }
 
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -124,7 +127,7 @@ pub(super) struct Shared {
     pub(super) recall: Recall,
     pub(super) records: mpsc::Sender<FromPayload>,
     pub(super) thumbnails: bool,
-    refusals: std::sync::atomic::AtomicU64,
+    refusals: AtomicU64,
 }
 
 /// Gives the link what it must know of the disk, and tells how it does.
@@ -162,7 +165,7 @@ impl StationHandle {
 
     /// Handshakes refused since the start.
     pub fn refusals(&self) -> u64 {
-        self.shared.refusals.load(std::sync::atomic::Ordering::Relaxed)
+        self.shared.refusals.load(Ordering::Relaxed)
     }
 }
 
@@ -191,7 +194,7 @@ impl StationLink {
             recall,
             records,
             thumbnails: settings.thumbnails,
-            refusals: std::sync::atomic::AtomicU64::new(0),
+            refusals: AtomicU64::new(0),
         });
         let handle = StationHandle { shared: Arc::clone(&shared) };
         let link = Self { door, dial: settings.dial.clone(), shared, arrivals, events };
@@ -212,7 +215,7 @@ impl StationLink {
             tasks.spawn(self.door.clone().dial(address));
         }
         loop {
-            self.shared.refusals.store(self.events.refusals(), std::sync::atomic::Ordering::Relaxed);
+            self.shared.refusals.store(self.events.refusals(), Ordering::Relaxed);
             tokio::select! {
                 peer = self.arrivals.recv() => {
                     let Some(peer) = peer else { break };
@@ -226,16 +229,15 @@ impl StationLink {
         self.door.shut().await;
     }
 
-    /// The state of a payload, made when it first comes; and whether an older connection was still open.
-    fn state_of(&self, peer: &Peer) -> (Arc<PayloadState>, bool) {
+    /// The state of a payload, made when it first comes; an older connection ends.
+    fn state_of(&self, peer: &Peer) -> Arc<PayloadState> {
         let mut payloads = lock(&self.shared.payloads);
         if let Some(state) = payloads.get(&peer.name) {
             let old = std::mem::replace(&mut *lock(&state.connection), peer.connection.clone());
-            let was_up = old.close_reason().is_none();
             old.close(VarInt::from_u32(close::SUPERSEDED), b"a newer connection took over");
             lock(&state.status).connected = true;
             *lock(&state.heard) = Instant::now();
-            return (Arc::clone(state), was_up);
+            return Arc::clone(state);
         }
         let status = PayloadStatus {
             name: peer.name.clone(),
@@ -254,17 +256,18 @@ impl StationLink {
             status: Mutex::new(status),
             heard: Mutex::new(Instant::now()),
             connection: Mutex::new(peer.connection.clone()),
+            told: AtomicBool::new(false),
         });
         payloads.insert(peer.name.clone(), Arc::clone(&state));
-        (state, false)
+        state
     }
 
     fn welcome(&self, peer: Peer, tasks: &mut tokio::task::JoinSet<()>) {
-        let (state, was_up) = self.state_of(&peer);
+        let state = self.state_of(&peer);
         let (shared, events) = (Arc::clone(&self.shared), self.events.clone());
         tasks.spawn(async move {
             let up = || {
-                if !was_up {
+                if !state.told.swap(true, Ordering::Relaxed) {
                     let address = peer.connection.remote_address();
                     events.tell(LinkEvent::Up { peer: peer.name.clone(), address });
                 }
@@ -273,6 +276,7 @@ impl StationLink {
             let ours = lock(&state.connection).stable_id() == peer.connection.stable_id();
             if ours {
                 lock(&state.status).connected = false;
+                state.told.store(false, Ordering::Relaxed);
                 events.ended(&peer, ended);
             }
         });

@@ -1,0 +1,174 @@
+//! The vehicles for other programs: GeoJSON, KML, NMEA.
+
+use serde_json::{Value, json};
+
+use super::view::{Vehicle, nmea_time};
+use crate::io::proto::host_time;
+
+/// Trail points in KML and GeoJSON; more only slow a viewer down.
+const POINTS: usize = 2_000;
+/// Knots in a metre a second.
+const KNOTS: f64 = 3_600.0 / 1_852.0;
+
+fn thinned(vehicle: &Vehicle) -> impl Iterator<Item = (f64, f64)> + '_ {
+    let every = vehicle.trail.len().div_ceil(POINTS).max(1);
+    vehicle.trail.iter().step_by(every).map(|(_, lat, lon)| (*lat, *lon))
+}
+
+fn heading_deg(vehicle: &Vehicle) -> f64 {
+    vehicle.state.heading_rad.to_degrees().rem_euclid(360.0)
+}
+
+/// One-sigma of north and east, metres; `None` without a covariance.
+fn sigmas_m(vehicle: &Vehicle) -> Option<(f64, f64)> {
+    let p = &vehicle.state.covariance;
+    Some((p.first()?.max(0.0).sqrt(), p.get(5)?.max(0.0).sqrt()))
+}
+
+/// Every vehicle as a point, and its trail as a line.
+pub fn geojson(vehicles: &[Vehicle]) -> String {
+    let mut features = Vec::new();
+    for vehicle in vehicles {
+        let s = &vehicle.state;
+        let (sigma_n, sigma_e) =
+            sigmas_m(vehicle).map_or((Value::Null, Value::Null), |(n, e)| (json!(n), json!(e)));
+        features.push(json!({"type": "Feature", "id": format!("{}/{}", vehicle.payload, vehicle.target),
+            "geometry": {"type": "Point", "coordinates": [s.lon_deg, s.lat_deg]},
+            "properties": {"payload": vehicle.payload, "target": vehicle.target,
+                "time_ms": host_time(s.timestamp.as_ref()).ns() / 1_000_000,
+                "heading_deg": heading_deg(vehicle), "speed_mps": s.speed_mps,
+                "yaw_rate_radps": s.yaw_rate_radps, "sigma_north_m": sigma_n, "sigma_east_m": sigma_e}}));
+        let line: Vec<Value> = thinned(vehicle).map(|(lat, lon)| json!([lon, lat])).collect();
+        if line.len() > 1 {
+            features.push(json!({"type": "Feature", "geometry": {"type": "LineString", "coordinates": line},
+                "properties": {"payload": vehicle.payload, "target": vehicle.target, "kind": "trail"}}));
+        }
+    }
+    json!({"type": "FeatureCollection", "features": features}).to_string()
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+/// A network link that fetches [`kml`] every second.
+pub fn network_link(url: &str) -> String {
+    format!(
+        "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<kml xmlns=\"http://www.opengis.net/kml/2.2\">\
+         <NetworkLink><name>windhover</name><Link><href>{}</href><refreshMode>onInterval</refreshMode>\
+         <refreshInterval>1</refreshInterval></Link></NetworkLink></kml>\n",
+        escaped(url)
+    )
+}
+
+/// Every vehicle as a placemark turned to its heading, and its trail.
+pub fn kml(vehicles: &[Vehicle]) -> String {
+    let mut out = String::from(
+        "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<kml xmlns=\"http://www.opengis.net/kml/2.2\"><Document>\
+         <name>windhover</name>",
+    );
+    for vehicle in vehicles {
+        let s = &vehicle.state;
+        let name = escaped(&format!("{} ({})", vehicle.target, vehicle.payload));
+        out += &format!(
+            "<Placemark><name>{name}</name><description>{:.2} m/s, {:.0}°</description><Style><IconStyle>\
+             <color>ff0f48d9</color><heading>{:.1}</heading></IconStyle></Style><Point><coordinates>\
+             {:.9},{:.9},0</coordinates></Point></Placemark>",
+            s.speed_mps,
+            heading_deg(vehicle),
+            heading_deg(vehicle),
+            s.lon_deg,
+            s.lat_deg
+        );
+        let line: Vec<String> = thinned(vehicle).map(|(lat, lon)| format!("{lon:.9},{lat:.9},0")).collect();
+        if line.len() > 1 {
+            out += &format!(
+                "<Placemark><name>{name} trail</name><Style><LineStyle><color>ff0f48d9</color><width>2</width>\
+                 </LineStyle></Style><LineString><tessellate>1</tessellate><coordinates>{}</coordinates>\
+                 </LineString></Placemark>",
+                line.join(" ")
+            );
+        }
+    }
+    out + "</Document></kml>\n"
+}
+
+/// A sentence with its checksum.
+fn sentence(body: &str) -> String {
+    let checksum = body.bytes().fold(0, |sum, byte| sum ^ byte);
+    format!("${body}*{checksum:02X}\r\n")
+}
+
+/// `ddmm.mmmmmm,N`: degrees (of `width` digits), minutes, hemisphere.
+fn angle(degrees: f64, width: usize, hemispheres: [char; 2]) -> String {
+    // Rounded to the last digit first, so that minutes never read 60.
+    let micro_minutes = (degrees.abs() * 60e6).round() as u64;
+    let (whole, rest) = (micro_minutes / 60_000_000, micro_minutes % 60_000_000);
+    let hemisphere = hemispheres[usize::from(degrees < 0.0)];
+    format!("{whole:0width$}{:02}.{:06},{hemisphere}", rest / 1_000_000, rest % 1_000_000)
+}
+
+/// RMC and GGA of a vehicle. Altitude stays empty: the link carries heights above the ellipsoid, and GGA
+/// wants mean sea level.
+pub fn nmea(vehicle: &Vehicle) -> String {
+    let s = &vehicle.state;
+    let (time, date) = nmea_time(host_time(s.timestamp.as_ref()));
+    let (lat, lon) = (angle(s.lat_deg, 2, ['N', 'S']), angle(s.lon_deg, 3, ['E', 'W']));
+    // Course over ground: of a vehicle that reverses, the way it goes.
+    let course = if s.speed_mps < 0.0 { heading_deg(vehicle) + 180.0 } else { heading_deg(vehicle) } % 360.0;
+    let knots = s.speed_mps.abs() * KNOTS;
+    let rmc = sentence(&format!("GPRMC,{time},A,{lat},{lon},{knots:.2},{course:.1},{date},,,A"));
+    rmc + &sentence(&format!("GPGGA,{time},{lat},{lon},1,,,,M,,M,,"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::io::proto::{timestamp, windhover as wh};
+    use crate::time::MonoTime;
+
+    fn vehicle() -> Vehicle {
+        let t = MonoTime::from_ns(1_795_046_445_250_000_000);
+        Vehicle {
+            payload: "a<b".into(),
+            target: "ugv".into(),
+            state: wh::TargetState {
+                timestamp: Some(timestamp(t)),
+                target: "ugv".into(),
+                known: true,
+                heading_rad: -std::f64::consts::FRAC_PI_2,
+                speed_mps: 2.0,
+                lat_deg: 30.999_999_999_9,
+                lon_deg: -85.5,
+                ..Default::default()
+            },
+            trail: vec![(t, 30.0, -85.0), (t, 30.1, -85.1)],
+        }
+    }
+
+    #[test]
+    fn sentences_are_read_back_by_a_parser() {
+        let text = nmea(&vehicle());
+        let lines: Vec<&str> = text.lines().collect();
+        assert_eq!(lines[0], "$GPRMC,000045.25,A,3100.000000,N,08530.000000,W,3.89,270.0,191126,,,A*7D");
+        for line in lines {
+            let parsed = nmea::parse_str(line).expect("a sentence");
+            match parsed {
+                nmea::ParseResult::RMC(rmc) => assert_eq!((rmc.lat, rmc.lon), (Some(31.0), Some(-85.5))),
+                nmea::ParseResult::GGA(gga) => assert_eq!((gga.latitude, gga.altitude), (Some(31.0), None)),
+                other => panic!("{other:?}"),
+            }
+        }
+    }
+
+    #[test]
+    fn geojson_and_kml_hold_point_and_trail() {
+        let parsed: Value = serde_json::from_str(&geojson(&[vehicle()])).expect("JSON");
+        assert_eq!(parsed["features"][0]["geometry"]["coordinates"][0], json!(-85.5));
+        assert_eq!(parsed["features"][1]["geometry"]["coordinates"].as_array().map(Vec::len), Some(2));
+        assert_eq!(parsed["features"][0]["properties"]["heading_deg"], json!(270.0));
+        let kml = kml(&[vehicle()]);
+        assert!(kml.contains("-85.500000000,31.000000000,0") && kml.contains("ugv (a&lt;b) trail"));
+        assert!(network_link("http://h/v.kml?a=1&b=2").contains("a=1&amp;b=2"));
+    }
+}

@@ -1,0 +1,308 @@
+//! The receiving station: link, disk, web page, feeds, terminal.
+//!
+//! ```text
+//! payloads ─► io::link ─► intake ─┬─► mirror (thread: MCAP, fsync once a second) ─► "stored" to the payload
+//!                                 ├─► view ─► web page, GeoJSON, KML, NMEA
+//!                                 └─► one line a second per payload
+//! ```
+
+mod feeds;
+pub mod mirror;
+pub mod view;
+pub mod web;
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use tokio::io::AsyncWriteExt as _;
+use tokio::sync::{broadcast, mpsc, watch};
+
+use crate::io::clock::HostClock;
+use crate::io::link::{
+    Arrival, FromPayload, LinkError, LinkEvent, StationHandle, StationLink, StationSettings,
+};
+use mirror::{Mirror, MirrorError};
+use view::View;
+use web::Web;
+
+/// Messages a page may be behind before it misses some.
+const PAGE_QUEUE: usize = 4_096;
+/// Records on their way to the disk; more hold the link back, never lose anything.
+const DISK_QUEUE: usize = 16_384;
+/// What is received reaches the disk this often.
+const SYNC: Duration = Duration::from_secs(1);
+/// NMEA sentences at most this often.
+const NMEA_EVERY: Duration = Duration::from_millis(200);
+
+/// What a station is made of.
+#[derive(Clone, Debug)]
+pub struct GroundSettings {
+    /// The link.
+    pub link: StationSettings,
+    /// Where flights are kept.
+    pub out: PathBuf,
+    /// Where the web page is served.
+    pub web: Option<SocketAddr>,
+    /// What visitors of the page must know; made up where the page is not on loopback and none is given.
+    pub token: Option<String>,
+    /// Folder with map tiles.
+    pub tiles: Option<PathBuf>,
+    /// Where NMEA is served over TCP.
+    pub nmea: Option<SocketAddr>,
+    /// Whether lines are rewritten in place, as on a terminal.
+    pub terminal: bool,
+}
+
+/// Why a station could not run.
+#[derive(Debug, thiserror::Error)]
+pub enum GroundError {
+    /// The link.
+    #[error(transparent)]
+    Link(#[from] LinkError),
+    /// The disk.
+    #[error("station: {0}")]
+    Mirror(#[from] MirrorError),
+    /// A TCP port.
+    #[error("station: cannot listen on {address}: {source}")]
+    Listen {
+        /// The address.
+        address: SocketAddr,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The system.
+    #[error("station: {0}")]
+    System(#[from] std::io::Error),
+}
+
+fn lock(view: &Mutex<View>) -> MutexGuard<'_, View> {
+    view.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+async fn listen(address: SocketAddr) -> Result<tokio::net::TcpListener, GroundError> {
+    tokio::net::TcpListener::bind(address).await.map_err(|source| GroundError::Listen { address, source })
+}
+
+/// 128 random bits in hexadecimal.
+fn random_token() -> Option<String> {
+    use ring::rand::SecureRandom as _;
+    let mut bytes = [0_u8; 16];
+    ring::rand::SystemRandom::new().fill(&mut bytes).ok()?;
+    Some(bytes.iter().map(|b| format!("{b:02x}")).collect())
+}
+
+/// Runs a station until `stop` says so.
+pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Result<(), GroundError> {
+    let mirror = Mirror::at(&settings.out)?;
+    let root = settings.out.clone();
+    let recall =
+        Arc::new(move |payload: &str, flight: &str, run: u32| mirror::recall(&root, payload, flight, run));
+    let (link, handle, records, events) = StationLink::open(&settings.link, recall)?;
+    if settings.link.listen.is_some() {
+        println!("payloads may call {}", link.local_addr()?);
+    }
+    let view = Arc::new(Mutex::new(View::default()));
+    let live = broadcast::Sender::new(PAGE_QUEUE);
+    let mut tasks = tokio::task::JoinSet::new();
+    if let Some(address) = settings.web {
+        let listener = listen(address).await?;
+        let token = match (&settings.token, address.ip().is_loopback()) {
+            (Some(token), _) => Some(token.as_str().into()),
+            (None, true) => None,
+            (None, false) => {
+                Some(random_token().ok_or_else(|| std::io::Error::other("no random bytes"))?.into())
+            }
+        };
+        let asked = token.as_ref().map_or_else(String::new, |token: &Arc<str>| format!("?token={token}"));
+        println!("page at http://{}/{asked}", listener.local_addr()?);
+        let (view, live, tiles) = (Arc::clone(&view), live.clone(), settings.tiles.clone());
+        tasks.spawn(async move { web::serve(listener, Web { view, live, tiles, token }).await });
+    }
+    if let Some(address) = settings.nmea {
+        let listener = listen(address).await?;
+        println!("NMEA at tcp://{}", listener.local_addr()?);
+        tasks.spawn(serve_nmea(listener, Arc::clone(&view)));
+    }
+    let (to_disk, from_link) = std::sync::mpsc::sync_channel(DISK_QUEUE);
+    let (failed, mut failure) = mpsc::channel(1);
+    let disk_handle = handle.clone();
+    let disk = std::thread::Builder::new().name("mirror".into()).spawn(move || {
+        if let Err(error) = keep(mirror, &from_link, &disk_handle) {
+            // The receiver is gone only when the station ends.
+            let _ = failed.blocking_send(error);
+        }
+    })?;
+    let linked = tokio::spawn(link.run(stop));
+    tasks.spawn(report(handle, Arc::clone(&view), live.clone(), settings.terminal));
+    tasks.spawn(tell(events, Arc::clone(&view), live.clone()));
+    let taken = tokio::spawn(intake(records, to_disk, view, live));
+    let outcome = tokio::select! {
+        _ = linked => Ok(()),
+        Some(error) = failure.recv() => Err(error.into()),
+    };
+    // The link's end closes the records' channel, and that the disk's: what was received is kept.
+    let _ = tokio::time::timeout(Duration::from_secs(5), taken).await;
+    let _ = tokio::task::spawn_blocking(move || disk.join()).await;
+    outcome
+}
+
+/// Hands records to the disk and to the pages. A full disk queue holds the link back.
+async fn intake(
+    mut records: mpsc::Receiver<FromPayload>,
+    to_disk: std::sync::mpsc::SyncSender<Arrival>,
+    view: Arc<Mutex<View>>,
+    live: broadcast::Sender<Arc<str>>,
+) {
+    while let Some(message) = records.recv().await {
+        let news = match message {
+            FromPayload::Record(arrival) => {
+                let news = lock(&view).record(&arrival);
+                let mut arrival = Some(arrival);
+                while let Some(waiting) = arrival.take() {
+                    match to_disk.try_send(waiting) {
+                        Ok(()) => {}
+                        Err(std::sync::mpsc::TrySendError::Full(back)) => {
+                            arrival = Some(back);
+                            tokio::time::sleep(Duration::from_millis(5)).await;
+                        }
+                        Err(std::sync::mpsc::TrySendError::Disconnected(_)) => return,
+                    }
+                }
+                news
+            }
+            FromPayload::Thumbnail { payload, thumbnail } => Some(lock(&view).thumbnail(&payload, thumbnail)),
+        };
+        if let Some(news) = news {
+            // Nobody may be looking.
+            let _ = live.send(news);
+        }
+    }
+}
+
+/// The disk's thread: writes, syncs once a second, acknowledges.
+fn keep(
+    mut mirror: Mirror,
+    records: &std::sync::mpsc::Receiver<Arrival>,
+    handle: &StationHandle,
+) -> Result<(), MirrorError> {
+    use std::sync::mpsc::RecvTimeoutError;
+    let mut due = tokio::time::Instant::now() + SYNC;
+    let acknowledge = |done: Vec<mirror::OnDisk>| {
+        for d in done {
+            handle.stored(&d.payload, d.run, &d.numbers);
+        }
+    };
+    loop {
+        match records.recv_timeout(due.saturating_duration_since(tokio::time::Instant::now())) {
+            Ok(arrival) => mirror.keep(&arrival)?,
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => {
+                acknowledge(mirror.finish()?);
+                return Ok(());
+            }
+        }
+        if tokio::time::Instant::now() >= due {
+            acknowledge(mirror.sync()?);
+            due = tokio::time::Instant::now() + SYNC;
+        }
+    }
+}
+
+/// One line a second per payload, and how the link does for the pages.
+async fn report(
+    handle: StationHandle,
+    view: Arc<Mutex<View>>,
+    live: broadcast::Sender<Arc<str>>,
+    terminal: bool,
+) -> std::io::Result<()> {
+    let mut tick = tokio::time::interval(Duration::from_secs(1));
+    tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
+    let (mut last, mut printed) = (tokio::time::Instant::now(), 0);
+    loop {
+        tick.tick().await;
+        let status = handle.status();
+        let passed = std::mem::replace(&mut last, tokio::time::Instant::now()).elapsed().as_secs_f64();
+        let (message, lines) = {
+            let mut view = lock(&view);
+            let message = view.link(&status, passed);
+            (message, status.iter().map(|s| view.line(s)).collect::<Vec<_>>())
+        };
+        let _ = live.send(message);
+        let up = if terminal && printed > 0 { format!("\x1b[{printed}A") } else { String::new() };
+        let clear = if terminal { "\x1b[K" } else { "" };
+        printed = lines.len();
+        let text: String = lines.iter().map(|line| format!("{line}{clear}\n")).collect();
+        print!("{up}{text}");
+    }
+}
+
+/// What the operator may want to know, on standard error and on the pages.
+async fn tell(
+    mut events: mpsc::Receiver<LinkEvent>,
+    view: Arc<Mutex<View>>,
+    live: broadcast::Sender<Arc<str>>,
+) -> std::io::Result<()> {
+    let clock = HostClock::start();
+    while let Some(event) = events.recv().await {
+        let (peer, level, text) = match &event {
+            LinkEvent::Up { peer, address } => (Some(peer), 2, format!("connected from {address}")),
+            LinkEvent::Down { peer, why } => (Some(peer), 3, format!("disconnected: {why}")),
+            LinkEvent::Refused { address, why, unreported } => {
+                let more = if *unreported > 0 { format!(" ({unreported} more)") } else { String::new() };
+                (None, 4, format!("{address}: {why}{more}"))
+            }
+            LinkEvent::KeysReloaded => (None, 2, "keys read again".into()),
+            LinkEvent::KeysUnusable { why } => (None, 4, format!("keys changed and not usable: {why}")),
+            LinkEvent::Unresolved { address, why } => (None, 3, format!("{address}: {why}")),
+        };
+        eprintln!("{}{text}", peer.map_or_else(String::new, |peer| format!("{peer}: ")));
+        if let Some(peer) = peer {
+            let _ = live.send(lock(&view).remark(peer, clock.now(), level, &text));
+        }
+    }
+    Ok(())
+}
+
+/// RMC and GGA of every vehicle whose state is new, to every client.
+async fn serve_nmea(listener: tokio::net::TcpListener, view: Arc<Mutex<View>>) -> std::io::Result<()> {
+    let sentences = broadcast::Sender::<Arc<str>>::new(64);
+    let source = sentences.clone();
+    let produce = async move {
+        let mut told = std::collections::BTreeMap::new();
+        loop {
+            tokio::time::sleep(NMEA_EVERY).await;
+            for vehicle in lock(&view).vehicles() {
+                let key = (vehicle.payload.clone(), vehicle.target.clone());
+                let t = vehicle.state.timestamp;
+                if told.insert(key, t) != Some(t) {
+                    let _ = source.send(feeds::nmea(&vehicle).into());
+                }
+            }
+        }
+    };
+    let accept = async move {
+        loop {
+            let (mut client, _) = listener.accept().await?;
+            let mut news = sentences.subscribe();
+            tokio::spawn(async move {
+                loop {
+                    match news.recv().await {
+                        Ok(text) => {
+                            if client.write_all(text.as_bytes()).await.is_err() {
+                                return;
+                            }
+                        }
+                        Err(broadcast::error::RecvError::Lagged(_)) => {}
+                        Err(broadcast::error::RecvError::Closed) => return,
+                    }
+                }
+            });
+        }
+    };
+    tokio::select! {
+        () = produce => Ok(()),
+        outcome = accept => outcome,
+    }
+}

@@ -1,0 +1,240 @@
+// The page: takes the station's messages, keeps the last minutes, draws.
+"use strict";
+const $ = id => document.getElementById(id);
+const KEEP = 9000, PLOT_S = 60, STALE_MS = 1500;
+const fleet = new Map();
+let chosen = null, socket = null, dirty = true, heardAt = 0;
+const map = new FieldMap($("map"));
+map.moved = () => { dirty = true; };
+
+function payload(name) {
+  if (!fleet.has(name)) {
+    fleet.set(name, { name, targets: new Map(), ownTrail: [], own: null, health: null, link: null, events: [], thumb: null, image: new Image(), datum: null });
+    if (!chosen) chosen = name;
+    tabs();
+  }
+  return fleet.get(name);
+}
+
+function tabs() {
+  $("payloads").replaceChildren(...[...fleet.values()].map(p => {
+    const b = document.createElement("button");
+    b.textContent = p.name;
+    b.className = `${p.name === chosen ? "on" : ""} ${p.link && p.link.up ? "up" : ""}`;
+    b.onclick = () => { chosen = p.name; map.center = null; tabs(); panels(); dirty = true; };
+    return b;
+  }));
+}
+
+// Puts a point where its time belongs: what is sent again comes late.
+function insert(list, point) {
+  let at = list.length;
+  while (at > 0 && list[at - 1].t > point.t) at--;
+  if (at > 0 && list[at - 1].t === point.t) return;
+  list.splice(at, 0, point);
+  for (const i of [at, at + 1]) if (i > 0 && i < list.length) list[i].gap = list[i].t - list[i - 1].t > 1000;
+  if (list.length > KEEP) list.splice(0, list.length - KEEP);
+}
+
+const handlers = {
+  hello(m) { map.tiles = m.tiles; },
+  est(m, p) {
+    let target = p.targets.get(m.target);
+    if (!target) p.targets.set(m.target, target = { name: m.target, trail: [], last: null, at: 0 });
+    if (m.lat != null) {
+      const position = mercator(m.lat, m.lon);
+      insert(target.trail, { ...position, t: m.t, v: m.v, w: m.w, sv: m.cov && Math.sqrt(m.cov[4]), sw: m.cov && Math.sqrt(m.cov[5]) });
+      m.position = position;
+    }
+    if (!target.last || m.t >= target.last.t) { target.last = m; target.at = performance.now(); if (m.position) target.known = m; }
+  },
+  own(m, p) {
+    m.position = mercator(m.lat, m.lon);
+    insert(p.ownTrail, { ...m.position, t: m.t });
+    if (!p.own || m.t >= p.own.t) p.own = m;
+  },
+  datum(m, p) { p.datum = mercator(m.lat, m.lon); },
+  health(m, p) { if (!p.health || m.t >= p.health.t) p.health = m; if (p.name === chosen) panels(); },
+  thumb(m, p) { p.thumb = m; p.image.onload = () => { dirty = true; }; p.image.src = `thumbnail/${encodeURIComponent(m.p)}?frame=${m.frame}`; },
+  event(m, p) { p.events.push(m); p.events.sort((a, b) => b.t - a.t); p.events.length = Math.min(p.events.length, 60); if (p.name === chosen) events(p); },
+  link(m) { for (const l of m.payloads) { payload(l.name).link = l; } tabs(); panels(); },
+};
+
+function connect() {
+  socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${location.pathname.replace(/[^/]*$/, "")}live`);
+  socket.onmessage = e => {
+    heardAt = performance.now();
+    const m = JSON.parse(e.data), handler = handlers[m.k];
+    if (handler) handler(m, m.p == null ? null : payload(m.p));
+    dirty = true;
+  };
+  socket.onopen = () => { heardAt = performance.now(); chip($("server"), "live", "good"); };
+  socket.onclose = () => { chip($("server"), "station gone", "bad"); setTimeout(connect, 1000); };
+}
+
+function chip(element, text, kind) { element.textContent = text; element.className = `chip ${kind}`; }
+const number = (x, digits) => x == null || !isFinite(x) ? "–" : x.toFixed(digits);
+
+function numbers(p) {
+  const target = p && [...p.targets.values()][0], e = target && target.last, k = target && target.known;
+  $("target-name").textContent = target ? target.name : "vehicle";
+  const old = target ? performance.now() - target.at : Infinity, fresh = old < STALE_MS;
+  const status = e ? (fresh ? e.status : "no news") : "no data";
+  chip($("target-status"), status, status === "tracking" ? "good" : status === "lost" || !fresh ? "bad" : "warn");
+  const c = k && k.cov, deg = 180 / Math.PI, s = v => c ? `±${v}` : "";
+  $("speed").textContent = number(k && k.v, 2);
+  $("heading").textContent = k ? number(((k.h * deg) % 360 + 360) % 360, 0) : "–";
+  $("yaw-rate").textContent = number(k && k.w * deg, 1);
+  $("sigma").textContent = c ? number(Math.sqrt(Math.max(c[0], c[2])), 2) : "–";
+  $("speed-sigma").textContent = c ? s(Math.sqrt(c[4]).toFixed(2)) : "";
+  $("heading-sigma").textContent = c ? s(`${(Math.sqrt(c[3]) * deg).toFixed(1)}°`) : "";
+  $("yaw-rate-sigma").textContent = c ? s((Math.sqrt(c[5]) * deg).toFixed(1)) : "";
+  $("coordinates").textContent = k ? `${k.lat.toFixed(7)}, ${k.lon.toFixed(7)}` : "";
+  $("age").textContent = !e ? "" : fresh ? `${e.t ? new Date(e.t).toISOString().replace("T", " ").slice(0, 21) : ""} UTC` : `last heard ${(old / 1000).toFixed(0)} s ago`;
+  const note = $("map-note"), down = p && p.link && !p.link.up, cut = p && p.link && p.link.silent_ms > 2000;
+  note.style.display = e && (!fresh || down) ? "block" : "none";
+  note.textContent = down ? "payload not connected" : cut ? `link silent for ${(p.link.silent_ms / 1000).toFixed(0)} s` : "no new estimates";
+}
+
+function rows(table, list) {
+  table.replaceChildren(...list.map(([name, value, kind]) => {
+    const tr = document.createElement("tr"), a = document.createElement("td"), b = document.createElement("td");
+    if (kind) { const dot = document.createElement("span"); dot.className = `dot ${kind}`; a.append(dot); }
+    a.append(name); b.textContent = value; tr.append(a, b);
+    return tr;
+  }));
+}
+
+function panels() {
+  const p = fleet.get(chosen);
+  if (p && p.health) {
+    const h = p.health, table = document.createElement("table");
+    const list = h.sources.map(s => {
+      const silent = s.age_ms < 0 || s.age_ms > 2000;
+      const extra = [s.refused ? `${s.refused} refused` : "", s.dropped ? `${s.dropped} dropped` : ""].filter(Boolean).join(", ");
+      return [s.name, `${s.rate_hz.toFixed(1)}/s${extra ? `, ${extra}` : ""}`, silent ? "bad" : s.dropped ? "warn" : "good"];
+    });
+    list.push(["fix", `${h.fix === 3 ? "3D" : h.fix === 2 ? "2D" : "none"}, ${h.sats} satellites`, h.fix ? "good" : "bad"]);
+    if (h.clock_sigma_ms >= 0) list.push(["UTC", `±${h.clock_sigma_ms.toFixed(1)} ms`, "good"]);
+    for (const [name, word] of Object.entries(h.words)) list.push([name, word, /fail|full|none|lost|error/i.test(word) ? "bad" : "good"]);
+    rows(table, list); $("sensors").replaceChildren(table);
+  }
+  if (p && p.link) {
+    const l = p.link, table = document.createElement("table"), all = l.received + l.missing, done = all ? 100 * l.received / all : 100;
+    const bar = document.createElement("div"), fill = document.createElement("div");
+    bar.className = "bar"; fill.style.width = `${done.toFixed(1)}%`; bar.append(fill);
+    rows(table, [
+      [l.address, l.up ? (l.silent_ms > 2000 ? `silent ${(l.silent_ms / 1000).toFixed(0)} s` : "connected") : "not connected", l.up ? (l.silent_ms > 2000 ? "warn" : "good") : "bad"],
+      ["round trip", `${l.rtt_ms.toFixed(1)} ms`],
+      ["live", `${l.live_hz.toFixed(1)} records/s, ${(l.kbps).toFixed(0)} kbit/s`],
+      ["complete", l.missing ? `${done.toFixed(1)} %, ${l.missing} to come` : `${l.received} records, nothing missing`],
+      ...(l.gone ? [["lost on board", `${l.gone}`, "warn"]] : []),
+      ["on board", l.software],
+    ]);
+    $("link").replaceChildren(bar, table);
+  }
+  if (p) events(p);
+}
+
+function events(p) {
+  $("events").replaceChildren(...p.events.map(e => {
+    const li = document.createElement("li"), t = document.createElement("time"), text = document.createElement("span");
+    t.textContent = new Date(e.t).toISOString().slice(11, 19);
+    text.textContent = e.text; text.className = e.level >= 4 ? "bad" : e.level === 3 ? "warn" : "";
+    li.append(t, text);
+    return li;
+  }));
+}
+
+function plot(canvas, trail, now, value, sigma, unit) {
+  const [c, w, h] = surface(canvas), left = 34, bottom = 16, top = 6;
+  const points = trail.filter(p => p.t > now - PLOT_S * 1000);
+  let low = Infinity, high = -Infinity;
+  for (const p of points) { const v = value(p), s = Math.min(sigma(p) || 0, unit * 5); low = Math.min(low, v - s); high = Math.max(high, v + s); }
+  if (!points.length) { low = 0; high = unit; }
+  const pad = Math.max(unit * 0.25, (high - low) * 0.08); low -= pad; high += pad;
+  const x = t => left + (w - left - 4) * (1 - (now - t) / (PLOT_S * 1000)), y = v => top + (h - top - bottom) * (1 - (v - low) / (high - low));
+  const raw = (high - low) / 4, p10 = 10 ** Math.floor(Math.log10(raw)), step = [1, 2, 5, 10].map(f => f * p10).find(s => s >= raw);
+  c.font = "11px system-ui, sans-serif"; c.lineWidth = 1; c.textAlign = "right";
+  for (let v = Math.ceil(low / step) * step; v <= high; v += step) {
+    const r = Math.round(y(v)) + 0.5;
+    c.strokeStyle = css(Math.abs(v) < step / 2 ? "--grid-strong" : "--grid"); c.beginPath(); c.moveTo(left, r); c.lineTo(w - 4, r); c.stroke();
+    c.fillStyle = css("--soft"); c.fillText(String(+v.toFixed(6)), left - 5, r + 4);
+  }
+  c.textAlign = "center";
+  for (let s = 0; s <= PLOT_S; s += 15) c.fillText(s ? `−${s} s` : "now", Math.min(w - 14, x(now - s * 1000)), h - 3);
+  c.textAlign = "left"; c.save(); c.beginPath(); c.rect(left, 0, w - left, h - bottom); c.clip();
+  const runs = [];
+  for (const p of points) { if (p.gap || !runs.length) runs.push([]); runs[runs.length - 1].push(p); }
+  for (const run of runs) {
+    c.fillStyle = css("--band"); c.beginPath();
+    run.forEach((p, i) => c[i ? "lineTo" : "moveTo"](x(p.t), y(value(p) + (sigma(p) || 0))));
+    for (const p of [...run].reverse()) c.lineTo(x(p.t), y(value(p) - (sigma(p) || 0)));
+    c.fill(); c.strokeStyle = css("--accent"); c.lineWidth = 1.6; c.lineJoin = "round"; c.beginPath();
+    run.forEach((p, i) => c[i ? "lineTo" : "moveTo"](x(p.t), y(value(p)))); c.stroke();
+  }
+  c.restore();
+}
+
+function camera(p) {
+  const [c, w, h] = surface($("camera")), t = p && p.thumb;
+  if (!t || !p.image.complete || !p.image.naturalWidth) {
+    c.fillStyle = css("--soft"); c.font = "13px system-ui, sans-serif"; c.textAlign = "center"; c.fillText("no picture yet", w / 2, h / 2); c.textAlign = "left"; return;
+  }
+  const k = Math.min(w / t.w, h / t.h), u0 = (w - t.w * k) / 2, v0 = (h - t.h * k) / 2;
+  c.drawImage(p.image, u0, v0, t.w * k, t.h * k);
+  c.lineWidth = 2;
+  for (const m of t.markers) {
+    const q = (u, v) => [u0 + (u + 0.5) * k, v0 + (v + 0.5) * k];
+    c.strokeStyle = css("--accent"); c.beginPath();
+    if (m.corners.length === 8) { for (let i = 0; i < 8; i += 2) c[i ? "lineTo" : "moveTo"](...q(m.corners[i], m.corners[i + 1])); c.closePath(); }
+    else { const [x, y] = q(m.u, m.v); c.arc(x, y, Math.max(3, m.size * k / 2), 0, TAU); }
+    c.stroke();
+    const [x, y] = q(m.u, m.v); c.font = "600 12px system-ui, sans-serif"; c.lineWidth = 3; c.strokeStyle = "#000a"; c.strokeText(m.id, x + 8, y - 8); c.fillStyle = "#fff"; c.fillText(m.id, x + 8, y - 8); c.lineWidth = 2;
+  }
+  $("camera-note").textContent = `frame ${t.frame}, ${t.markers.length} marker${t.markers.length === 1 ? "" : "s"}`;
+}
+
+function draw() {
+  requestAnimationFrame(draw);
+  const now = performance.now();
+  if (!dirty && now - draw.last < 250) return;
+  dirty = false; draw.last = now;
+  const p = fleet.get(chosen), targets = p ? [...p.targets.values()] : [];
+  map.draw({
+    origin: p && p.datum, ownTrail: p ? p.ownTrail : [],
+    own: p && p.own && { position: p.own.position, heading: p.own.heading, above: p.own.above },
+    vehicles: targets.map(t => ({
+      name: t.name, trail: t.trail, position: t.known && t.known.position, heading: t.known && t.known.h,
+      cov: t.known && t.known.cov, fresh: now - t.at < STALE_MS && t.last.status !== "lost",
+    })),
+  });
+  numbers(p); camera(p);
+  const trail = targets[0] ? targets[0].trail : [], deg = 180 / Math.PI;
+  const end = trail.length ? trail[trail.length - 1].t + Math.min(now - targets[0].at, 600000) : 0;
+  plot($("plot-speed"), trail, end, q => q.v, q => q.sv, 0.5);
+  plot($("plot-yaw"), trail, end, q => q.w * deg, q => q.sw && q.sw * deg, 5);
+}
+draw.last = 0;
+
+function theme(dark) { document.documentElement.dataset.theme = dark ? "dark" : "light"; dirty = true; }
+let saved = null;
+try { saved = localStorage.getItem("theme"); } catch { /* a private window keeps nothing */ }
+const system = matchMedia("(prefers-color-scheme: dark)");
+theme(saved ? saved === "dark" : system.matches);
+system.onchange = e => { if (!saved) theme(e.matches); };
+$("theme").onclick = () => {
+  const dark = document.documentElement.dataset.theme !== "dark";
+  theme(dark); saved = dark ? "dark" : "light";
+  try { localStorage.setItem("theme", saved); } catch { /* as above */ }
+};
+$("zoom-in").onclick = () => map.zoom(1.5);
+$("zoom-out").onclick = () => map.zoom(1 / 1.5);
+$("follow").onclick = () => { map.follow = true; dirty = true; };
+$("whole").onclick = () => { const p = fleet.get(chosen); if (p) map.fit([...p.targets.values()].flatMap(t => t.trail).concat(p.own ? [p.own.position] : [])); };
+setInterval(() => {
+  $("follow").classList.toggle("on", map.follow);
+  if (socket && socket.readyState === 1 && performance.now() - heardAt > 4000) { chip($("server"), "station silent", "warn"); }
+}, 300);
+window.addEventListener("resize", () => { dirty = true; });
+connect(); draw();

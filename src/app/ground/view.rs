@@ -1,0 +1,326 @@
+//! What the station knows of each payload, and the messages its web page lives on.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+
+use prost::Message as _;
+use serde_json::{Value, json};
+
+use crate::geo::euler_321;
+use crate::io::link::{Arrival, PayloadStatus};
+use crate::io::proto::{foxglove, host_time, link::Thumbnail, windhover as wh};
+use crate::time::{MonoTime, NS_PER_S};
+
+/// Estimates kept for pages opened later: ten minutes at 15 Hz.
+const TRAIL: usize = 9_000;
+/// Notices kept for pages opened later.
+const NOTICES: usize = 60;
+
+/// A vehicle as last known.
+#[derive(Clone, Debug)]
+pub struct Vehicle {
+    /// Name of the payload.
+    pub payload: String,
+    /// Name of the target.
+    pub target: String,
+    /// Its latest known state.
+    pub state: wh::TargetState,
+    /// Latitude and longitude over time, oldest first.
+    pub trail: Vec<(MonoTime, f64, f64)>,
+}
+
+#[derive(Default)]
+struct Target {
+    latest: Option<wh::TargetState>,
+    known: Option<wh::TargetState>,
+    trail: BTreeMap<i64, Arc<str>>,
+    places: BTreeMap<i64, (f64, f64)>,
+}
+
+#[derive(Default)]
+struct Payload {
+    targets: BTreeMap<String, Target>,
+    own: Option<(i64, Arc<str>)>,
+    health: Option<(i64, Arc<str>)>,
+    datum: Option<Arc<str>>,
+    notices: VecDeque<Arc<str>>,
+    thumbnail: Option<(Arc<str>, Arc<[u8]>)>,
+    live: (u64, u64),
+    live_hz: f64,
+    kbps: f64,
+}
+
+/// Everything pages are told, by payload.
+#[derive(Default)]
+pub struct View {
+    payloads: BTreeMap<String, Payload>,
+}
+
+fn ms(t: MonoTime) -> f64 {
+    t.ns() as f64 * 1e-6
+}
+
+fn status_name(status: i32) -> &'static str {
+    match wh::TrackStatus::try_from(status) {
+        Ok(wh::TrackStatus::Acquiring) => "acquiring",
+        Ok(wh::TrackStatus::Tracking) => "tracking",
+        Ok(wh::TrackStatus::Coasting) => "coasting",
+        Ok(wh::TrackStatus::Lost) | Err(_) => "lost",
+    }
+}
+
+/// (nn, ne, ee, hh, vv, ww) of the covariance's upper triangle; `null` without one.
+fn covariance(p: &[f64]) -> Value {
+    match p {
+        [nn, ne, _, _, _, ee, _, _, _, hh, _, _, vv, _, ww] => json!([nn, ne, ee, hh, vv, ww]),
+        _ => Value::Null,
+    }
+}
+
+impl View {
+    /// Takes a record; gives the message for the pages, where it makes one.
+    pub fn record(&mut self, arrival: &Arrival) -> Option<Arc<str>> {
+        let name = arrival.payload.to_string();
+        let payload = self.payloads.entry(name.clone()).or_default();
+        let data = &arrival.data[..];
+        match arrival.channel.schema_name.as_str() {
+            // The smoother's and the paper's states have schemas of the same name and other topics.
+            "windhover.TargetState" if arrival.channel.topic.ends_with("/state") => {
+                payload.estimate(&name, wh::TargetState::decode(data).ok()?, arrival.live)
+            }
+            "windhover.Ownship" => payload.ownship(&name, &wh::Ownship::decode(data).ok()?),
+            "windhover.Health" => payload.health(&name, &wh::Health::decode(data).ok()?),
+            "windhover.Datum" => {
+                let datum = wh::Datum::decode(data).ok()?;
+                let text = json!({"k": "datum", "p": name, "lat": datum.lat_deg, "lon": datum.lon_deg});
+                payload.datum = Some(text.to_string().into());
+                payload.datum.clone()
+            }
+            "foxglove.Log" => payload.notice(&name, &foxglove::Log::decode(data).ok()?),
+            _ => None,
+        }
+    }
+
+    /// Takes a thumbnail; gives the message for the pages.
+    pub fn thumbnail(&mut self, name: &str, thumbnail: Thumbnail) -> Arc<str> {
+        let found = wh::Detections::decode(&thumbnail.detections[..]).unwrap_or_default();
+        let markers: Vec<Value> = found
+            .markers
+            .iter()
+            .map(|m| {
+                json!({"id": format!("{} {}", m.family, m.id).trim(), "u": m.center_u, "v": m.center_v,
+                    "corners": m.corners, "size": m.size_px})
+            })
+            .collect();
+        let text: Arc<str> = json!({"k": "thumb", "p": name, "frame": thumbnail.frame,
+            "t": ms(MonoTime::from_ns(thumbnail.time_ns)), "w": thumbnail.width, "h": thumbnail.height,
+            "markers": markers})
+        .to_string()
+        .into();
+        let payload = self.payloads.entry(name.to_owned()).or_default();
+        payload.thumbnail = Some((Arc::clone(&text), thumbnail.jpeg.into()));
+        text
+    }
+
+    /// The latest thumbnail of a payload, JPEG.
+    pub fn picture(&self, payload: &str) -> Option<Arc<[u8]>> {
+        self.payloads.get(payload)?.thumbnail.as_ref().map(|(_, jpeg)| Arc::clone(jpeg))
+    }
+
+    /// Takes how the link does; gives the message for the pages. `passed_s` is the time since the last call.
+    pub fn link(&mut self, status: &[PayloadStatus], passed_s: f64) -> Arc<str> {
+        let payloads: Vec<Value> = status
+            .iter()
+            .map(|s| {
+                let payload = self.payloads.entry(s.name.clone()).or_default();
+                // A new connection counts from zero again.
+                let grown = |now: u64, before: u64| now.checked_sub(before).unwrap_or(now) as f64;
+                payload.live_hz = grown(s.live, payload.live.0) / passed_s.max(0.1);
+                payload.kbps = grown(s.bytes, payload.live.1) * 8e-3 / passed_s.max(0.1);
+                payload.live = (s.live, s.bytes);
+                json!({"name": s.name, "up": s.connected, "address": s.address.to_string(),
+                    "rtt_ms": s.rtt_ms, "silent_ms": s.silent.as_millis() as u64, "software": s.software,
+                    "received": s.progress.received, "missing": s.progress.missing,
+                    "gone": s.progress.gone, "live_hz": payload.live_hz, "kbps": payload.kbps})
+            })
+            .collect();
+        json!({"k": "link", "payloads": payloads}).to_string().into()
+    }
+
+    /// Takes something the station itself has to tell about a payload.
+    pub fn remark(&mut self, name: &str, t: MonoTime, level: u32, text: &str) -> Arc<str> {
+        self.payloads.entry(name.to_owned()).or_default().remark(name, t, level, text)
+    }
+
+    /// Everything a page that has just been opened needs.
+    pub fn history(&self) -> Vec<Arc<str>> {
+        let mut all = Vec::new();
+        for payload in self.payloads.values() {
+            all.extend(payload.datum.clone());
+            for target in payload.targets.values() {
+                all.extend(target.trail.values().cloned());
+            }
+            all.extend(payload.own.iter().map(|(_, text)| Arc::clone(text)));
+            all.extend(payload.health.iter().map(|(_, text)| Arc::clone(text)));
+            all.extend(payload.notices.iter().cloned());
+            all.extend(payload.thumbnail.iter().map(|(text, _)| Arc::clone(text)));
+        }
+        all
+    }
+
+    /// Every vehicle whose position was ever known.
+    pub fn vehicles(&self) -> Vec<Vehicle> {
+        let of = |(payload, p): (&String, &Payload)| -> Vec<Vehicle> {
+            let known = |(target, t): (&String, &Target)| {
+                let places = t.places.iter();
+                Some(Vehicle {
+                    payload: payload.clone(),
+                    target: target.clone(),
+                    state: t.known.clone()?,
+                    trail: places.map(|(ns, (lat, lon))| (MonoTime::from_ns(*ns), *lat, *lon)).collect(),
+                })
+            };
+            p.targets.iter().filter_map(known).collect()
+        };
+        self.payloads.iter().flat_map(of).collect()
+    }
+
+    /// One line a payload, for a terminal.
+    pub fn line(&self, status: &PayloadStatus) -> String {
+        let payload = self.payloads.get(&status.name);
+        let link = match (status.connected, status.silent.as_secs_f64()) {
+            (false, _) => "down".to_owned(),
+            (true, silent) if silent > 2.0 => format!("silent {silent:.0} s"),
+            _ => "up".to_owned(),
+        };
+        let mut line = format!("{:12} {link:10}", status.name);
+        for (name, target) in payload.iter().flat_map(|p| &p.targets) {
+            let Some(latest) = &target.latest else { continue };
+            line += &format!(" {name} {}", status_name(latest.status));
+            if latest.known {
+                line += &format!(
+                    " N {:.2} E {:.2} m, {:.0}°, {:.2} m/s, {:.1}°/s",
+                    latest.north_m,
+                    latest.east_m,
+                    latest.heading_rad.to_degrees().rem_euclid(360.0),
+                    latest.speed_mps,
+                    latest.yaw_rate_radps.to_degrees()
+                );
+            }
+        }
+        let (live_hz, kbps) = payload.map_or((0.0, 0.0), |p| (p.live_hz, p.kbps));
+        let progress = status.progress;
+        line += &format!(
+            " | {live_hz:.0}/s live, {kbps:.0} kbit/s, rtt {:.1} ms | {} kept, {} missing",
+            status.rtt_ms, progress.received, progress.missing
+        );
+        if progress.gone > 0 {
+            line += &format!(", {} lost on board", progress.gone);
+        }
+        line
+    }
+}
+
+impl Payload {
+    fn estimate(&mut self, name: &str, state: wh::TargetState, live: bool) -> Option<Arc<str>> {
+        let t = host_time(state.timestamp.as_ref());
+        let target = self.targets.entry(state.target.clone()).or_default();
+        let mut message = json!({"k": "est", "p": name, "target": state.target, "t": ms(t),
+            "status": status_name(state.status), "live": live});
+        if state.known {
+            let figures = json!({"lat": state.lat_deg, "lon": state.lon_deg, "n": state.north_m,
+                "e": state.east_m, "h": state.heading_rad, "v": state.speed_mps,
+                "w": state.yaw_rate_radps, "cov": covariance(&state.covariance)});
+            if let (Value::Object(message), Value::Object(figures)) = (&mut message, figures) {
+                message.extend(figures);
+            }
+        }
+        let text: Arc<str> = message.to_string().into();
+        target.trail.insert(t.ns(), Arc::clone(&text));
+        if target.trail.len() > TRAIL {
+            target.trail.pop_first();
+        }
+        let newer = |old: &Option<wh::TargetState>| {
+            old.as_ref().is_none_or(|old| host_time(old.timestamp.as_ref()) <= t)
+        };
+        if state.known {
+            target.places.insert(t.ns(), (state.lat_deg, state.lon_deg));
+            if target.places.len() > TRAIL {
+                target.places.pop_first();
+            }
+            if newer(&target.known) {
+                target.known = Some(state.clone());
+            }
+        }
+        if newer(&target.latest) {
+            target.latest = Some(state);
+        }
+        Some(text)
+    }
+
+    fn ownship(&mut self, name: &str, own: &wh::Ownship) -> Option<Arc<str>> {
+        let t = host_time(own.timestamp.as_ref());
+        let quaternion = nalgebra::Quaternion::new(own.qw, own.qx, own.qy, own.qz);
+        let attitude = nalgebra::UnitQuaternion::try_new(quaternion, 1e-9)?;
+        let (heading, ..) = euler_321(&attitude.to_rotation_matrix());
+        let text: Arc<str> =
+            json!({"k": "own", "p": name, "t": ms(t), "lat": own.lat_deg, "lon": own.lon_deg,
+            "heading": heading, "above": -own.down_m})
+            .to_string()
+            .into();
+        if self.own.as_ref().is_none_or(|(last, _)| *last <= t.ns()) {
+            self.own = Some((t.ns(), Arc::clone(&text)));
+        }
+        Some(text)
+    }
+
+    fn health(&mut self, name: &str, health: &wh::Health) -> Option<Arc<str>> {
+        let t = host_time(health.timestamp.as_ref());
+        let sources: Vec<Value> = health
+            .sources
+            .iter()
+            .map(|s| {
+                json!({"name": s.name, "rate_hz": s.rate_hz, "age_ms": s.age_ms, "refused": s.refused,
+                    "dropped": s.dropped})
+            })
+            .collect();
+        let text: Arc<str> = json!({"k": "health", "p": name, "t": ms(t), "sources": sources,
+            "fix": health.fix, "sats": health.sats, "clock_sigma_ms": health.clock_sigma_ms,
+            "words": health.words})
+        .to_string()
+        .into();
+        if self.health.as_ref().is_none_or(|(last, _)| *last <= t.ns()) {
+            self.health = Some((t.ns(), Arc::clone(&text)));
+        }
+        Some(text)
+    }
+
+    fn notice(&mut self, name: &str, log: &foxglove::Log) -> Option<Arc<str>> {
+        let t = host_time(log.timestamp.as_ref());
+        let level = u32::try_from(log.level).unwrap_or(0);
+        let text =
+            if log.name.is_empty() { log.message.clone() } else { format!("{}: {}", log.name, log.message) };
+        Some(self.remark(name, t, level, &text))
+    }
+
+    fn remark(&mut self, name: &str, t: MonoTime, level: u32, text: &str) -> Arc<str> {
+        let message = json!({"k": "event", "p": name, "t": ms(t), "level": level, "text": text});
+        let message: Arc<str> = message.to_string().into();
+        self.notices.push_back(Arc::clone(&message));
+        if self.notices.len() > NOTICES {
+            self.notices.pop_front();
+        }
+        message
+    }
+}
+
+/// UTC of a host time as `hhmmss.ss` and `ddmmyy`: host time is close to UTC where the payload's clock was
+/// set.
+pub fn nmea_time(t: MonoTime) -> (String, String) {
+    let civil = crate::time::UtcTime::from_unix_ns(t.ns()).civil();
+    let hundredths = i64::from(civil.nanosecond) / (NS_PER_S / 100);
+    (
+        format!("{:02}{:02}{:02}.{hundredths:02}", civil.hour, civil.minute, civil.second),
+        format!("{:02}{:02}{:02}", civil.day, civil.month, civil.year.rem_euclid(100)),
+    )
+}

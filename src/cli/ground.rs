@@ -1,0 +1,112 @@
+//! `windhover ground`: the receiving station.
+
+use std::io::IsTerminal as _;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use super::{CliError, CliResult};
+use crate::app::ground::{self, GroundSettings};
+use crate::io::link::StationSettings;
+use crate::io::link::tls::KeyFiles;
+
+/// Receive from payloads: keep their flights, show them on a web page, feed other programs.
+#[derive(clap::Args, Debug)]
+pub(super) struct Args {
+    /// Payload to call; may be given several times
+    #[arg(long, value_name = "HOST:PORT")]
+    connect: Vec<String>,
+    /// Address at which payloads that call reach this station
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    listen: Option<SocketAddr>,
+    /// Certificate of the authority
+    #[arg(long, value_name = "FILE", default_value = "keys/authority.pem")]
+    authority: PathBuf,
+    /// Certificate of this station, from `windhover keys station`
+    #[arg(long, value_name = "FILE")]
+    certificate: PathBuf,
+    /// Private key of this station; beside the certificate when not given
+    #[arg(long, value_name = "FILE")]
+    key: Option<PathBuf>,
+    /// Revocation list; beside the authority's certificate when not given, if there is one
+    #[arg(long, value_name = "FILE")]
+    revoked: Option<PathBuf>,
+    /// Directory for the flights received
+    #[arg(long, value_name = "DIR", default_value = "ground")]
+    out: PathBuf,
+    /// Where to serve the web page; elsewhere than on loopback a token is asked for
+    #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:8080")]
+    web: SocketAddr,
+    /// Serve no web page
+    #[arg(long)]
+    no_web: bool,
+    /// Token visitors of the page must know; made up and printed when the page is not on loopback
+    #[arg(long)]
+    token: Option<String>,
+    /// Folder with map tiles (Z/X/Y.png, Web Mercator)
+    #[arg(long, value_name = "DIR")]
+    tiles: Option<PathBuf>,
+    /// Serve the vehicles as NMEA (RMC and GGA) over TCP here, for example 127.0.0.1:10110
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    nmea: Option<SocketAddr>,
+    /// Ask for no thumbnails of the camera image
+    #[arg(long)]
+    no_thumbnails: bool,
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    if args.connect.is_empty() && args.listen.is_none() {
+        return Err(CliError::usage(
+            "say which payload to call (--connect) or where payloads call (--listen)",
+        ));
+    }
+    let token_fits =
+        |t: &String| t.len() >= 8 && t.chars().all(|c| c.is_ascii_alphanumeric() || "-_.~".contains(c));
+    if args.token.as_ref().is_some_and(|token| !token_fits(token)) {
+        return Err(CliError::usage("--token must be at least 8 letters, digits and -_.~"));
+    }
+    let revoked = args.revoked.clone().or_else(|| {
+        let beside = args.authority.with_file_name("revoked.pem");
+        beside.exists().then_some(beside)
+    });
+    let settings = GroundSettings {
+        link: StationSettings {
+            files: KeyFiles {
+                authority: args.authority.clone(),
+                certificate: args.certificate.clone(),
+                key: args.key.clone().unwrap_or_else(|| args.certificate.with_extension("key")),
+                revoked,
+            },
+            listen: args.listen,
+            dial: args.connect.clone(),
+            thumbnails: !args.no_thumbnails,
+        },
+        out: args.out.clone(),
+        web: (!args.no_web).then_some(args.web),
+        token: args.token.clone(),
+        tiles: args.tiles.clone(),
+        nmea: args.nmea,
+        terminal: std::io::stdout().is_terminal(),
+    };
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+    runtime.block_on(async {
+        let stop = tokio::sync::watch::Sender::new(false);
+        let stopped = stop.subscribe();
+        tokio::spawn(async move {
+            let mut terminate =
+                tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()).ok();
+            let terminated = async {
+                match &mut terminate {
+                    Some(signal) => signal.recv().await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                _ = tokio::signal::ctrl_c() => {}
+                _ = terminated => {}
+            }
+            stop.send_replace(true);
+        });
+        ground::run(settings, stopped).await
+    })?;
+    Ok(())
+}

@@ -1,0 +1,132 @@
+//! The whole receiving station: flights on disk, page, feeds.
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use prost::Message as _;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
+use windhover::app::ground::{self, GroundSettings, mirror};
+use windhover::io::link::keys::Role;
+use windhover::io::proto::{timestamp, windhover as wh};
+use windhover::io::records::{Record, Schema};
+use windhover::time::MonoTime;
+
+use crate::team::{Keys, Payload, loopback, payload_settings, station_settings};
+
+const PATIENCE: Duration = Duration::from_secs(15);
+
+/// A free TCP port; another program might take it before the station does, but none of ours.
+fn free_port() -> SocketAddr {
+    std::net::TcpListener::bind("127.0.0.1:0").and_then(|l| l.local_addr()).expect("a port")
+}
+
+async fn ask(address: SocketAddr, path: &str, headers: &str) -> String {
+    let mut stream = TcpStream::connect(address).await.expect("the page's port");
+    let request = format!("GET {path} HTTP/1.1\r\nConnection: close\r\n{headers}\r\n");
+    stream.write_all(request.as_bytes()).await.expect("sent");
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).await.expect("an answer");
+    String::from_utf8_lossy(&answer).into_owned()
+}
+
+async fn eventually(address: SocketAddr, path: &str, headers: &str, word: &str) -> bool {
+    let deadline = tokio::time::Instant::now() + PATIENCE;
+    while tokio::time::Instant::now() < deadline {
+        if TcpStream::connect(address).await.is_ok() && ask(address, path, headers).await.contains(word) {
+            return true;
+        }
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    false
+}
+
+fn state(n: i64) -> Record {
+    let t = MonoTime::from_ns(1_795_046_400_000_000_000 + n * 66_666_667);
+    let state = wh::TargetState {
+        timestamp: Some(timestamp(t)),
+        target: "ugv".into(),
+        status: wh::TrackStatus::Tracking.into(),
+        known: true,
+        lat_deg: 30.0 + n as f64 * 1e-6,
+        lon_deg: -85.0,
+        covariance: vec![0.01; 15],
+        ..Default::default()
+    };
+    Record {
+        topic: "/target/ugv/state".into(),
+        schema: Schema::TargetState,
+        log_time: t,
+        publish_time: t,
+        data: state.encode_to_vec(),
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_station_keeps_shows_and_feeds_what_it_receives() {
+    let keys = Keys::new();
+    let payload = Payload::start(&payload_settings(keys.files(Role::Payload, "alpha"), loopback()), 7, None);
+    let (web, nmea) = (free_port(), free_port());
+    let out = keys.path().join("out");
+    let settings = GroundSettings {
+        link: station_settings(keys.files(Role::Station, "base"), Some(payload.address)),
+        out: out.clone(),
+        web: Some(web),
+        token: None,
+        tiles: None,
+        nmea: Some(nmea),
+        terminal: false,
+    };
+    let stop = tokio::sync::watch::Sender::new(false);
+    let running = tokio::spawn(ground::run(settings, stop.subscribe()));
+    for n in 0..40 {
+        payload.handle.send(&state(n)).expect("for the ground");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    let local = "Host: 127.0.0.1\r\n";
+    assert!(eventually(web, "/vehicles.geojson", local, "30.000039").await, "the last position in GeoJSON");
+    assert!(ask(web, "/", local).await.contains("<title>windhover</title>"));
+    assert!(ask(web, "/vehicles.kml", local).await.contains("ugv (alpha)"));
+    assert!(ask(web, "/", "Host: evil.example\r\n").await.starts_with("HTTP/1.1 403"));
+    let foreign = ask(web, "/live", &format!("{local}Origin: http://evil.example\r\n")).await;
+    assert!(foreign.starts_with("HTTP/1.1 403"), "{foreign}");
+    assert!(ask(web, "/tiles/..%2f/1/1", local).await.starts_with("HTTP/1.1 4"), "no way out of a folder");
+    // NMEA: a state that is new after the client came.
+    let mut plotter = TcpStream::connect(nmea).await.expect("the NMEA port");
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    payload.handle.send(&state(40)).expect("for the ground");
+    let mut sentence = vec![0; 120];
+    let read = tokio::time::timeout(PATIENCE, plotter.read(&mut sentence)).await.expect("in time").expect("read");
+    assert!(sentence[..read].starts_with(b"$GPRMC,"));
+    // When the station ends, everything is on disk, each once.
+    stop.send_replace(true);
+    running.await.expect("no panic").expect("no error");
+    assert_eq!(mirror::recall(&out, "alpha", "boot-7", 7).iter().collect::<Vec<_>>(), [(0, 41)]);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_page_beyond_loopback_asks_for_its_token() {
+    let keys = Keys::new();
+    let web: SocketAddr = ([0, 0, 0, 0], free_port().port()).into();
+    let settings = GroundSettings {
+        link: station_settings(keys.files(Role::Station, "base"), Some(([127, 0, 0, 1], 9).into())),
+        out: keys.path().join("out"),
+        web: Some(web),
+        token: Some("open-sesame".into()),
+        tiles: None,
+        nmea: None,
+        terminal: false,
+    };
+    let stop = tokio::sync::watch::Sender::new(false);
+    let running = tokio::spawn(ground::run(settings, stop.subscribe()));
+    let reach: SocketAddr = ([127, 0, 0, 1], web.port()).into();
+    let host = "Host: station.example\r\n";
+    assert!(eventually(reach, "/?token=open-sesame", host, "<title>").await);
+    for (path, headers) in [("/", host), ("/?token=wrong", host), ("/live", host), ("/vehicles.kml", host)] {
+        assert!(ask(reach, path, headers).await.starts_with("HTTP/1.1 401"), "{path}");
+    }
+    let cookie = format!("{host}Cookie: windhover=open-sesame\r\n");
+    assert!(ask(reach, "/app.js", &cookie).await.starts_with("HTTP/1.1 200"));
+    stop.send_replace(true);
+    running.await.expect("no panic").expect("no error");
+}
