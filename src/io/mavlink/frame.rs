@@ -169,6 +169,15 @@ mod tests {
     }
 
     #[test]
+    fn a_signed_heartbeat_is_byte_for_byte_what_pymavlink_makes() {
+        // The same with key 0707…07, link id 3, time stamp 0x010203040506.
+        let payload = [0, 0, 0, 0, 10, 0, 0, 4, 3];
+        let mut frame = encode(7, SENDER, HEARTBEAT, &payload, true);
+        sign(&mut frame, &SigningKey([7; 32]), 3, 0x0102_0304_0506);
+        assert_eq!(frame, hex("fd090100072a01000000000000000a00000403af650306050403020162df0c2c8a33"));
+    }
+
+    #[test]
     fn the_checksum_of_the_standard_check_string() {
         assert_eq!(CRC.checksum(b"123456789"), 0x6f91);
     }
