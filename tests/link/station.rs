@@ -96,7 +96,8 @@ async fn a_station_keeps_shows_and_feeds_what_it_receives() {
     tokio::time::sleep(Duration::from_millis(300)).await;
     payload.handle.send(&state(40)).expect("for the ground");
     let mut sentence = vec![0; 120];
-    let read = tokio::time::timeout(PATIENCE, plotter.read(&mut sentence)).await.expect("in time").expect("read");
+    let read =
+        tokio::time::timeout(PATIENCE, plotter.read(&mut sentence)).await.expect("in time").expect("read");
     assert!(sentence[..read].starts_with(b"$GPRMC,"));
     // When the station ends, everything is on disk, each once.
     stop.send_replace(true);
