@@ -166,6 +166,7 @@ fn source_event(event: &windhover::SourceEvent) -> Option<EventBody> {
         [Source::Gps, Source::Compass, Source::Camera].into_iter().find(|s| s.name() == event.source)?;
     match event.what.as_str() {
         "dropped" => Some(EventBody::Dropped { source, count: event.count }),
+        "pulse" => Some(EventBody::Pulse),
         "up" => Some(EventBody::SourceUp(source)),
         "down" => Some(EventBody::SourceDown(source)),
         _ => None,

@@ -55,6 +55,8 @@ pub enum EventBody {
         /// How many messages.
         count: u32,
     },
+    /// The receiver's pulse marked a whole second of UTC; `t_recv` is the edge.
+    Pulse,
     /// A device answered.
     SourceUp(Source),
     /// A device went away.

@@ -79,9 +79,9 @@ impl GpsLine {
         self.clock_sigma
     }
 
-    /// The fit, for those who mark the receiver's seconds.
-    pub(super) fn clock(&mut self) -> &mut GnssClock {
-        &mut self.clock
+    /// The receiver's pulse marked a whole second of UTC at this host time.
+    pub(super) fn pulse(&mut self, edge: MonoTime) {
+        self.clock.observe_pulse(edge);
     }
 
     pub(super) fn refused(&self) -> (u64, String) {

@@ -103,13 +103,9 @@ impl Pipeline {
                 }
                 self.take_estimated(t, out);
             }
+            EventBody::Pulse => self.gps.pulse(t),
             EventBody::SourceUp(_) | EventBody::SourceDown(_) => {}
         }
-    }
-
-    /// The receiver's pulse marked a whole second of UTC at this host time.
-    pub fn pulse(&mut self, edge: MonoTime) {
-        self.gps.clock().observe_pulse(edge);
     }
 
     /// The pure part of a frame's handling, which may run ahead on other threads.

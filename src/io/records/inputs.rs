@@ -27,6 +27,7 @@ pub fn of_event(event: &Event) -> Option<Record> {
         EventBody::CompassBytes(bytes) => serial(topic::COMPASS_SERIAL, t, bytes),
         EventBody::Frame(frame) => image(t, frame),
         EventBody::Dropped { source, count } => source_event(*source, "dropped", *count),
+        EventBody::Pulse => source_event(Source::Gps, "pulse", 0),
         EventBody::SourceUp(source) => source_event(*source, "up", 0),
         EventBody::SourceDown(source) => source_event(*source, "down", 0),
         EventBody::Tick => return None,

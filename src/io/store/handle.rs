@@ -121,9 +121,10 @@ impl StoreHandle {
             EventBody::GnssBytes(bytes) => (topic::GPS_SERIAL, bytes.len(), Weight::Small),
             EventBody::CompassBytes(bytes) => (topic::COMPASS_SERIAL, bytes.len(), Weight::Small),
             EventBody::Frame(frame) => (topic::CAMERA_IMAGE, frame.data.len(), Weight::Frame),
-            EventBody::Dropped { .. } | EventBody::SourceUp(_) | EventBody::SourceDown(_) => {
-                (topic::SOURCE_EVENT, 0, Weight::Small)
-            }
+            EventBody::Dropped { .. }
+            | EventBody::Pulse
+            | EventBody::SourceUp(_)
+            | EventBody::SourceDown(_) => (topic::SOURCE_EVENT, 0, Weight::Small),
         };
         let log_ns = encode::unsigned(event.t_recv);
         let value = Work::Event(event.clone());
