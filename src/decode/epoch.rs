@@ -23,6 +23,7 @@ pub(super) struct Draft {
     /// Whether the first sentence of a burst opened it, so that its arrival tells the time.
     pub opens_burst: bool,
     void: bool,
+    confirmed: bool,
     epoch: GnssEpoch,
     fix_told: Option<FixKind>,
     sats_listed: Option<u32>,
@@ -47,6 +48,7 @@ impl Draft {
             end: begin,
             opens_burst,
             void: false,
+            confirmed: false,
             epoch: GnssEpoch::default(),
             fix_told: None,
             sats_listed: None,
@@ -68,6 +70,7 @@ impl Draft {
         self.time_of_day_ns = self.time_of_day_ns.or(report.time_of_day_ns);
         self.date = self.date.or(report.date);
         self.void |= report.valid == Some(false);
+        self.confirmed |= report.valid == Some(true) || report.fix > Some(FixKind::None);
         self.fix_told = self.fix_told.max(report.fix);
         if let Some(listed) = report.sats_listed {
             self.sats_listed = Some(self.sats_listed.unwrap_or(0) + listed);
@@ -139,7 +142,7 @@ impl Draft {
 
     /// What all sentences agree on: one that calls the fix void is believed.
     fn fix_kind(&self) -> FixKind {
-        if self.void || self.epoch.lat_deg.is_none() {
+        if self.void || !self.confirmed || self.epoch.lat_deg.is_none() {
             return FixKind::None;
         }
         match self.fix_told {

@@ -6,6 +6,8 @@
 
 mod burst;
 mod compass;
+#[cfg(test)]
+mod compass_tests;
 mod compass_text;
 mod counts;
 mod epoch;

@@ -147,7 +147,8 @@ fn of_gga(report: &mut Report, data: &GgaData) {
     let measured = data.fix_type.is_some_and(|fix| {
         !matches!(fix, FixType::Invalid | FixType::Estimated | FixType::Manual | FixType::Simulation)
     });
-    report.valid = Some(measured);
+    // A fix of no satellites is one only if another sentence says so.
+    report.valid = (!measured || data.fix_satellites != Some(0)).then_some(measured);
     report.sats = data.fix_satellites;
     report.hdop = data.hdop.map(decimal);
     if measured {

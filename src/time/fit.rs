@@ -215,3 +215,136 @@ impl GnssClock {
         self.fit.fit(self.points.make_contiguous());
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, Exp1, StandardNormal};
+
+    use super::*;
+
+    const LATENCY: Span = Span::from_ns(120_000_000);
+    /// 23:59:30 UTC of some day, so that every run passes midnight.
+    const START_NS: i64 = 1_795_046_370_000_000_000;
+
+    enum Jitter {
+        OneSided(f64),
+        Normal(f64),
+    }
+
+    impl Jitter {
+        fn draw(&self, rng: &mut impl Rng) -> Span {
+            Span::from_ms(match *self {
+                Self::OneSided(mean) => mean * Distribution::<f64>::sample(&Exp1, rng),
+                Self::Normal(sigma) => sigma * Distribution::<f64>::sample(&StandardNormal, rng),
+            })
+        }
+    }
+
+    /// Errors in ms of a receiver of 5 Hz heard by a host that is `drift_ppm` fast.
+    fn errors_ms(jitter: &Jitter, drift_ppm: f64, seconds: i64, seed: u64) -> Vec<f64> {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut clock = GnssClock::new(LATENCY);
+        let mut errors = Vec::new();
+        for epoch in 0..seconds * 5 {
+            let since_ns = epoch * 200_000_000;
+            let valid = MonoTime::from_ns(START_NS + since_ns + (since_ns as f64 * drift_ppm * 1e-6) as i64);
+            let arrival = valid + LATENCY + jitter.draw(&mut rng);
+            let time_of_day_ns = (START_NS + since_ns).rem_euclid(DAY_NS);
+            clock.observe(time_of_day_ns, arrival);
+            let fitted = clock.host_time_of(time_of_day_ns, arrival);
+            errors.push(fitted.map_or(f64::NAN, |(t, _)| (t - valid).ms()));
+        }
+        errors
+    }
+
+    fn rms(errors: &[f64]) -> f64 {
+        (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt()
+    }
+
+    #[test]
+    fn the_fit_is_within_two_milliseconds_whatever_the_jitter() {
+        let cases = [
+            Jitter::OneSided(5.0),
+            Jitter::OneSided(17.5),
+            Jitter::OneSided(30.0),
+            Jitter::Normal(5.0),
+            Jitter::Normal(15.0),
+        ];
+        for (index, jitter) in cases.iter().enumerate() {
+            let errors = errors_ms(jitter, 30.0, 80, index as u64 + 1);
+            let settled = rms(&errors[200..]);
+            assert!(settled < 2.0, "case {index}: {settled} ms rms after 40 s");
+            // From the first epoch the error is that of one arrival at most
+            assert!(errors.iter().all(|e| e.abs() < 120.0), "case {index}");
+        }
+    }
+
+    #[test]
+    fn it_settles_within_seconds_where_the_jitter_is_one_sided() {
+        let errors = errors_ms(&Jitter::OneSided(17.5), 0.0, 10, 3);
+        assert!(rms(&errors[25..]) < 4.0, "{} ms rms from 5 s on", rms(&errors[25..]));
+    }
+
+    #[test]
+    fn single_wild_arrivals_change_nothing() {
+        let mut clock = GnssClock::new(LATENCY);
+        let at = |k: i64| (k * 200_000_000, MonoTime::from_ns(START_NS + k * 200_000_000) + LATENCY);
+        for k in 0..50 {
+            let (time, arrival) = at(k);
+            clock.observe(time, arrival + Span::from_ms(if k % 7 == 6 { 400.0 } else { 0.0 }));
+        }
+        let (time, arrival) = at(50);
+        let (t_valid, sigma) = clock.host_time_of(time, arrival + Span::from_ms(400.0)).expect("a fit");
+        assert!((t_valid - (arrival - LATENCY)).ms().abs() < 1.0, "a late epoch is still put in its place");
+        assert!(sigma.ms() < 2.0);
+    }
+
+    #[test]
+    fn a_step_of_either_clock_is_followed() {
+        let mut clock = GnssClock::new(LATENCY);
+        let step = |k: i64| if k < 50 { 0 } else { 3_723 * NS_PER_S };
+        for k in 0..60 {
+            let t = MonoTime::from_ns(START_NS + k * 200_000_000);
+            clock.observe((k * 200_000_000 + step(k)).rem_euclid(DAY_NS), t + LATENCY);
+        }
+        let t = MonoTime::from_ns(START_NS + 12 * NS_PER_S);
+        let (t_valid, _) = clock.host_time_of(12 * NS_PER_S + step(60), t + LATENCY).expect("a fit");
+        assert!((t_valid - t).ms().abs() < 1.0);
+        assert!(clock.host_time_of(12 * NS_PER_S, t + LATENCY).is_none(), "the old time is no more");
+    }
+
+    #[test]
+    fn an_announced_leap_second_is_followed_at_once() {
+        let mut clock = GnssClock::new(LATENCY);
+        let last_minute_ns = DAY_NS - 60 * NS_PER_S;
+        for k in 0..310 {
+            let t = MonoTime::from_ns(START_NS + k * 200_000_000);
+            let elapsed_ns = last_minute_ns + k * 200_000_000;
+            // 23:59:60 is second 86400 of its day; the next day begins after it.
+            let of_day = if k < 305 { elapsed_ns } else { elapsed_ns - DAY_NS - NS_PER_S };
+            clock.observe(of_day, t + LATENCY);
+            let (t_valid, _) = clock.host_time_of(of_day, t + LATENCY).expect("a fit");
+            assert!((t_valid - t).ms().abs() < 1.0, "epoch {k}: {:?}", t_valid - t);
+        }
+    }
+
+    #[test]
+    fn a_pulse_takes_the_latency_out() {
+        // Given a receiver 40 ms later than configured
+        let mut clock = GnssClock::new(LATENCY);
+        let late = Span::from_ms(40.0);
+        for k in 0..30 {
+            let t = MonoTime::from_ns(START_NS + k * 200_000_000);
+            clock.observe(k * 200_000_000, t + LATENCY + late);
+            if k % 5 == 0 {
+                clock.observe_pulse(t);
+            }
+        }
+        let t = MonoTime::from_ns(START_NS + 6 * NS_PER_S);
+        let (t_valid, sigma) = clock.host_time_of(6 * NS_PER_S, t + LATENCY + late).expect("a fit");
+        assert!((t_valid - t).ms().abs() < 0.1 && sigma.ms() < 0.1);
+        assert!(clock.state().expect("a fit").pulse);
+    }
+}

@@ -202,3 +202,50 @@ fn most_coherent_period(times: &[f64]) -> Option<(f64, f64)> {
     let periods = (0..=count as u32).map(|k| 1.0 / (low + (high - low) * f64::from(k) / count));
     periods.map(|period| (period, coherence(times, period).0)).max_by(|a, b| a.1.total_cmp(&b.1))
 }
+
+#[cfg(test)]
+mod tests {
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, Exp1};
+
+    use super::*;
+
+    /// Errors in ms of samples that arrive late by a mean of `late_ms`, some of them missing; the
+    /// rate goes from 30 to 25 Hz in the middle.
+    fn errors_ms(late_ms: f64, seed: u64) -> Vec<f64> {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let (mut clock, mut errors, mut t) = (SteadyClock::new(), Vec::new(), MonoTime::from_ns(1 << 60));
+        for sample in 0..1_000 {
+            t += Span::from_s(if sample < 500 { 1.0 / 30.0 } else { 1.0 / 25.0 });
+            if rng.random_bool(0.03) {
+                continue;
+            }
+            let late = Span::from_ms(late_ms * Distribution::<f64>::sample(&Exp1, &mut rng));
+            errors.push((clock.smooth(t + late) - t).ms());
+        }
+        errors
+    }
+
+    #[test]
+    fn jitter_is_taken_out_through_gaps_and_a_change_of_rate() {
+        for late_ms in [0.6, 2.0] {
+            let errors = errors_ms(late_ms, 11);
+            let rms = |part: &[f64]| (part.iter().map(|e| e * e).sum::<f64>() / part.len() as f64).sqrt();
+            assert!(rms(&errors[60..460]) < 1.0, "{late_ms}: {}", rms(&errors[60..460]));
+            assert!(rms(&errors[560..]) < 1.0, "{late_ms}: {}", rms(&errors[560..]));
+        }
+    }
+
+    #[test]
+    fn without_a_rate_arrivals_are_given_back() {
+        let mut clock = SteadyClock::new();
+        let mut t = MonoTime::default();
+        for step in [3.0, 700.0, 12.0, 250.0, 90.0].repeat(12) {
+            t += Span::from_ms(step);
+            assert!((clock.smooth(t) - t).abs() <= Span::from_ms(700.0));
+        }
+        let mut burst = SteadyClock::new();
+        (0..100).for_each(|_| assert_eq!(burst.smooth(t), t, "all in one read"));
+    }
+}

@@ -1,0 +1,33 @@
+//! Any bytes of a compass line, in every format: no panic, values in range.
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+use windhover::config::CompassFormat;
+use windhover::decode::CompassDecoder;
+use windhover::time::MonoTime;
+
+const FORMATS: [CompassFormat; 7] = [
+    CompassFormat::Tcm2,
+    CompassFormat::Os5000,
+    CompassFormat::Hmr3000,
+    CompassFormat::Revolution,
+    CompassFormat::Pni,
+    CompassFormat::Pashr,
+    CompassFormat::Nmea,
+];
+
+// The first byte chooses the format and how long reads are.
+fuzz_target!(|data: &[u8]| {
+    let Some((&choice, stream)) = data.split_first() else {
+        return;
+    };
+    let format = FORMATS[usize::from(choice) % FORMATS.len()];
+    let (mut decoder, mut out) = (CompassDecoder::new(format), Vec::new());
+    for read in stream.chunks(usize::from(choice) / FORMATS.len() + 1) {
+        decoder.push(read, MonoTime::default(), &mut out);
+    }
+    for heard in out {
+        assert!(heard.reading.heading_deg.is_none_or(|deg| (0.0..=360.0).contains(&deg)));
+        assert!(heard.bytes > 0);
+    }
+});

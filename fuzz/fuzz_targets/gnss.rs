@@ -1,0 +1,28 @@
+//! Any bytes of a GPS line, cut anywhere: no panic, bounded output, values in range.
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+use windhover::decode::GnssDecoder;
+use windhover::time::{MonoTime, Span};
+
+// The first byte sets how long reads are and how far apart, so that the clocked paths run as well.
+fuzz_target!(|data: &[u8]| {
+    let Some((&pace, stream)) = data.split_first() else {
+        return;
+    };
+    let (mut decoder, mut out) = (GnssDecoder::new(), Vec::new());
+    let mut now = MonoTime::from_ns(1_795_014_245_000_000_000);
+    for read in stream.chunks(usize::from(pace % 61) + 1) {
+        now += Span::from_ms(f64::from(pace));
+        decoder.push(read, now, &mut out);
+        decoder.tick(now, &mut out);
+    }
+    decoder.flush(&mut out);
+    // The shortest epoch is one sentence of fifteen bytes.
+    assert!(out.len() <= stream.len() / 15 + 1);
+    for heard in out {
+        assert!(heard.epoch.lat_deg.is_none_or(|lat| (-90.0..=90.0).contains(&lat)));
+        assert!(heard.epoch.lon_deg.is_none_or(|lon| (-180.0..=180.0).contains(&lon)));
+        assert!(heard.t_last_byte >= heard.t_first_byte);
+    }
+});
