@@ -18,6 +18,8 @@ const GATE_MS: f64 = 20.0;
 const GATE_FIRST: (usize, f64) = (10, 300.0);
 /// Epochs in a row off the line, and within this of each other, begin a new one.
 const RESTART: (usize, f64) = (5, 150.0);
+/// One-sigma of the first arrival, milliseconds: that the first few agree may be chance.
+const FIRST_SIGMA_MS: f64 = 20.0;
 /// Nanoseconds in a day.
 const DAY_NS: i64 = 86_400 * NS_PER_S;
 /// How long after an epoch is true it may at most be heard to be put in time by the fit.
@@ -152,7 +154,10 @@ impl GnssClock {
         if self.pulse_holds(at) {
             return PULSE_SIGMA;
         }
-        self.reference.map_or(Span::ZERO, |(reference, _)| Span::from_ms(self.fit.at((at - reference).s()).1))
+        let by_chance = FIRST_SIGMA_MS / self.points.len().max(1) as f64;
+        self.reference.map_or(Span::ZERO, |(reference, _)| {
+            Span::from_ms(self.fit.at((at - reference).s()).1.hypot(by_chance))
+        })
     }
 
     /// Validity less time of day: of the pulse where one holds, else of the arrivals.

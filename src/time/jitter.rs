@@ -20,6 +20,9 @@ const NOISE_MIN_MS: f64 = 0.1;
 /// Part of the arrivals that have nothing to do with the jitter, and their density over a second.
 const WILD_PART: f64 = 0.01;
 const WILD_DENSITY: f64 = WILD_PART / 1_000.0;
+/// Belief (log) in symmetric against one-sided jitter before anything is seen: operating systems and
+/// receivers are late, not early.
+const LOG_SYMMETRIC: f64 = -3.0;
 /// Newton steps at most; from the line before, two or three do.
 const STEPS_MAX: usize = 30;
 /// Candidates lighter than the heaviest by more than this (log) are looked at seldom.
@@ -182,7 +185,8 @@ impl Candidate {
         let det = aa * bb - ab * ab;
         self.line = line;
         self.covariance = [bb / det, -ab / det, aa / det];
-        self.log_weight = here.log - 0.5 * det.ln();
+        let belief = if self.shape.tau == 0.0 { LOG_SYMMETRIC } else { 0.0 };
+        self.log_weight = here.log - 0.5 * det.ln() + belief;
         self.fitted = true;
     }
 
