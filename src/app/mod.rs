@@ -9,6 +9,7 @@ pub mod export;
 pub mod flight;
 pub mod ground;
 pub mod health;
+pub mod import;
 pub mod inbox;
 pub mod log;
 pub mod outlets;

@@ -8,6 +8,7 @@ mod error;
 mod export;
 mod generate;
 mod ground;
+mod import;
 mod keys;
 mod montecarlo;
 mod replay;
@@ -36,6 +37,8 @@ enum Command {
     Calibrate(calibrate::Args),
     /// Run a recorded capture or flight through the pipeline that flies
     Replay(replay::Args),
+    /// Make a capture of recordings you already have
+    Import(import::Args),
     /// Write the outputs of a flight for other tools
     Export(export::Args),
     /// Write manual pages and shell completions
@@ -77,6 +80,7 @@ pub fn main() -> ExitCode {
     let result = match cli.command {
         Command::Calibrate(args) => calibrate::run(&args),
         Command::Replay(args) => replay::run(&args),
+        Command::Import(args) => import::run(&args),
         Command::Export(args) => export::run(&args),
         Command::Generate(args) => generate::run(&args),
         Command::Run(args) => run::run(&args),

@@ -49,7 +49,7 @@ impl McapWriter<BufWriter<File>> {
 
 impl<W: Write + Seek> McapWriter<W> {
     /// Begins a recording on any seekable output. `config_toml` becomes the attachment
-    /// [`CONFIG_ATTACHMENT`]; versions go into the metadata record `windhover`.
+    /// [`CONFIG_ATTACHMENT`] unless it is empty; versions go into the metadata record `windhover`.
     pub fn new(output: W, config_toml: &str, began: MonoTime) -> Result<Self, WriteError> {
         let options = WriteOptions::new()
             .compression(Some(Compression::Lz4))
@@ -58,13 +58,15 @@ impl<W: Write + Seek> McapWriter<W> {
             .library(concat!("windhover ", env!("CARGO_PKG_VERSION")));
         let mut writer = options.create(output)?;
         let t = unsigned(began);
-        writer.attach(&Attachment {
-            log_time: t,
-            create_time: t,
-            name: CONFIG_ATTACHMENT.into(),
-            media_type: "application/toml".into(),
-            data: config_toml.as_bytes().into(),
-        })?;
+        if !config_toml.is_empty() {
+            writer.attach(&Attachment {
+                log_time: t,
+                create_time: t,
+                name: CONFIG_ATTACHMENT.into(),
+                media_type: "application/toml".into(),
+                data: config_toml.as_bytes().into(),
+            })?;
+        }
         let mut versions = BTreeMap::new();
         versions.insert("version".to_owned(), env!("CARGO_PKG_VERSION").to_owned());
         versions.insert("magnetic_model".to_owned(), "WMM2025".to_owned());

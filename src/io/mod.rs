@@ -5,6 +5,7 @@ pub mod capture;
 pub mod clock;
 pub mod device;
 pub mod link;
+pub mod import;
 pub mod mcap_read;
 pub mod mcap_write;
 pub mod notify;

@@ -1,0 +1,75 @@
+//! `windhover import --gps FILE --compass FILE --video FILE|FOLDER --out CAPTURE.mcap`
+
+use std::path::PathBuf;
+
+use super::{CliError, CliResult};
+use crate::app::{config_file, import};
+use crate::io::import::parse_time;
+use crate::time::MonoTime;
+
+/// Make a capture of recordings you already have: serial logs with a time a line, and a video.
+#[derive(clap::Args, Debug)]
+#[command(
+    after_help = "Serial logs: each line starts with a time (seconds since any epoch, or ISO 8601) and one
+space, then what came over the line. Video: a folder of images with times.csv (time_s,file), Motion
+JPEG in AVI, Y4M, or whatever an installed ffmpeg reads. All times are on one clock.
+
+Example:
+  windhover import --gps gps.log --compass compass.log --video frames/ \\
+                   --config windhover.toml --out capture.mcap"
+)]
+pub(super) struct Args {
+    /// Log of the GPS receiver's line
+    #[arg(long, value_name = "FILE")]
+    gps: Option<PathBuf>,
+    /// Log of the compass's line
+    #[arg(long, value_name = "FILE")]
+    compass: Option<PathBuf>,
+    /// Video file, or folder of images with times.csv
+    #[arg(long, value_name = "FILE|FOLDER")]
+    video: Option<PathBuf>,
+    /// When a video file's first frame was taken [default: with the first line of the logs]
+    #[arg(long, value_name = "TIME", value_parser = time)]
+    video_start: Option<MonoTime>,
+    /// Configuration to attach, so that the capture replays by itself
+    #[arg(long)]
+    config: Option<PathBuf>,
+    /// Capture to write
+    #[arg(long, value_name = "CAPTURE")]
+    out: PathBuf,
+}
+
+fn time(text: &str) -> Result<MonoTime, String> {
+    parse_time(text).ok_or_else(|| format!("{text:?} is no time: give seconds or ISO 8601"))
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    let config = match &args.config {
+        Some(file) => {
+            config_file::load(file).map_err(CliError::config)?.to_toml().map_err(CliError::config)?
+        }
+        None => String::new(),
+    };
+    let sources = import::Sources {
+        gps: args.gps.clone(),
+        compass: args.compass.clone(),
+        video: args.video.clone(),
+        video_start: args.video_start,
+    };
+    let imported = import::import(&sources, &config, &args.out).map_err(|error| match error {
+        import::ImportFailure::Nothing => CliError::usage(error),
+        other => CliError::failed(other),
+    })?;
+    for warning in &imported.warnings {
+        eprintln!("windhover: {warning}");
+    }
+    eprintln!(
+        "imported {} GPS lines, {} compass lines and {} frames over {:.1} s",
+        imported.gps_lines,
+        imported.compass_lines,
+        imported.frames,
+        imported.length.s()
+    );
+    eprintln!("wrote {}", args.out.display());
+    Ok(())
+}

@@ -1,0 +1,122 @@
+//! YUV4MPEG2: the header's size and rate, then frames of planes; the luma plane is kept.
+
+use std::io::{BufRead, Read};
+use std::path::{Path, PathBuf};
+
+use super::folder::grey;
+use super::{Frames, ImportError};
+use crate::msg::FramePayload;
+use crate::time::{MonoTime, Span};
+
+/// Longest header line accepted.
+const HEADER_MAX: u64 = 4096;
+/// Largest side accepted, pixels.
+const SIDE_MAX: usize = 16_384;
+
+struct Header {
+    width: usize,
+    height: usize,
+    rate_hz: f64,
+    /// Bytes of chroma after the luma plane.
+    chroma: usize,
+}
+
+/// Frames of a Y4M stream; the first was taken at `start`.
+pub(super) fn frames<R: BufRead + 'static>(
+    mut input: R,
+    path: &Path,
+    start: MonoTime,
+) -> Result<Frames, ImportError> {
+    let header = read_header(&mut input, path)?;
+    let mut reader = Reader { input, path: path.to_owned(), header, start, index: 0, ended: false };
+    Ok(Box::new(std::iter::from_fn(move || reader.next_frame())))
+}
+
+fn read_line(input: &mut impl BufRead) -> std::io::Result<Vec<u8>> {
+    let mut line = Vec::new();
+    input.take(HEADER_MAX).read_until(b'\n', &mut line)?;
+    Ok(line)
+}
+
+fn read_header(input: &mut impl BufRead, path: &Path) -> Result<Header, ImportError> {
+    let refused = |reason: &str| ImportError::video(path, reason);
+    let line = read_line(input).map_err(|e| ImportError::io(path, e))?;
+    let text = String::from_utf8_lossy(&line);
+    let mut words = text.split_ascii_whitespace();
+    if words.next() != Some("YUV4MPEG2") {
+        return Err(refused("is no Y4M video: it does not begin with YUV4MPEG2"));
+    }
+    let (mut width, mut height, mut rate_hz, mut space) = (0, 0, None, "420");
+    for word in words {
+        let value = word.get(1..).unwrap_or("");
+        match word.as_bytes()[0] {
+            b'W' => width = value.parse().unwrap_or(0),
+            b'H' => height = value.parse().unwrap_or(0),
+            b'F' => rate_hz = rate(value),
+            b'C' => space = value,
+            _ => {}
+        }
+    }
+    if width == 0 || height == 0 || width > SIDE_MAX || height > SIDE_MAX {
+        return Err(refused("its Y4M header gives no sensible size"));
+    }
+    let half = |n: usize| n.div_ceil(2);
+    let chroma = match space {
+        s if s.contains("p1") || s.contains("mono1") => return Err(refused("has more than 8 bits a sample")),
+        s if s.starts_with("mono") => 0,
+        s if s.starts_with("422") => 2 * half(width) * height,
+        s if s.starts_with("444") => 2 * width * height,
+        s if s.starts_with("420") => 2 * half(width) * half(height),
+        _ => return Err(refused("has a chroma layout that is not read here; use 420, 422, 444 or mono")),
+    };
+    let rate_hz = rate_hz.ok_or_else(|| refused("its Y4M header gives no frame rate"))?;
+    Ok(Header { width, height, rate_hz, chroma })
+}
+
+fn rate(text: &str) -> Option<f64> {
+    let (n, d) = text.split_once(':')?;
+    let rate = n.parse::<f64>().ok()? / d.parse::<f64>().ok()?;
+    (rate.is_finite() && rate > 0.0).then_some(rate)
+}
+
+struct Reader<R> {
+    input: R,
+    path: PathBuf,
+    header: Header,
+    start: MonoTime,
+    index: u32,
+    ended: bool,
+}
+
+impl<R: BufRead> Reader<R> {
+    fn next_frame(&mut self) -> Option<Result<FramePayload, ImportError>> {
+        if self.ended {
+            return None;
+        }
+        let frame = self.read_frame();
+        self.ended = !matches!(frame, Ok(Some(_)));
+        frame.transpose()
+    }
+
+    /// A frame cut off at the end of the file ends the video.
+    fn read_frame(&mut self) -> Result<Option<FramePayload>, ImportError> {
+        let line = read_line(&mut self.input).map_err(|e| ImportError::io(&self.path, e))?;
+        if line.is_empty() {
+            return Ok(None);
+        }
+        if !line.starts_with(b"FRAME") {
+            let reason = format!("is damaged after frame {}: no FRAME marker follows", self.index);
+            return Err(ImportError::video(&self.path, reason));
+        }
+        let Header { width, height, rate_hz, chroma } = self.header;
+        let mut luma = vec![0; width * height];
+        let mut rest = vec![0; chroma];
+        if self.input.read_exact(&mut luma).and_then(|()| self.input.read_exact(&mut rest)).is_err() {
+            return Ok(None);
+        }
+        let t = self.start + Span::from_s(f64::from(self.index) / rate_hz);
+        let frame = grey(self.index, t, width as u32, height as u32, luma);
+        self.index += 1;
+        Ok(Some(frame))
+    }
+}
