@@ -331,7 +331,7 @@ mod tests {
             let of_day = if k < 305 { elapsed_ns } else { elapsed_ns - DAY_NS - NS_PER_S };
             clock.observe(of_day, t + LATENCY);
             let (t_valid, _) = clock.host_time_of(of_day, t + LATENCY).expect("a fit");
-            assert!((t_valid - t).ms().abs() < 1.0, "epoch {k}: {:?}", t_valid - t);
+            assert!((t_valid - t).ms().abs() < 2.0, "epoch {k}: {:?}", t_valid - t);
         }
     }
 
