@@ -77,6 +77,8 @@ pub(super) struct Keeper {
     queued: u64,
     tasks: VecDeque<Task>,
     present: Option<(u32, String)>,
+    /// Whether the index was told to be complete since it was opened.
+    complete: bool,
 }
 
 impl Keeper {
@@ -93,6 +95,7 @@ impl Keeper {
             queued: 0,
             tasks: VecDeque::new(),
             present: None,
+            complete: false,
         }
     }
 
@@ -206,6 +209,7 @@ impl Keeper {
                 self.queued = index.queued_runs().iter().map(|(_, first, end)| u64::from(end - first)).sum();
                 self.shared.set_index(Some(index.clone()));
                 self.index = Some(index);
+                self.complete = false;
                 self.tasks.push_back(Task::Look);
                 self.apply();
             }
@@ -229,6 +233,10 @@ impl Keeper {
         };
         if let Err(error) = done {
             self.shared.notice(StoreNotice::Failed { reason: error.to_string() });
+        }
+        if let (true, false, Some(index)) = (self.tasks.is_empty(), self.complete, &self.index) {
+            self.shared.notice(StoreNotice::IndexReady { flights: index.flights().len() });
+            self.complete = true;
         }
     }
 
@@ -256,9 +264,6 @@ impl Keeper {
                 self.tasks.push_back(Task::Settle(name));
             }
         }
-        if self.index.is_some() && !self.tasks.iter().any(|t| matches!(t, Task::Settle(_))) {
-            self.shared.notice(StoreNotice::IndexReady { flights: known.len() });
-        }
         Ok(())
     }
 
@@ -281,9 +286,6 @@ impl Keeper {
         if let Some(index) = self.index.clone() {
             let room = self.config.backfill_records.saturating_sub(self.queued);
             self.queued += rebuild::index_flight(self.volume.root(), name, &index, room)?;
-            if !self.tasks.iter().any(|t| matches!(t, Task::Settle(_))) {
-                self.shared.notice(StoreNotice::IndexReady { flights: index.flights().len() });
-            }
         }
         Ok(())
     }
