@@ -16,6 +16,7 @@ use clap::Parser;
 use windhover::config::{FramePolicy, StoreConfig};
 use windhover::io::clock::HostClock;
 use windhover::io::records::{Record, Schema, topic};
+use windhover::io::store::index::{Change, Index, QueuedRecord};
 use windhover::io::store::volume::Volume;
 use windhover::io::store::{Store, StoreHandle};
 use windhover::msg::{Event, EventBody, FrameEncoding, FramePayload};
@@ -40,6 +41,9 @@ struct Args {
     /// Megabytes that must stay free
     #[arg(long, default_value_t = 64)]
     floor_mb: u64,
+    /// Only the index: one commit a `--seconds` second, of `--estimates-hz` records, as fast as it goes
+    #[arg(long)]
+    index_only: bool,
     /// Print what is durable
     #[arg(long)]
     acks: bool,
@@ -156,8 +160,37 @@ fn feed(args: &Args, feeder: &mut Feeder, began: MonoTime) {
     }
 }
 
+/// Commits queue records to an index alone; tells bytes to the block layer for each byte of data.
+fn index_only(args: &Args) {
+    let index = Index::open(&args.dir.join("index")).expect("a directory to write to");
+    let (mut bytes, before) = (0, bytes_to_block_layer());
+    let each = args.estimates_hz as u32;
+    for commit in 0..args.seconds as u32 {
+        let record = |n: u32| QueuedRecord {
+            topic: topic::target_state("ugv"),
+            schema: Schema::TargetState.name().into(),
+            log_ns: u64::from(n) << 26,
+            publish_ns: u64::from(n) << 26,
+            data: (0..160u32).map(|k| (k.wrapping_mul(n) >> 2) as u8).collect(),
+        };
+        let changes: Vec<Change> =
+            (commit * each..(commit + 1) * each).map(|n| Change::Queue(1, n, record(n))).collect();
+        bytes += changes.len() as u64 * (160 + 17 + 20 + 16 + 2 + 9);
+        index.apply(&changes).expect("commits");
+    }
+    drop(index);
+    let written = bytes_to_block_layer() - before;
+    println!(
+        "index: {bytes} bytes of records, {written} to the block layer: {:.2}",
+        written as f64 / bytes as f64
+    );
+}
+
 fn main() {
     let args = Args::parse();
+    if args.index_only {
+        return index_only(&args);
+    }
     let policy: FramePolicy =
         serde_json::from_value(args.frames.clone().into()).expect("jpeg, png, zstd, region or none");
     let config = StoreConfig {

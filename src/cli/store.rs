@@ -10,7 +10,7 @@ use clap::{Args as ClapArgs, Subcommand};
 
 use super::{CliError, CliResult};
 use crate::app::config_file;
-use crate::io::store::flight;
+use crate::io::store::flight::{self, FLIGHTS};
 use crate::io::store::inspect;
 use crate::io::store::volume::Volume;
 
@@ -58,6 +58,8 @@ enum Action {
     },
     /// Make the index again from the segments (the daemon must not run)
     Rebuild,
+    /// Write the outputs of a flight for other tools
+    Export(Export),
     /// Never delete a flight to make room
     Keep {
         /// Flights
@@ -78,6 +80,18 @@ enum Action {
     },
 }
 
+#[derive(ClapArgs, Debug)]
+struct Export {
+    /// Flight
+    flight: String,
+    /// What to write
+    #[arg(long, value_enum)]
+    format: crate::app::export::Format,
+    /// Directory to write into [default: named after the flight]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+}
+
 pub(super) fn run(args: &Args) -> CliResult {
     let root = match &args.path {
         Some(path) => path.clone(),
@@ -93,6 +107,7 @@ pub(super) fn run(args: &Args) -> CliResult {
         Action::Verify { flight } => check::verify(&root, &resolve_all(&root, flight)?, flight.is_empty()),
         Action::Repair { flight } => check::repair(&root, &resolve_all(&root, flight)?),
         Action::Rebuild => check::rebuild(&root),
+        Action::Export(export) => run_export(&root, export),
         Action::Keep { flight, undo } => keep(&root, &resolve_all(&root, flight)?, !undo),
         Action::Delete { flight, yes } => delete(&root, &resolve_all(&root, flight)?, *yes),
     }
@@ -127,6 +142,19 @@ fn resolve_all(root: &Path, asked: &[String]) -> Result<Vec<String>, CliError> {
         return Ok(inspect::list(root)?.0.into_iter().map(|info| info.name).collect());
     }
     asked.iter().map(|name| resolve(root, name)).collect()
+}
+
+fn run_export(root: &Path, export: &Export) -> CliResult {
+    let name = resolve(root, &export.flight)?;
+    let out = export.out.clone().unwrap_or_else(|| PathBuf::from(&name));
+    let written = crate::app::export::export(&root.join(FLIGHTS).join(&name), export.format, &out)?;
+    for warning in &written.warnings {
+        eprintln!("windhover: {warning}");
+    }
+    for file in &written.files {
+        eprintln!("wrote {}", file.display());
+    }
+    Ok(())
 }
 
 fn keep(root: &Path, names: &[String], keep: bool) -> CliResult {

@@ -65,6 +65,30 @@ impl Schema {
         }
     }
 
+    /// The schema of that full name.
+    pub fn named(name: &str) -> Option<Self> {
+        const ALL: [Schema; 17] = [
+            Schema::SerialBytes,
+            Schema::SourceEvent,
+            Schema::CompressedImage,
+            Schema::RawImage,
+            Schema::LocationFix,
+            Schema::FrameTransform,
+            Schema::CameraCalibration,
+            Schema::ImageAnnotations,
+            Schema::Log,
+            Schema::TargetState,
+            Schema::Ownship,
+            Schema::Datum,
+            Schema::Detections,
+            Schema::GnssEpoch,
+            Schema::Attitude,
+            Schema::Fusion,
+            Schema::Health,
+        ];
+        ALL.into_iter().find(|schema| schema.name() == name)
+    }
+
     /// The descriptor set that goes into a file beside messages of this schema.
     pub fn descriptor(self) -> Vec<u8> {
         let package = self.name().split_once('.').map_or("", |(package, _)| package);

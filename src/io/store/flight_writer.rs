@@ -146,9 +146,9 @@ impl FlightWriter {
         Ok(finished)
     }
 
-    /// Bytes appended to the present segment.
-    pub fn segment_bytes(&self) -> u64 {
-        self.segment.as_ref().map_or(0, |(segment, _)| segment.len())
+    /// Bytes of all its segments so far.
+    pub fn bytes(&self) -> u64 {
+        self.finished.bytes + self.segment.as_ref().map_or(0, |(segment, _)| segment.len())
     }
 
     fn finish_segment(&mut self) -> StoreResult<Option<FinishedSegment>> {

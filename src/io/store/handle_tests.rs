@@ -136,6 +136,15 @@ fn a_flight_is_recorded_named_and_read_again() {
         (number, &record.data[..], &record.topic[..]),
         (7, &7u32.to_le_bytes()[..], "/target/ugv/state")
     );
+
+    // The link reads them as its backlog: as many as fit, from where it asks.
+    let backlog: &dyn crate::io::link::Backlog = &handle;
+    let extents = backlog.extents();
+    assert_eq!((extents[0].run, extents[0].first, extents[0].end, &extents[0].flight[..]), (1, 0, 40, name));
+    let read = backlog.read(1, 38, 99, 10_000);
+    assert_eq!(read.iter().map(|(n, _)| *n).collect::<Vec<_>>(), [38, 39]);
+    assert_eq!(read[0].1.schema, Schema::TargetState);
+    assert_eq!(backlog.read(1, 0, 40, 1).len(), 1);
     store.stop();
 }
 

@@ -4,6 +4,7 @@
 //! the only one to wait for the card, one keeps house (index, sealing, old flights). Callers hold a
 //! [`StoreHandle`] and never wait. `docs/storage.md` tells the layout and what is guaranteed.
 
+mod backlog;
 #[cfg(test)]
 mod crash_tests;
 mod encode;

@@ -176,7 +176,6 @@ impl Recorder {
             self.record_dropout(now);
         }
         let Some(flight) = &mut self.flight else { return };
-        let before = flight.segment_bytes();
         let result = flight.commit(unsigned(now));
         let after = self.clock.now();
         self.committed.add((after - now).ms());
@@ -184,11 +183,9 @@ impl Recorder {
             Err(error) => return self.fail(&error),
             Ok(finished) => {
                 self.uncommitted = Drops::default();
-                let written =
-                    finished.as_ref().map_or(flight.segment_bytes(), |f| f.bytes).saturating_sub(before);
                 let session = flight.session();
                 let mut status = self.shared.status();
-                status.bytes_written += written;
+                status.bytes_written = flight.bytes();
                 status.last_commit_ns = after.ns();
                 drop(status);
                 self.send_changes();
@@ -346,7 +343,9 @@ impl Recorder {
     fn end(&mut self) {
         let Some(flight) = &mut self.flight else { return };
         let session = flight.session();
-        match flight.finish() {
+        let finished = flight.finish();
+        self.shared.status().bytes_written = flight.bytes();
+        match finished {
             Ok(Some(segment)) => self.send(Message::SegmentDone { session, segment }),
             Ok(None) => {}
             Err(error) => self.shared.notice(StoreNotice::Failed { reason: error.to_string() }),

@@ -37,7 +37,7 @@ pub struct StoreStatus {
     pub dropouts: u64,
     /// Messages dropped.
     pub dropped_messages: u64,
-    /// Bytes written to segments.
+    /// Bytes in the flight's segments.
     pub bytes_written: u64,
     /// Bytes waiting for the card.
     pub waiting_bytes: u64,
