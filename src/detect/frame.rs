@@ -1,5 +1,6 @@
 //! What is looked for in a frame, and where: predicted places first, the rest in strips while tracking.
 
+use super::features::{Circle, FeatureTracker};
 use super::tag::{Region, TagDetector};
 use crate::config::{Config, MarkerKind, TagFamily};
 use crate::msg::{
@@ -19,6 +20,8 @@ pub struct FrameDetector {
     min_px: f64,
     next_strip: usize,
     scratch: Vec<MarkerDetection>,
+    features: FeatureTracker,
+    occupied: Vec<Circle>,
 }
 
 impl FrameDetector {
@@ -36,7 +39,7 @@ impl FrameDetector {
         let detector = &config.detector;
         let tags = (!families.is_empty())
             .then(|| TagDetector::new(&families, detector.min_px, detector.max_hamming));
-        Self { tags, min_px: detector.min_px, next_strip: 0, scratch: Vec::new() }
+        Self { tags, min_px: detector.min_px, next_strip: 0, scratch: Vec::new(), features: FeatureTracker::new(detector.ground_features), occupied: Vec::new() }
     }
 
     /// Fills `out` with what is seen; its frame number is the caller's.
@@ -53,6 +56,10 @@ impl FrameDetector {
             return;
         }
         self.find_tags(image, prediction, &mut out.markers);
+        self.occupied.clear();
+        self.occupied.extend(prediction.iter().flat_map(|p| &p.occupied));
+        self.occupied.extend(out.markers.iter().map(|m| (m.center_px, m.size_px)));
+        self.features.process(image, &self.occupied, &mut out.features);
     }
 
     fn find_tags(
