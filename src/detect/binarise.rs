@@ -30,6 +30,10 @@ impl Bitmap {
     }
 }
 
+/// Least range over maximum, of 256. Ink is a fifth to a tenth as light as paper; blur and haze take some of
+/// that away, while most ground varies less.
+const LEAST_RELATIVE: u16 = 70;
+
 /// Thresholds an image against its surroundings, 12×12 pixels around each tile.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Binariser {
@@ -64,14 +68,15 @@ impl Binariser {
     }
 
     /// Marks pixels below `fraction`/256 of the way from the local minimum to the local maximum, where
-    /// these are at least `gate` apart; elsewhere nothing is dark.
+    /// these are at least `gate` apart and the minimum is well below the maximum; elsewhere nothing is dark.
     pub fn mark(&mut self, image: ImageView<'_>, gate: u8, fraction: u16, out: &mut Bitmap, simd: Simd) {
         let (across, down) = self.tiles;
         self.thresholds.resize(across * down, 0);
         for ((t, &low), &high) in self.thresholds.iter_mut().zip(&self.wide_low).zip(&self.wide_high) {
             let range = high - low;
             let above = (u16::from(range) * fraction + 128) >> 8;
-            *t = if range >= gate { low + above as u8 } else { 0 };
+            let seen = range >= gate && u16::from(range) * 256 >= u16::from(high) * LEAST_RELATIVE;
+            *t = if seen { low + above as u8 } else { 0 };
         }
         let per_row = image.width.div_ceil(64);
         (out.width, out.height) = (image.width, image.height);

@@ -80,7 +80,7 @@ impl Refiner {
         let mut variance = 0.0;
         for round in 0..6 {
             let half = if round == 0 { (0.7 * cell).clamp(1.5, 6.0) } else { (0.5 * cell).clamp(1.25, 4.0) };
-            self.locate(image, &model, half);
+            self.locate(image, &model, half, if round == 0 { 2 } else { 1 });
             if self.located.len() < 24 {
                 return None;
             }
@@ -88,7 +88,7 @@ impl Refiner {
             let (step, info, var) = self.solve(&model, bow, spread)?;
             model.theta += step;
             (information, variance) = (info, var);
-            if step.rows(0, 6).amax() < 0.003 {
+            if round > 0 && step.rows(0, 6).amax() < 0.005 {
                 break;
             }
         }
@@ -103,7 +103,7 @@ impl Refiner {
     fn place_points(&mut self, family: &Family, id: u32, cell: f64) {
         self.points.clear();
         let w = family.width as i32;
-        let per_cell = (cell / 1.2).clamp(2.0, 4.0) as usize;
+        let per_cell = (cell / 1.4).clamp(2.0, 4.0) as usize;
         let light = |x: i32, y: i32| family.is_light(id, x, y);
         let scale = 2.0 / f64::from(w);
         for y in 0..w {
@@ -140,13 +140,14 @@ impl Refiner {
         }
     }
 
-    fn locate(&mut self, image: ImageView<'_>, model: &Model, half: f64) {
+    fn locate(&mut self, image: ImageView<'_>, model: &Model, half: f64, every: usize) {
         self.located.clear();
-        for point in &self.points {
+        for point in self.points.iter().step_by(every) {
             let (p, jacobian) = model.at(point.xi, point.eta);
             // The normal of the edge in the image: across the direction in which it runs.
-            let along = model.direction(point.xi, point.eta, [-point.light[1], point.light[0]]);
-            let towards = model.direction(point.xi, point.eta, point.light);
+            let (d_xi, d_eta) = model.directions(point.xi, point.eta);
+            let along = d_eta * point.light[0] - d_xi * point.light[1];
+            let towards = d_xi * point.light[0] + d_eta * point.light[1];
             let length = along.norm();
             if !(length > 1e-9) {
                 continue;
@@ -188,12 +189,16 @@ impl Refiner {
             let normalised = l.residual / (2.0 * spread);
             // Strong edges are located better, up to the point where noise no longer tells.
             let weight = (l.strength / mean).min(1.5) / (1.0 + normalised * normalised);
-            information.ger(weight, &l.row, &l.row, 1.0);
+            for i in 0..PARAMETERS {
+                let scaled = weight * l.row[i];
+                (0..=i).for_each(|j| information[(i, j)] += scaled * l.row[j]);
+            }
             right.axpy(weight * l.residual, &l.row, 1.0);
             sum += weight * l.residual * l.residual;
             weights += weight;
         }
         let variance = sum / weights * self.located.len() as f64 / (self.located.len() as f64 - 8.0);
+        information.fill_upper_triangle_with_lower_triangle();
         for k in 8..PARAMETERS {
             let hold = variance.max(1e-4) / (bow * bow);
             information[(k, k)] += hold;
@@ -248,11 +253,14 @@ impl Model {
         (p, jacobian)
     }
 
-    /// Image of a direction in the tag.
-    fn direction(&self, xi: f64, eta: f64, d: [f64; 2]) -> Vector2<f64> {
-        let step = 1e-3;
-        (self.at(xi + step * d[0], eta + step * d[1]).0 - self.at(xi - step * d[0], eta - step * d[1]).0)
-            / (2.0 * step)
+    /// Images of the directions of ξ and η.
+    fn directions(&self, xi: f64, eta: f64) -> (Vector2<f64>, Vector2<f64>) {
+        let t = &self.theta;
+        let w = 1.0 / (t[6] * xi + t[7] * eta + 1.0);
+        let (u, v) = ((t[0] * xi + t[1] * eta + t[2]) * w, (t[3] * xi + t[4] * eta + t[5]) * w);
+        let d_xi = Vector2::new(t[0] - u * t[6], t[3] - v * t[6]) * w + self.axes[1] * (2.0 * t[9] * xi);
+        let d_eta = Vector2::new(t[1] - u * t[7], t[4] - v * t[7]) * w + self.axes[0] * (2.0 * t[8] * eta);
+        (d_xi, d_eta)
     }
 
     fn result(&self, information: &Information, variance: f64) -> Option<Refined> {

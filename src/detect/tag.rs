@@ -175,10 +175,11 @@ impl TagDetector {
             self.labeller.label(&self.bits, |c| may_be_border(c, limits, width, height));
             for (component, outline) in self.labeller.kept() {
                 let Some(quad) = self.finder.quad(component, outline, limits) else { continue };
-                let Some(quad) = straighten(level, &quad, gate) else { continue };
-                if self.found.iter().any(|f| same_place(&f.corners, &quad)) {
+                let in_frame = quad.map(|p| p.map(|c| level.to_frame(c)));
+                if self.found.iter().any(|f| same_place(&f.corners, &in_frame)) {
                     continue;
                 }
+                let Some(quad) = straighten(level, &quad, gate) else { continue };
                 let families = self.families.iter().filter(|f| f.inverted == inverted);
                 let found =
                     families.filter_map(|f| decode(image, &self.pyramid, &quad, f, &mut self.refiner)).next();
