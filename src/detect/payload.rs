@@ -110,6 +110,13 @@ impl Grid {
         levels
     }
 
+    /// Whether the border's levels differ by more than a third: a shadow lies across the tag.
+    fn is_shaded(&self, border: &[[f32; MOST]; 4]) -> bool {
+        let cells = border.iter().flat_map(|side| &side[self.pad..self.side - self.pad]);
+        let (least, most) = cells.fold((f32::MAX, f32::MIN), |m, &c| (m.0.min(c), m.1.max(c)));
+        most > 1.3 * least
+    }
+
     /// Two levels on either side of a straight line, where the border's levels fall into two groups: a
     /// shadow's edge across the tag. The line is a least-squares discriminant of the border cells.
     fn halves_threshold(&self, border: &[[f32; MOST]; 4]) -> Option<[f32; MOST * MOST]> {
@@ -121,9 +128,6 @@ impl Grid {
             [(t, near, border[0][k]), (far, t, border[1][k]), (t, far, border[2][k]), (near, t, border[3][k])]
         });
         let (least, most) = cells.clone().fold((f32::MAX, f32::MIN), |m, c| (m.0.min(c.2), m.1.max(c.2)));
-        if most < 1.3 * least {
-            return None;
-        }
         let split = 0.5 * (least + most);
         let (mut dark, mut lit, mut slope, mut square) = ((0.0, 0.0f32), (0.0, 0.0f32), [0.0f32; 2], 0.0);
         for (x, y, level) in cells.clone() {
@@ -209,6 +213,9 @@ pub(super) fn read(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family:
         return Some(reading);
     }
     let border = grid.border_levels();
+    if !grid.is_shaded(&border) {
+        return None;
+    }
     if let Some(reading) = grid.halves_threshold(&border).and_then(|t| grid.read(&t, family)) {
         return Some(reading);
     }

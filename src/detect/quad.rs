@@ -33,7 +33,8 @@ pub(super) fn may_be_border(c: &Component, limits: SizeLimits, width: usize, hei
     let size_fits = long + 1.0 >= limits.least && short <= 1.5 * limits.most;
     let shape_fits = short + 1.0 >= 0.55 * limits.least && short >= LEAST_ASPECT * long;
     // A border is a quarter to a half of its tag; of a large one only a rim is dark against what is near.
-    let fill_fits = c.area as f32 >= (0.17 * w * h).min(2.0 * (w + h));
+    let area = c.area as f32;
+    let fill_fits = area >= (0.17 * w * h).min(2.0 * (w + h)) && area <= MOST_FILL * w * h;
     let inside =
         c.left > 0 && c.top > 0 && usize::from(c.right) + 1 < width && usize::from(c.bottom) + 1 < height;
     size_fits && shape_fits && fill_fits && inside
@@ -202,32 +203,42 @@ pub(super) fn corners_of(lines: &[Line; 4]) -> Option<Quad> {
     Some(quad)
 }
 
-/// Whether 13 of 16 pairs of pixels across a quadrilateral's sides are darker inside, by `least_step` and
-/// by a tenth of what the outer one is.
+/// Whether a quadrilateral looks like a tag at a glance: 13 of 16 pairs of pixels across its sides are darker
+/// inside, by `least_step` and by a tenth of what the outer one is, and among 36 pixels further in some are
+/// about as light as outside and some about as dark as the border.
 ///
 /// `reach` is how far inside and outside the side the pairs lie, pixels.
-pub(super) fn border_is_dark(image: ImageView<'_>, quad: &Quad, reach: f32, least_step: f32) -> bool {
-    let mut wrong = 0;
+pub(super) fn looks_like_tag(image: ImageView<'_>, quad: &Quad, reach: f32, least_step: f32) -> bool {
+    let (mut wrong, mut dark, mut light) = (0, 0.0, 0.0);
     for i in 0..4 {
         let (a, b) = (quad[i], quad[(i + 1) % 4]);
         let n = Line::through(a, b).n;
         for t in [0.2, 0.4, 0.6, 0.8] {
             let at = [a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])];
             let pixel = |d: f32| nearest(image, [at[0] + d * n[0], at[1] + d * n[1]]);
-            let dark = match (pixel(-reach), pixel(reach)) {
-                (Some(inside), Some(outside)) => {
-                    let (inside, outside) = (f32::from(inside), f32::from(outside));
-                    outside - inside >= least_step.max(0.1 * outside)
-                }
-                _ => false,
-            };
-            wrong += u32::from(!dark);
-            if wrong > 3 {
-                return false;
-            }
+            let (Some(inside), Some(outside)) = (pixel(-reach), pixel(reach)) else { return false };
+            let (inside, outside) = (f32::from(inside), f32::from(outside));
+            wrong += u32::from(outside - inside < least_step.max(0.1 * outside));
+            dark += inside / 16.0;
+            light += outside / 16.0;
+        }
+        if wrong > 3 {
+            return false;
         }
     }
-    true
+    let (low, high) = (dark + 0.6 * (light - dark), dark + 0.4 * (light - dark));
+    let (mut lights, mut darks) = (0, 0);
+    for k in 0..36 {
+        let (x, y) = (0.19 + 0.124 * (k % 6) as f32, 0.19 + 0.124 * (k / 6) as f32);
+        let mix = |c: usize| {
+            let (top, bottom) = (quad[0][c] + x * (quad[1][c] - quad[0][c]), quad[3][c] + x * (quad[2][c] - quad[3][c]));
+            top + y * (bottom - top)
+        };
+        let value = nearest(image, [mix(0), mix(1)]).map_or(0.0, f32::from);
+        lights += u32::from(value > high);
+        darks += u32::from(value < low);
+    }
+    lights >= 4 && darks >= 4
 }
 
 fn nearest(image: ImageView<'_>, [u, v]: Point) -> Option<u8> {

@@ -7,7 +7,7 @@ use super::family::{Family, Word};
 use super::noise::noise_sigma;
 use super::payload;
 use super::pyramid::{Base, Level, Pyramid};
-use super::quad::{Quad, QuadFinder, SizeLimits, border_is_dark, distance, may_be_border};
+use super::quad::{Quad, QuadFinder, SizeLimits, looks_like_tag, distance, may_be_border};
 use super::refine::{Refined, Refiner};
 use super::simd::Simd;
 use crate::config::TagFamily;
@@ -194,7 +194,7 @@ impl TagDetector {
 fn straighten(level: Level<'_>, quad: &Quad, gate: u8) -> Option<Quad> {
     let edge = mean_edge(quad);
     let least_step = f32::from(gate) / 3.0;
-    if !border_is_dark(level.image, quad, (edge / 16.0).clamp(0.8, 4.0), least_step) {
+    if !looks_like_tag(level.image, quad, (edge / 16.0).clamp(0.8, 4.0), least_step) {
         return None;
     }
     let search = EdgeSearch { reach: (edge / 8.0).clamp(1.5, 3.0), least_step };
