@@ -142,8 +142,7 @@ impl FeatureTracker {
                 let (tu, tv) = (level.from_frame(t.at[0]), level.from_frame(t.at[1]));
                 (tu as usize / w, tv as usize / h) == (part % across, part / across)
             });
-            if !taken
-                && let Some((score, at)) = best_corner(level, (u, v, w, h), occupied, &mut self.scores)
+            if !taken && let Some((score, at)) = best_corner(level, (u, v, w, h), occupied, &mut self.scores)
             {
                 order.push((score, at));
             }
@@ -291,7 +290,10 @@ fn gradients(p: &[f32; AREA]) -> ([f32; AREA], [f32; AREA]) {
         k if k == SIDE - 1 => p[i] - p[i - stride],
         _ => 0.5 * (p[i + stride] - p[i - stride]),
     };
-    (std::array::from_fn(|i| difference(i, i % SIDE, 1)), std::array::from_fn(|i| difference(i, i / SIDE, SIDE)))
+    (
+        std::array::from_fn(|i| difference(i, i % SIDE, 1)),
+        std::array::from_fn(|i| difference(i, i / SIDE, SIDE)),
+    )
 }
 
 /// The place in part `(u, v, w, h)` of a level with the largest smaller eigenvalue of the gradient matrix

@@ -39,7 +39,14 @@ impl FrameDetector {
         let detector = &config.detector;
         let tags = (!families.is_empty())
             .then(|| TagDetector::new(&families, detector.min_px, detector.max_hamming));
-        Self { tags, min_px: detector.min_px, next_strip: 0, scratch: Vec::new(), features: FeatureTracker::new(detector.ground_features), occupied: Vec::new() }
+        Self {
+            tags,
+            min_px: detector.min_px,
+            next_strip: 0,
+            scratch: Vec::new(),
+            features: FeatureTracker::new(detector.ground_features),
+            occupied: Vec::new(),
+        }
     }
 
     /// Fills `out` with what is seen; its frame number is the caller's.

@@ -82,8 +82,9 @@ fn pose_of_homography(seen: &[[f64; 2]; 4], size_m: f64) -> Option<Isometry3<f64
     // The homography's origin is the first corner, the tag's its centre.
     let middle = Vector3::new(size_m / 2.0, size_m / 2.0, 1.0);
     let center = h * middle / middle.z * scale;
-    (rotation.matrix().determinant() > 0.5 && center.z > 0.0)
-        .then(|| Isometry3::from_parts(Translation3::from(center), UnitQuaternion::from_rotation_matrix(&rotation)))
+    (rotation.matrix().determinant() > 0.5 && center.z > 0.0).then(|| {
+        Isometry3::from_parts(Translation3::from(center), UnitQuaternion::from_rotation_matrix(&rotation))
+    })
 }
 
 /// The pose whose image is the same but for perspective: mirrored across the plane square to the line of

@@ -231,7 +231,8 @@ pub(super) fn looks_like_tag(image: ImageView<'_>, quad: &Quad, reach: f32, leas
     for k in 0..36 {
         let (x, y) = (0.19 + 0.124 * (k % 6) as f32, 0.19 + 0.124 * (k / 6) as f32);
         let mix = |c: usize| {
-            let (top, bottom) = (quad[0][c] + x * (quad[1][c] - quad[0][c]), quad[3][c] + x * (quad[2][c] - quad[3][c]));
+            let (top, bottom) =
+                (quad[0][c] + x * (quad[1][c] - quad[0][c]), quad[3][c] + x * (quad[2][c] - quad[3][c]));
             top + y * (bottom - top)
         };
         let value = nearest(image, [mix(0), mix(1)]).map_or(0.0, f32::from);

@@ -7,7 +7,7 @@ use super::family::{Family, Word};
 use super::noise::noise_sigma;
 use super::payload;
 use super::pyramid::{Base, Level, Pyramid};
-use super::quad::{Quad, QuadFinder, SizeLimits, looks_like_tag, distance, may_be_border};
+use super::quad::{Quad, QuadFinder, SizeLimits, distance, looks_like_tag, may_be_border};
 use super::refine::{Refined, Refiner};
 use super::simd::Simd;
 use crate::config::TagFamily;
