@@ -28,6 +28,9 @@ pub(super) fn run(args: &Args) -> CliResult {
     let page = report::render(&args.flight, &flight, truth.as_ref())?;
     std::fs::write(&args.out, page)
         .map_err(|e| CliError::failed(format!("cannot write {}: {e}", args.out.display())))?;
+    if let Some(table) = truth.as_ref().and_then(|truth| report::error_text(&flight, truth)) {
+        print!("{table}");
+    }
     println!("{}", args.out.display());
     Ok(())
 }

@@ -4,6 +4,7 @@ use nalgebra::{SMatrix, SVector};
 
 use super::page::{Section, figure, grid, paragraph, table};
 use super::{Context, cloud, line};
+use crate::app::flight::{Flight, Track};
 use crate::app::truth::Truth;
 use crate::geo::{Geodetic, LocalFrame, wrap_angle};
 use crate::io::proto::windhover as wh;
@@ -120,20 +121,15 @@ fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
 
 /// The section; nothing without truth.
 pub(super) fn section(context: &Context<'_>) -> Option<Section> {
-    let (truth, frame) = (context.truth?, context.frame()?);
+    let truth = context.truth?;
     let (name, track) = context.flight.targets.iter().next()?;
-    let at = |s: &wh::TargetState| context.flight.at(s.timestamp.as_ref());
-    let estimators = [
-        ("real time", errors_of(&track.filtered, truth, &frame, at), Ink::Blue),
-        ("smoothed", errors_of(&track.smoothed, truth, &frame, at), Ink::Green),
-        ("paper", errors_of(&track.paper, truth, &frame, at), Ink::Orange),
-    ];
+    let estimators = estimators_of(context.flight, track, truth)?;
     let mut body = paragraph(&format!(
         "Estimates of {name} against the truth given, root mean square after the first {SETTLING_S:.0} s. \
          The position's own mean error is the receiver's bias; without it remains what matters for following. \
          Normalised error squared (NEES) is near 5 and 3 where the covariances tell the truth; larger is overconfident."
     ));
-    body += &error_table(&estimators);
+    body += &table(&ERROR_COLUMNS, &error_rows(&estimators));
     let specs = [
         ("Error north", "m", 0, 1.0),
         ("Error east", "m", 1, 1.0),
@@ -150,9 +146,22 @@ pub(super) fn section(context: &Context<'_>) -> Option<Section> {
     Some(Section { id: "accuracy", title: "Errors", body })
 }
 
-fn error_table(estimators: &[(&str, Errors, Ink)]) -> String {
+/// Columns of the error table.
+const ERROR_COLUMNS: [&str; 9] = [
+    "estimator",
+    "frames",
+    "position m",
+    "without mean m",
+    "heading °",
+    "speed m/s",
+    "yaw rate rad/s",
+    "NEES of 5",
+    "NEES of ψ v ω",
+];
+
+fn error_rows(estimators: &[(&str, Errors, Ink)]) -> Vec<Vec<String>> {
     let figure = |v: Option<f64>, digits: usize| v.map_or("–".to_owned(), |v| format!("{v:.digits$}"));
-    let rows: Vec<Vec<String>> = estimators
+    estimators
         .iter()
         .filter(|(_, errors, _)| !errors.rows.is_empty())
         .map(|(name, errors, _)| {
@@ -169,19 +178,36 @@ fn error_table(estimators: &[(&str, Errors, Ink)]) -> String {
                 figure(nees.map(|n| n.1), 2),
             ]
         })
-        .collect();
-    let head = [
-        "estimator",
-        "frames",
-        "position m",
-        "without mean m",
-        "heading °",
-        "speed m/s",
-        "yaw rate rad/s",
-        "NEES of 5",
-        "NEES of ψ v ω",
-    ];
-    table(&head, &rows)
+        .collect()
+}
+
+/// The error table of a flight's first target as text for a terminal; `None` where nothing can be
+/// compared.
+pub fn error_text(flight: &Flight, truth: &Truth) -> Option<String> {
+    let (_, track) = flight.targets.iter().next()?;
+    let rows = error_rows(&estimators_of(flight, track, truth)?);
+    let head = ERROR_COLUMNS.map(String::from).to_vec();
+    let all: Vec<Vec<String>> = std::iter::once(head).chain(rows).collect();
+    let width = |k: usize| all.iter().map(|row| row[k].chars().count()).max().unwrap_or(0);
+    let line = |row: &Vec<String>| {
+        let cells = row.iter().enumerate().map(|(k, cell)| {
+            let pad = " ".repeat(width(k) - cell.chars().count());
+            if k == 0 { format!("{cell}{pad}") } else { format!("{pad}{cell}") }
+        });
+        cells.collect::<Vec<_>>().join("  ") + "\n"
+    };
+    (all.len() > 1).then(|| all.iter().map(line).collect())
+}
+
+/// Errors of each estimator, with its ink.
+fn estimators_of(flight: &Flight, track: &Track, truth: &Truth) -> Option<[(&'static str, Errors, Ink); 3]> {
+    let frame = LocalFrame::new(flight.datum?);
+    let at = |s: &wh::TargetState| flight.at(s.timestamp.as_ref());
+    Some([
+        ("real time", errors_of(&track.filtered, truth, &frame, at), Ink::Blue),
+        ("smoothed", errors_of(&track.smoothed, truth, &frame, at), Ink::Green),
+        ("paper", errors_of(&track.paper, truth, &frame, at), Ink::Orange),
+    ])
 }
 
 fn error_chart(

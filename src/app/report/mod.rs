@@ -19,7 +19,7 @@ use crate::geo::{Geodetic, LocalFrame};
 use crate::io::mcap_read::ReadError;
 use crate::plot::{Chart, Ink, Mark, thin};
 
-pub use accuracy::{Errors, errors_of};
+pub use accuracy::{Errors, error_text, errors_of};
 
 /// Points drawn of one line.
 const LINE_POINTS: usize = 600;

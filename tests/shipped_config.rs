@@ -1,0 +1,45 @@
+//! The shipped configuration explains every key and tells true defaults.
+
+use windhover::config::Config;
+
+fn shipped() -> String {
+    std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/config/windhover.toml")).unwrap()
+}
+
+/// The file with every default that is shown behind `#` put in force.
+fn with_defaults_spelt_out(text: &str) -> String {
+    let is_default = |line: &str| {
+        line.strip_prefix('#').is_some_and(|rest| rest.starts_with(|c: char| c.is_ascii_lowercase()))
+    };
+    text.lines().map(|line| if is_default(line) { &line[1..] } else { line }).collect::<Vec<_>>().join("\n")
+}
+
+#[test]
+fn it_is_valid_and_its_defaults_are_the_programs() {
+    let text = shipped();
+    let as_shipped = Config::parse(&text).unwrap();
+    let spelt_out = Config::parse(&with_defaults_spelt_out(&text)).unwrap();
+    assert_eq!(as_shipped.to_toml().unwrap(), spelt_out.to_toml().unwrap());
+}
+
+#[test]
+fn every_key_is_there() {
+    let text = shipped();
+    let effective = Config::parse(&text).unwrap().to_toml().unwrap();
+    for line in effective.lines() {
+        let Some((key, _)) = line.split_once(" = ") else { continue };
+        let mentioned =
+            text.lines().any(|l| l.trim_start_matches(['#', ' ']).starts_with(&format!("{key} =")));
+        assert!(mentioned, "{key} is not explained in config/windhover.toml");
+    }
+}
+
+#[test]
+fn unknown_and_absurd_values_are_told_by_name() {
+    let text = shipped().replace("[gps]", "[gps]\ntypo = 1");
+    let error = Config::parse(&text).unwrap_err().to_string();
+    assert!(error.contains("typo") && error.contains("line"), "{error}");
+    let text = shipped().replace("fx = 1019", "fx = -1019");
+    let error = Config::parse(&text).unwrap_err().to_string();
+    assert!(error.contains("camera.intrinsics.fx"), "{error}");
+}
