@@ -68,6 +68,10 @@ impl GpsLine {
             }
             // An epoch without a time, or one the fit does not know, was true a latency ago.
             let fitted = heard.epoch.time_of_day_ns.and_then(|of_day| self.clock.host_time_of(of_day, began));
+            if !heard.opens_burst && fitted.is_none() {
+                // Another instant within a burst, which neither its arrival nor the fit puts in time.
+                continue;
+            }
             self.clock_sigma = fitted.map(|(_, sigma)| sigma);
             let t_valid = fitted.map_or(began - self.latency, |(t, _)| t);
             out.push(Stamped { t_valid, t_recv: heard.t_last_byte, seq, value: heard.epoch });

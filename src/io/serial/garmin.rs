@@ -23,11 +23,13 @@ pub(super) enum Step {
 /// on (PGRMC1 fields 3 and 7: averaging would freeze a hovering helicopter); then those decoded on.
 /// Bodies without `$` and checksum. `PGRMO` is not echoed by every firmware, so only `PGRMC1` must
 /// be answered.
-const SENTENCES: [(&str, bool); 6] = [
+const SENTENCES: [(&str, bool); 7] = [
     ("PGRMO,,2", false),
     ("PGRMC1,1,1,1,,,,2", true),
     ("PGRMO,GPRMC,1", false),
     ("PGRMO,GPGGA,1", false),
+    // GSA alone tells a two-dimensional fix, whose GGA still carries an altitude.
+    ("PGRMO,GPGSA,1", false),
     ("PGRMO,PGRME,1", false),
     ("PGRMO,PGRMV,1", false),
 ];
@@ -142,7 +144,7 @@ mod tests {
 
     #[test]
     fn echoes_are_checked() {
-        assert_eq!(run(|sentence| Some(sentence.to_owned())), Step::Accepted(6));
+        assert_eq!(run(|sentence| Some(sentence.to_owned())), Step::Accepted(7));
         let silent = run(|_| None);
         assert!(matches!(&silent, Step::Refused(why) if why.contains("did not answer PGRMC1")), "{silent:?}");
         let other = run(|s| Some(s.replace("1,1,1,", "1,1,2,")));
