@@ -4,6 +4,7 @@ pub mod brain;
 pub mod card;
 pub mod config_file;
 pub mod devices;
+pub mod downlink;
 pub mod events;
 pub mod export;
 pub mod flight;

@@ -9,10 +9,12 @@ use crate::pipeline::Output;
 use crate::time::{MonoTime, UtcTime};
 
 use super::card::Slot;
+use super::downlink::Downlink;
 
 /// The data card and the link, from the pipeline's side. Nothing here waits.
 pub struct Outlets {
     slot: Slot,
+    downlink: Downlink,
     recorder: Recorder,
     records: Vec<Record>,
     began: Option<MonoTime>,
@@ -22,9 +24,10 @@ pub struct Outlets {
 
 impl Outlets {
     /// For a pipeline of this configuration.
-    pub fn new(config: &Config, slot: Slot) -> Self {
+    pub fn new(config: &Config, slot: Slot, downlink: Downlink) -> Self {
         Self {
             slot,
+            downlink,
             recorder: Recorder::new(config),
             records: Vec::new(),
             began: None,
@@ -36,8 +39,11 @@ impl Outlets {
     /// Keeps an event as it was heard.
     pub fn event(&mut self, event: &Event) {
         self.began.get_or_insert(event.t_recv);
+        self.downlink.event(event);
         let Some(store) = self.slot.get() else {
-            self.opened = false;
+            if std::mem::replace(&mut self.opened, false) {
+                self.downlink.store_closed();
+            }
             return;
         };
         // A flight opened anew begins with what every flight begins with, and wants its date again.
@@ -52,6 +58,7 @@ impl Outlets {
 
     /// Keeps and sends an output that followed from what was heard at `t`.
     pub fn output(&mut self, output: &Output, t: MonoTime) {
+        self.downlink.output(output);
         self.recorder.output(output, t, &mut self.records);
         let store = self.slot.get();
         if let Some(store) = &store {
@@ -62,9 +69,10 @@ impl Outlets {
             }
         }
         for record in self.records.drain(..) {
-            let record = Arc::new(record);
+            // Sent first: the ground hears of it before the card does.
+            let number = self.downlink.record(&record);
             if let Some(store) = &store {
-                store.record(Arc::clone(&record), None);
+                store.record(Arc::new(record), number);
             }
         }
     }

@@ -35,6 +35,7 @@ use crate::io::device::Stop;
 use super::brain::{self, Board};
 use super::card::{self, CardOrders, Slot};
 use super::devices::{self, Surroundings};
+use super::downlink::{self, Downlink};
 use super::inbox::Inbox;
 use super::log::Log;
 use super::outlets::Outlets;
@@ -80,6 +81,12 @@ pub fn start(config: &Config, clock: HostClock, log: &Log) -> std::io::Result<Gr
     let mut tasks = Supervisor::new(clock);
 
     let (slot, orders) = (Slot::default(), CardOrders::default());
+    let downlink = Downlink::default();
+    {
+        let (config, around, board) = (config.clone(), around.clone(), board.clone());
+        let (slot, downlink) = (slot.clone(), downlink.clone());
+        tasks.spawn(LINK, move |heart| downlink::run(&config, &around, &board, &slot, &downlink, &heart))?;
+    }
     {
         let (config, around, board) = (config.clone(), around.clone(), board.clone());
         let (slot, orders) = (slot.clone(), orders.clone());
@@ -87,7 +94,7 @@ pub fn start(config: &Config, clock: HostClock, log: &Log) -> std::io::Result<Gr
     }
     {
         let (config, around, board) = (config.clone(), around.clone(), board.clone());
-        let (outlets, orders) = (Outlets::new(&config, slot), orders.clone());
+        let (outlets, orders) = (Outlets::new(&config, slot, downlink), orders.clone());
         tasks.spawn(PIPELINE, move |heart| brain::run(&config, &around, &board, outlets, &orders, &heart))?;
     }
     for (rule, device) in [

@@ -14,6 +14,7 @@ mod receive;
 mod sense;
 mod session;
 mod station;
+mod store_backlog;
 mod thumbnail;
 pub mod tls;
 mod wire;
@@ -28,4 +29,5 @@ pub use station::{
     Arrival, Channel, FromPayload, OpenStation, PayloadStatus, Recall, StationHandle, StationLink,
     StationSettings,
 };
+pub use store_backlog::StoreBacklog;
 pub use thumbnail::Picture;

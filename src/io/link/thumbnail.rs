@@ -5,21 +5,17 @@ use prost::Message as _;
 
 use crate::io::proto::link::Thumbnail;
 use crate::io::records;
-use crate::msg::{FeatureTrack, GrayImage, MarkerDetection};
-use crate::time::MonoTime;
+use crate::msg::{FeatureTrack, FramePayload, GrayImage, MarkerDetection};
+use crate::pipeline::frame;
 
 /// JPEG quality: a thumbnail of 320 × 256 takes about 8 KB.
 const QUALITY: u8 = 60;
 
-/// A frame offered for the next thumbnail.
+/// A frame offered for the next thumbnail, as the camera gave it.
 #[derive(Clone, Debug)]
 pub struct Picture {
-    /// Number of the frame.
-    pub frame: u32,
-    /// Exposure.
-    pub t_exposure: MonoTime,
     /// The frame.
-    pub image: std::sync::Arc<GrayImage>,
+    pub frame: FramePayload,
     /// Markers found in it.
     pub markers: Vec<MarkerDetection>,
     /// Ground features found in it.
@@ -48,22 +44,24 @@ fn shrink(image: &GrayImage, factor: usize) -> GrayImage {
 }
 
 impl Picture {
-    /// The thumbnail, about `width` pixels wide; `None` where the frame is empty.
+    /// The thumbnail, about `width` pixels wide; `None` where the frame cannot be read or is empty.
     pub fn thumbnail(&self, width: u32) -> Option<Thumbnail> {
-        let factor = (self.image.width / width.max(1) as usize).max(1);
-        let small = shrink(&self.image, factor);
+        let image = frame::decode(&self.frame, false).ok()?.gray;
+        let factor = (image.width / width.max(1) as usize).max(1);
+        let small = shrink(&image, factor);
         let size = (u16::try_from(small.width).ok()?, u16::try_from(small.height).ok()?);
         if size.0 == 0 || size.1 == 0 {
             return None;
         }
         let mut jpeg = Vec::new();
         Encoder::new(&mut jpeg, QUALITY).encode(&small.data, size.0, size.1, ColorType::Luma).ok()?;
-        let found = records::detections(self.frame, self.t_exposure, &self.markers, &self.features);
+        let found =
+            records::detections(self.frame.index, self.frame.t_exposure, &self.markers, &self.features);
         Some(Thumbnail {
-            frame: self.frame,
-            time_ns: self.t_exposure.ns(),
-            width: self.image.width as u32,
-            height: self.image.height as u32,
+            frame: self.frame.index,
+            time_ns: self.frame.t_exposure.ns(),
+            width: image.width as u32,
+            height: image.height as u32,
             jpeg,
             detections: found.encode_to_vec(),
         })
@@ -73,6 +71,8 @@ impl Picture {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::msg::FrameEncoding;
+    use crate::time::MonoTime;
 
     #[test]
     fn a_thumbnail_shows_the_mean_and_keeps_the_size_of_the_frame() {
@@ -83,16 +83,21 @@ mod tests {
         let small = shrink(&image, 4);
         assert_eq!((small.width, small.height), (16, 12));
         assert_eq!((small.data[0], small.data[15]), (40, 200));
-        let picture = Picture {
-            frame: 7,
+        let frame = FramePayload {
+            index: 7,
             t_exposure: MonoTime::from_ns(5),
-            image: image.into(),
-            markers: Vec::new(),
-            features: Vec::new(),
+            encoding: FrameEncoding::Grey,
+            width: 64,
+            height: 48,
+            stride: 64,
+            data: image.data.into(),
         };
+        let picture = Picture { frame, markers: Vec::new(), features: Vec::new() };
         let thumbnail = picture.thumbnail(16).expect("a thumbnail");
         assert_eq!((thumbnail.frame, thumbnail.width, thumbnail.height), (7, 64, 48));
         assert_eq!(thumbnail.jpeg[..2], [0xff, 0xd8]);
-        assert!(Picture { image: GrayImage::new(0, 0).into(), ..picture }.thumbnail(16).is_none());
+        let mut cut_off = picture;
+        cut_off.frame.data = vec![0; 10].into();
+        assert!(cut_off.thumbnail(16).is_none());
     }
 }

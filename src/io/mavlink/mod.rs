@@ -69,6 +69,7 @@ pub struct MavlinkSender {
     datum: Option<Geodetic>,
     geoid_m: Option<f64>,
     latest: Vec<Option<TargetEstimate>>,
+    utc_from_host_ns: Option<i64>,
     started: Option<MonoTime>,
     heartbeat: Option<MonoTime>,
     sequence: u8,
@@ -104,6 +105,7 @@ impl MavlinkSender {
             datum: None,
             geoid_m: None,
             latest: vec![None; config.target.len()],
+            utc_from_host_ns: None,
             started: None,
             heartbeat: None,
             sequence: 0,
@@ -122,7 +124,12 @@ impl MavlinkSender {
                 }
             }
             Output::Datum(_, datum) => self.datum = Some(*datum),
-            Output::Fix(fix) => self.geoid_m = fix.value.geoid_m.or(self.geoid_m),
+            Output::Fix(fix) => {
+                self.geoid_m = fix.value.geoid_m.or(self.geoid_m);
+                if let Some(utc) = fix.value.utc {
+                    self.utc_from_host_ns = Some(utc.unix_ns() - fix.t_valid.ns());
+                }
+            }
             _ => {}
         }
     }
@@ -140,8 +147,9 @@ impl MavlinkSender {
     }
 
     /// Sends heartbeats once a second and the state of every vehicle that is known; call it at the
-    /// configured rate. Signed messages wait until UTC is known, for signatures carry the time.
-    pub fn send(&mut self, now: MonoTime, utc: Option<UtcTime>) {
+    /// configured rate. Signed messages wait until the receiver told UTC, for signatures carry the time.
+    pub fn send(&mut self, now: MonoTime) {
+        let utc = self.utc_from_host_ns.map(|ahead| UtcTime::from_unix_ns(now.ns().saturating_add(ahead)));
         let started = *self.started.get_or_insert(now);
         self.resolve(now);
         self.listen(utc);

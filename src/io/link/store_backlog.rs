@@ -1,0 +1,79 @@
+//! Back-fill out of the store on the data card: earlier runs, and what memory no longer holds.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ring::rand::SecureRandom as _;
+
+use super::backlog::{Backlog, Extent};
+use crate::io::records::Record;
+use crate::io::store::StoreHandle;
+
+/// Name under which the card keeps its identity.
+const CARD: &str = "link.card";
+/// How long the card may take to tell it.
+const WAIT: Duration = Duration::from_millis(500);
+
+/// The store's queue. Its runs count 1, 2, 3, … on each card, so that a card made anew begins again; on the
+/// link they are told apart by a random number that the card carries.
+pub struct StoreBacklog {
+    store: StoreHandle,
+    card: u32,
+}
+
+impl StoreBacklog {
+    /// Over a store; also gives the identity of the present run on the link and its flight's name. Waits
+    /// for the card up to a second.
+    pub fn open(store: StoreHandle) -> (Self, u32, String) {
+        let session = store.run();
+        let known = store.state(CARD, WAIT).and_then(|blob| Some(u32::from_be_bytes(blob.try_into().ok()?)));
+        let card = known.unwrap_or_else(|| {
+            let mut fresh = [0; 4];
+            // Without random bytes runs of different cards may be confused, which is all that fails.
+            let _ = ring::rand::SystemRandom::new().fill(&mut fresh);
+            store.put_state(CARD, fresh.to_vec());
+            u32::from_be_bytes(fresh)
+        });
+        let flight = store.index().and_then(|index| index.flight(session)).unwrap_or_else(|| boot_name(session));
+        (Self { store, card }, session ^ card, flight)
+    }
+}
+
+fn boot_name(session: u32) -> String {
+    format!("boot-{session}")
+}
+
+/// A run of the card as the link knows it.
+fn on_link(mut extent: Extent, card: u32) -> Extent {
+    if extent.flight.is_empty() {
+        extent.flight = boot_name(extent.run);
+    }
+    extent.run ^= card;
+    extent
+}
+
+impl Backlog for StoreBacklog {
+    fn extents(&self) -> Vec<Extent> {
+        self.store.extents().into_iter().map(|extent| on_link(extent, self.card)).collect()
+    }
+
+    fn read(&self, run: u32, first: u32, end: u32, max_bytes: usize) -> Vec<(u32, Arc<Record>)> {
+        self.store.read(run ^ self.card, first, end, max_bytes)
+    }
+
+    fn acknowledge(&self, station: &str, run: u32, through: u32) {
+        Backlog::acknowledge(&self.store, station, run ^ self.card, through);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn runs_are_told_apart_by_card_and_always_have_a_name() {
+        let run = |run, flight: &str| Extent { run, flight: flight.into(), first: 3, end: 10 };
+        assert_eq!(on_link(run(1, "20261118T150405Z"), 0xabcd), run(1 ^ 0xabcd, "20261118T150405Z"));
+        assert_eq!(on_link(run(2, ""), 0), run(2, "boot-2"));
+    }
+}
