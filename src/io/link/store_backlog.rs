@@ -34,7 +34,8 @@ impl StoreBacklog {
             store.put_state(CARD, fresh.to_vec());
             u32::from_be_bytes(fresh)
         });
-        let flight = store.index().and_then(|index| index.flight(session)).unwrap_or_else(|| boot_name(session));
+        let flight =
+            store.index().and_then(|index| index.flight(session)).unwrap_or_else(|| boot_name(session));
         (Self { store, card }, session ^ card, flight)
     }
 }
