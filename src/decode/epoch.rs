@@ -160,7 +160,8 @@ fn velocity_of(speed_mps: Option<f64>, course_deg: Option<f64>) -> Option<Vector
     match course_deg {
         Some(course) => {
             let (sin, cos) = course.to_radians().sin_cos();
-            Some(Vector3::new(speed * cos, speed * sin, 0.0))
+            // Adding zero takes the sign off a zero.
+            Some(Vector3::new(speed * cos + 0.0, speed * sin + 0.0, 0.0))
         }
         None => (speed == 0.0).then(Vector3::zeros),
     }
