@@ -1,6 +1,8 @@
 //! Calibration, and what accuracy to expect of it: the camera's intrinsics from boards, mounting
 //! angles from flights, the paper's Monte Carlo analysis.
 
+pub mod boresight;
+mod boresight_filter;
 mod chessboard;
 #[cfg(test)]
 mod drawn_board;
