@@ -1,5 +1,6 @@
 //! `windhover calibrate`
 
+mod boresight;
 mod intrinsics;
 
 use super::CliResult;
@@ -15,10 +16,13 @@ pub(super) struct Args {
 enum What {
     /// The lens, from photographs of a printed board
     Intrinsics(intrinsics::Args),
+    /// How camera and compass are mounted and timed, from flights over markers at rest
+    Boresight(boresight::Args),
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
     match &args.what {
         What::Intrinsics(args) => intrinsics::run(args),
+        What::Boresight(args) => boresight::run(args),
     }
 }

@@ -5,8 +5,10 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 
 use super::{CliError, CliResult};
-use crate::app::config_file;
-use crate::calibrate::montecarlo::{Analysis, Setup};
+use crate::app::flight::Flight;
+use crate::app::truth::Truth;
+use crate::app::{config_file, declination, geopositions};
+use crate::calibrate::montecarlo::{Analysis, Setup, radii};
 use crate::calibrate::{Overlay, scatter_svg};
 use crate::config::Config;
 use crate::plot;
@@ -30,6 +32,12 @@ pub(super) struct Args {
     /// Seed of the draws; the same seed gives the same figures
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
+    /// Lay the raw geo-positions of this flight's first target over the simulation
+    #[arg(long, value_name = "FLIGHT", requires = "truth")]
+    flight: Option<PathBuf>,
+    /// Where the target truly was: as for report; one row for a surveyed marker at rest
+    #[arg(long, value_name = "TRUTH.csv", requires = "flight")]
+    truth: Option<PathBuf>,
     /// One JSON object on standard output
     #[arg(long)]
     json: bool,
@@ -39,23 +47,45 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
-    let config = match &args.config {
-        Some(path) => config_file::load(path).map_err(CliError::config)?,
-        None => Config::parse(SHIPPED).map_err(CliError::config)?,
+    let flight = args.flight.as_deref().map(Flight::read).transpose()?;
+    let flown_with = flight.as_ref().and_then(|f| f.config.clone());
+    let config = match (&args.config, flown_with) {
+        (Some(path), _) => config_file::load(path).map_err(CliError::config)?,
+        (None, Some(config)) => config,
+        (None, None) => Config::parse(SHIPPED).map_err(CliError::config)?,
     };
+    let overlay = overlay(args, flight.as_ref(), &config)?;
     let setup = Setup::from_config(&config);
     let analysis = setup
         .run(args.samples as usize, args.seed)
         .map_err(|e| CliError::config(format!("[montecarlo] pose and pixel: {e}")))?;
     if let Some(path) = &args.plot {
-        write_plot(path, &setup, &analysis, None)?;
+        write_plot(path, &setup, &analysis, overlay.as_ref())?;
     }
     if args.json {
-        println!("{}", as_json(&setup, &analysis, args.seed));
+        println!("{}", as_json(&setup, &analysis, args.seed, overlay.as_ref()));
     } else {
         print_text(&setup, &analysis, args.seed);
+        if let Some(flown) = &overlay {
+            let (r50, r95, max) = radii(&flown.errors_m);
+            println!("\nflown: {} errors, 50 % within {r50:.3} m, 95 % within {r95:.3} m, worst {max:.3} m", flown.errors_m.len());
+        }
     }
     Ok(())
+}
+
+/// The flight's raw geo-positions against the truth given.
+fn overlay(args: &Args, flight: Option<&Flight>, config: &Config) -> Result<Option<Overlay>, CliError> {
+    let (Some(flight), Some(path)) = (flight, &args.truth) else { return Ok(None) };
+    let truth = Truth::read(path)?;
+    let errors_m = geopositions::errors(flight, config, declination::of_flight(config, flight)?, &truth);
+    if errors_m.is_empty() {
+        return Err(CliError::failed(format!(
+            "{} has no marker of the first target beside a fix, a compass sample and a row of truth (a bare capture must be replayed first)",
+            flight.name
+        )));
+    }
+    Ok(Some(Overlay { name: flight.name.clone(), errors_m }))
 }
 
 fn write_plot(path: &Path, setup: &Setup, analysis: &Analysis, overlay: Option<&Overlay>) -> CliResult {
@@ -66,7 +96,7 @@ fn write_plot(path: &Path, setup: &Setup, analysis: &Analysis, overlay: Option<&
     std::fs::write(path, svg).map_err(|e| CliError::failed(format!("cannot write {}: {e}", path.display())))
 }
 
-fn as_json(setup: &Setup, analysis: &Analysis, seed: u64) -> serde_json::Value {
+fn as_json(setup: &Setup, analysis: &Analysis, seed: u64, overlay: Option<&Overlay>) -> serde_json::Value {
     let (sample, closed) = (&analysis.sample_m2, &analysis.closed_m2);
     let budget: Vec<_> = analysis
         .budget
@@ -78,6 +108,10 @@ fn as_json(setup: &Setup, analysis: &Analysis, seed: u64) -> serde_json::Value {
             })
         })
         .collect();
+    let flight = overlay.map(|flown| {
+        let (r50, r95, max) = radii(&flown.errors_m);
+        json!({"errors": flown.errors_m.len(), "r50_m": r50, "r95_m": r95, "max_m": max})
+    });
     json!({
         "sigma_n_m": sample[(0, 0)].sqrt(),
         "sigma_e_m": sample[(1, 1)].sqrt(),
@@ -97,6 +131,7 @@ fn as_json(setup: &Setup, analysis: &Analysis, seed: u64) -> serde_json::Value {
             "cov_ne_m2": closed[(0, 1)],
         },
         "budget": budget,
+        "flight": flight,
     })
 }
 

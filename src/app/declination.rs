@@ -1,0 +1,23 @@
+//! The declination a flight was flown with: from its configuration, or the World Magnetic Model at
+//! its first dated fix.
+
+use super::flight::Flight;
+use crate::config::Config;
+use crate::geo::{DeclinationError, Geodetic, declination};
+use crate::time::UtcTime;
+
+/// Radians, east positive; zero where the configuration names neither figure nor model.
+pub fn of_flight(config: &Config, flight: &Flight) -> Result<f64, DeclinationError> {
+    if let Some(degrees) = config.compass.declination_deg {
+        return Ok(degrees.to_radians());
+    }
+    if config.compass.declination.is_none() {
+        return Ok(0.0);
+    }
+    let dated = flight.epochs.iter().find_map(|e| Some((e.utc_ns?, e.lat_deg?, e.lon_deg?, e.alt_msl_m?)));
+    let Some((utc_ns, lat_deg, lon_deg, height_m)) = dated else {
+        let date = UtcTime::from_unix_ns(0);
+        return Err(DeclinationError { date, reason: "the flight has no fix with a date".into() });
+    };
+    declination(Geodetic { lat_deg, lon_deg, height_m }, UtcTime::from_unix_ns(utc_ns))
+}

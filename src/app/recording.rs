@@ -1,0 +1,92 @@
+//! A flight's messages as the measurements that calibration works on.
+
+use nalgebra::{Matrix2, Vector2, Vector3};
+use prost_types::Timestamp;
+
+use super::flight::Flight;
+use crate::calibrate::boresight::Recording;
+use crate::config::TagFamily;
+use crate::geo::Tilt;
+use crate::io::proto::{host_time, windhover as wh};
+use crate::msg::{AttitudeSample, FixKind, GnssEpoch, MarkerDetection, MarkerId, Stamped};
+use crate::time::UtcTime;
+
+/// The raw measurements of a flight, stamped with their times of validity.
+pub fn recording(flight: &Flight) -> Recording {
+    Recording {
+        gnss: flight.epochs.iter().map(|e| stamped(&e.timestamp, &e.heard, epoch(e))).collect(),
+        attitude: flight.attitudes.iter().map(|a| stamped(&a.timestamp, &a.heard, attitude(a))).collect(),
+        frames: flight
+            .detections
+            .iter()
+            .map(|d| (host_time(d.timestamp.as_ref()), d.markers.iter().filter_map(marker).collect()))
+            .collect(),
+    }
+}
+
+fn stamped<T>(t: &Option<Timestamp>, heard: &Option<Timestamp>, value: T) -> Stamped<T> {
+    Stamped { t_valid: host_time(t.as_ref()), t_recv: host_time(heard.as_ref()), seq: 0, value }
+}
+
+fn epoch(e: &wh::GnssEpoch) -> GnssEpoch {
+    let fix = match e.fix {
+        2 => FixKind::TwoD,
+        3 => FixKind::ThreeD,
+        _ => FixKind::None,
+    };
+    let velocity = match e.vel_ned_mps[..] {
+        [north, east] => Some(Vector3::new(north, east, 0.0)),
+        [north, east, down] => Some(Vector3::new(north, east, down)),
+        _ => None,
+    };
+    GnssEpoch {
+        utc: e.utc_ns.map(UtcTime::from_unix_ns),
+        fix,
+        lat_deg: e.lat_deg,
+        lon_deg: e.lon_deg,
+        alt_msl_m: e.alt_msl_m,
+        geoid_m: e.geoid_m,
+        vel_ned_mps: velocity,
+        vel_has_down: e.vel_ned_mps.len() == 3,
+        hpe_m: e.hpe_m,
+        vpe_m: e.vpe_m,
+        sats: e.sats,
+        hdop: e.hdop,
+        ..GnssEpoch::default()
+    }
+}
+
+fn attitude(a: &wh::Attitude) -> AttitudeSample {
+    let tilt = a.pitch_rad.zip(a.roll_rad).map(|(pitch, roll)| Tilt { pitch, roll });
+    AttitudeSample { heading: a.heading_rad, heading_is_true: a.heading_is_true, tilt }
+}
+
+/// `None` for kinds and families this version does not know.
+fn marker(m: &wh::Marker) -> Option<MarkerDetection> {
+    let id = match m.kind.as_str() {
+        "apriltag" => MarkerId::Tag { family: m.family.parse::<TagFamily>().ok()?, id: m.id },
+        "disc" => MarkerId::Disc { target: m.target as usize, marker: m.id as usize },
+        _ => return None,
+    };
+    let corner = |k: usize| Some(Vector2::new(*m.corners.get(2 * k)?, *m.corners.get(2 * k + 1)?));
+    let covariance = |k: usize| {
+        let at = |n: usize| m.covariance_px2.get(3 * k + n).copied().unwrap_or(0.0);
+        Matrix2::new(at(0), at(1), at(1), at(2))
+    };
+    let corners_px = match [corner(0), corner(1), corner(2), corner(3)] {
+        [Some(a), Some(b), Some(c), Some(d)] => Some([a, b, c, d]),
+        _ => None,
+    };
+    let of_corners: [Matrix2<f64>; 4] = std::array::from_fn(covariance);
+    let tag = corners_px.is_some();
+    Some(MarkerDetection {
+        marker: id,
+        center_px: Vector2::new(m.center_u, m.center_v),
+        center_cov_px2: if tag { of_corners.iter().sum::<Matrix2<f64>>() / 16.0 } else { covariance(0) },
+        corners_px,
+        corner_cov_px2: if tag { of_corners } else { [Matrix2::zeros(); 4] },
+        hamming: m.hamming as u8,
+        margin: m.margin,
+        size_px: m.size_px,
+    })
+}

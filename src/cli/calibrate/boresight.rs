@@ -1,0 +1,173 @@
+//! `windhover calibrate boresight`
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use serde_json::json;
+
+use crate::app::flight::Flight;
+use crate::app::{config_file, declination, recording};
+use crate::calibrate::boresight::{Boresight, Finding, boresight};
+use crate::cli::{CliError, CliResult};
+use crate::config::{Config, TagFamily};
+use crate::geo::Geodetic;
+use crate::msg::MarkerId;
+
+/// Calibrate how camera and compass are mounted and timed, from flights over markers at rest.
+///
+/// Flights must hold what the pipeline saw: replay a bare capture first. Markers are those of static
+/// targets of the configuration, or all where no target is static. Uncertainties are one sigma.
+#[derive(clap::Args, Debug)]
+pub(super) struct Args {
+    /// Flights: files, or directories of segments
+    #[arg(required = true, value_name = "FLIGHT")]
+    flights: Vec<PathBuf>,
+    /// Configuration; the one attached to the first flight where absent
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// A marker whose position is known: ID:LAT,LON,HEIGHT (degrees, metres over the ellipsoid)
+    #[arg(long, value_name = "ID:LAT,LON,HEIGHT")]
+    surveyed: Vec<Surveyed>,
+    /// One-sigma of surveyed positions, metres
+    #[arg(long, value_name = "METRES", default_value_t = 0.02)]
+    survey_sigma_m: f64,
+    /// One JSON object on standard output
+    #[arg(long)]
+    json: bool,
+}
+
+/// A surveyed marker.
+#[derive(Clone, Copy, Debug)]
+struct Surveyed {
+    id: u32,
+    at: Geodetic,
+}
+
+impl FromStr for Surveyed {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (id, place) = text.split_once(':').ok_or("write it as ID:LAT,LON,HEIGHT")?;
+        let id = id.parse().map_err(|_| format!("{id:?} is not the number of a tag"))?;
+        let figures: Vec<f64> = place
+            .split(',')
+            .map(|f| f.trim().parse().map_err(|_| format!("{f:?} is not a number")))
+            .collect::<Result<_, _>>()?;
+        match figures[..] {
+            [lat_deg, lon_deg, height_m] => Ok(Self { id, at: Geodetic { lat_deg, lon_deg, height_m } }),
+            _ => Err("write it as ID:LAT,LON,HEIGHT".into()),
+        }
+    }
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    let flights: Vec<Flight> = args.flights.iter().map(|p| Flight::read(p)).collect::<Result<_, _>>()?;
+    for (path, flight) in args.flights.iter().zip(&flights) {
+        if flight.detections.is_empty() && !flight.frames.is_empty() {
+            return Err(CliError::failed(format!(
+                "{} is a bare capture: replay it first (windhover replay {0} --out FLIGHT.mcap)",
+                path.display()
+            )));
+        }
+    }
+    let config = match (&args.config, flights.first().and_then(|f| f.config.clone())) {
+        (Some(path), _) => config_file::load(path).map_err(CliError::config)?,
+        (None, Some(config)) => config,
+        (None, None) => return Err(CliError::usage("the flight carries no configuration: give --config FILE")),
+    };
+    let first = flights.first().ok_or_else(|| CliError::usage("no flight was given"))?;
+    let declination = declination::of_flight(&config, first)?;
+    let recordings: Vec<_> = flights.iter().map(recording::recording).collect();
+    let surveyed = surveyed_markers(args, &config);
+    let found = boresight(&config, declination, &recordings, &surveyed).map_err(CliError::failed)?;
+    if args.json {
+        println!("{}", as_json(&found));
+    } else {
+        print_text(&found, &config);
+    }
+    Ok(())
+}
+
+fn surveyed_markers(args: &Args, config: &Config) -> BTreeMap<MarkerId, (Geodetic, f64)> {
+    let family_of = |id: u32| -> TagFamily {
+        let markers = config.target.iter().flat_map(|t| &t.marker);
+        markers.filter(|m| m.id == Some(id)).find_map(|m| m.family).unwrap_or_default()
+    };
+    let entry = |s: &Surveyed| (MarkerId::Tag { family: family_of(s.id), id: s.id }, (s.at, args.survey_sigma_m));
+    args.surveyed.iter().map(entry).collect()
+}
+
+fn as_json(found: &Boresight) -> serde_json::Value {
+    let finding = |f: &Finding| {
+        json!({"name": f.name, "unit": f.unit, "value": f.value, "sigma": f.sigma, "prior": f.prior, "told": f.told})
+    };
+    let markers: Vec<_> = found
+        .markers
+        .iter()
+        .map(|m| {
+            json!({
+                "marker": name_of(m.marker), "flight": m.flight, "lat_deg": m.position.lat_deg,
+                "lon_deg": m.position.lon_deg, "height_m": m.position.height_m,
+                "sigma_ned_m": m.sigma_m.as_slice(),
+            })
+        })
+        .collect();
+    json!({
+        "parameters": found.parameters.iter().map(finding).collect::<Vec<_>>(),
+        "camera_to_compass": found.camera_to_compass.iter().map(finding).collect::<Vec<_>>(),
+        "markers": markers,
+        "rms_px": found.rms_px,
+        "pixels": found.pixels,
+        "refused": found.refused,
+        "advice": found.advice(),
+    })
+}
+
+fn name_of(marker: MarkerId) -> String {
+    match marker {
+        MarkerId::Tag { family, id } => format!("{} {id}", family.name()),
+        MarkerId::Disc { target, marker } => format!("disc {target}.{marker}"),
+    }
+}
+
+fn print_text(found: &Boresight, config: &Config) {
+    println!("{} pixel coordinates, residual {:.3} px (root mean square)", found.pixels, found.rms_px);
+    if found.refused > 0 {
+        println!("{} measurements lay outside the gate and were left out", found.refused);
+    }
+    println!("\n                         value  one sigma");
+    for f in &found.parameters {
+        let note = if f.told { "" } else { "   not told by these flights" };
+        println!("{:<20} {:>9.3} {:>9.3} {:<3}{note}", f.name, f.value, f.sigma, f.unit);
+    }
+    println!("\ncamera against compass (what positions a vehicle)");
+    for f in &found.camera_to_compass {
+        println!("{:<20} {:>9.3} {:>9.3} {}", f.name, f.value, f.sigma, f.unit);
+    }
+    for m in &found.markers {
+        println!(
+            "\nmarker {} (flight {}): {:.9} {:.9} {:.2} m, one sigma north {:.2} east {:.2} down {:.2} m",
+            name_of(m.marker),
+            m.flight,
+            m.position.lat_deg,
+            m.position.lon_deg,
+            m.position.height_m,
+            m.sigma_m.x,
+            m.sigma_m.y,
+            m.sigma_m.z
+        );
+    }
+    for advice in found.advice() {
+        println!("\n{advice}");
+    }
+    let value = |k: usize| found.parameters[k].value;
+    println!("\n[camera.mount]");
+    println!("position_m = [{:.3}, {:.3}, {:.3}]", value(3), value(4), value(5));
+    println!("yaw_deg = {:.3}\npitch_deg = {:.3}\nroll_deg = {:.3}", value(0), value(1), value(2));
+    println!("\n[compass]");
+    println!("yaw_offset_deg = {:.3}", config.compass.yaw_offset_deg - value(6));
+    println!("pitch_offset_deg = {:.3}", config.compass.pitch_offset_deg + value(7));
+    println!("roll_offset_deg = {:.3}", config.compass.roll_offset_deg + value(8));
+    println!("latency_ms = {:.1}", config.compass.latency_ms + value(9));
+    println!("\n[gps]\nlatency_ms = {:.1}", config.gps.latency_ms + value(10));
+}
