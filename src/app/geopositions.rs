@@ -80,7 +80,8 @@ fn error(
     let ned_from_camera = ned_from_body * config.camera.mount.body_from_camera();
     let ground = Ground::Flat { down_m: 0.0 };
     let above_m = -marker.position_m[2];
-    let at = locate(&config.camera.intrinsics, &eye, &ned_from_camera, seen.center_px, &ground, above_m, LIMIT_M);
+    let at =
+        locate(&config.camera.intrinsics, &eye, &ned_from_camera, seen.center_px, &ground, above_m, LIMIT_M);
     let off = at.ok()?.ned_m - offset;
     Some([off.x, off.y])
 }

@@ -155,7 +155,8 @@ fn prior_of(config: &Config) -> (Parameters, DVector<f64>) {
         0.0,
         0.0,
     ];
-    let mut sigma = DVector::from_iterator(PARAMETERS, NAMES.iter().map(|(_, _, prior, factor)| prior / factor));
+    let mut sigma =
+        DVector::from_iterator(PARAMETERS, NAMES.iter().map(|(_, _, prior, factor)| prior / factor));
     let told = config.compass.heading_bias_sigma_deg.max(0.1).to_radians();
     sigma[6] = told;
     sigma[10] = (config.gps.latency_sigma_ms * 1e-3).max(1e-3);
@@ -240,7 +241,13 @@ fn position_of(e: &GnssEpoch) -> Option<Geodetic> {
     Some(Geodetic { lat_deg: e.lat_deg?, lon_deg: e.lon_deg?, height_m })
 }
 
-fn run_flight(filter: &mut Filter<'_>, config: &Config, flight: &Recording, frame: &LocalFrame, from: MonoTime) {
+fn run_flight(
+    filter: &mut Filter<'_>,
+    config: &Config,
+    flight: &Recording,
+    frame: &LocalFrame,
+    from: MonoTime,
+) {
     let markers = markers_of(config);
     let mut items: Vec<(MonoTime, Item<'_>)> = Vec::new();
     items.extend(flight.gnss.iter().map(|e| (e.t_valid, Item::Gnss(&e.value))));
@@ -362,13 +369,17 @@ impl Boresight {
             );
         }
         if untold(&["lever arm forward", "lever arm right"]) {
-            advice.push("The lever arm is not told: turn on the spot over the marker, at 5 m and again at 15 m.");
+            advice.push(
+                "The lever arm is not told: turn on the spot over the marker, at 5 m and again at 15 m.",
+            );
         }
         if untold(&["lever arm down"]) {
             advice.push("The lever arm's height is not told apart from GPS height: measure it with a ruler.");
         }
         if untold(&["compass late by"]) {
-            advice.push("The compass's lateness is not told: yaw quickly to and fro (30° a second) over the marker.");
+            advice.push(
+                "The compass's lateness is not told: yaw quickly to and fro (30° a second) over the marker.",
+            );
         }
         if untold(&["gps late by"]) {
             advice.push("The GPS's lateness is not told: fly past the marker fast, in opposite directions.");

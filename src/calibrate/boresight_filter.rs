@@ -220,7 +220,12 @@ impl<'a> Filter<'a> {
 
     /// Takes a measurement: residual (measured minus expected) as a function of the state, noise
     /// variances, and the states it depends on. False where the gate refused it.
-    fn update(&mut self, residual: &dyn Fn(&State) -> Option<DVector<f64>>, noise: &[f64], axes: &[usize]) -> bool {
+    fn update(
+        &mut self,
+        residual: &dyn Fn(&State) -> Option<DVector<f64>>,
+        noise: &[f64],
+        axes: &[usize],
+    ) -> bool {
         let mut point = self.state.clone();
         point.parameters = self.about.unwrap_or(self.state.parameters);
         let Some(mut r) = residual(&point) else { return false };
@@ -286,10 +291,8 @@ impl<'a> Filter<'a> {
         let declination = if sample.heading_is_true { 0.0 } else { self.declination };
         let offset = compass.yaw_offset_deg.to_radians();
         let convention = compass.angles;
-        let zero = Tilt {
-            pitch: compass.pitch_offset_deg.to_radians(),
-            roll: compass.roll_offset_deg.to_radians(),
-        };
+        let zero =
+            Tilt { pitch: compass.pitch_offset_deg.to_radians(), roll: compass.roll_offset_deg.to_radians() };
         let seen = |s: &State| s.ned_from_body * Rotation3::new(-s.rate * s.parameters[9]);
         let axes: Vec<usize> = (12..18).chain(FIRST + 6..FIRST + 10).collect();
         if let Some(heading) = sample.heading {
@@ -351,7 +354,8 @@ impl<'a> Filter<'a> {
             vec![variance(seen.center_cov_px2[(0, 0)]), variance(seen.center_cov_px2[(1, 1)])]
         };
         let own = BASE + PER_MARKER * k;
-        let axes: Vec<usize> = (0..3).chain(12..15).chain(FIRST..FIRST + 6).chain(own..own + PER_MARKER).collect();
+        let axes: Vec<usize> =
+            (0..3).chain(12..15).chain(FIRST..FIRST + 6).chain(own..own + PER_MARKER).collect();
         if self.update(&expect, &noise, &axes)
             && let Some(after) = expect(&self.state)
         {

@@ -68,7 +68,10 @@ pub(super) fn run(args: &Args) -> CliResult {
         print_text(&setup, &analysis, args.seed);
         if let Some(flown) = &overlay {
             let (r50, r95, max) = radii(&flown.errors_m);
-            println!("\nflown: {} errors, 50 % within {r50:.3} m, 95 % within {r95:.3} m, worst {max:.3} m", flown.errors_m.len());
+            println!(
+                "\nflown: {} errors, 50 % within {r50:.3} m, 95 % within {r95:.3} m, worst {max:.3} m",
+                flown.errors_m.len()
+            );
         }
     }
     Ok(())

@@ -73,7 +73,9 @@ pub(super) fn run(args: &Args) -> CliResult {
     let config = match (&args.config, flights.first().and_then(|f| f.config.clone())) {
         (Some(path), _) => config_file::load(path).map_err(CliError::config)?,
         (None, Some(config)) => config,
-        (None, None) => return Err(CliError::usage("the flight carries no configuration: give --config FILE")),
+        (None, None) => {
+            return Err(CliError::usage("the flight carries no configuration: give --config FILE"));
+        }
     };
     let first = flights.first().ok_or_else(|| CliError::usage("no flight was given"))?;
     let declination = declination::of_flight(&config, first)?;
@@ -93,14 +95,13 @@ fn surveyed_markers(args: &Args, config: &Config) -> BTreeMap<MarkerId, (Geodeti
         let markers = config.target.iter().flat_map(|t| &t.marker);
         markers.filter(|m| m.id == Some(id)).find_map(|m| m.family).unwrap_or_default()
     };
-    let entry = |s: &Surveyed| (MarkerId::Tag { family: family_of(s.id), id: s.id }, (s.at, args.survey_sigma_m));
+    let entry =
+        |s: &Surveyed| (MarkerId::Tag { family: family_of(s.id), id: s.id }, (s.at, args.survey_sigma_m));
     args.surveyed.iter().map(entry).collect()
 }
 
 fn as_json(found: &Boresight) -> serde_json::Value {
-    let finding = |f: &Finding| {
-        json!({"name": f.name, "unit": f.unit, "value": f.value, "sigma": f.sigma, "prior": f.prior, "told": f.told})
-    };
+    let finding = |f: &Finding| json!({"name": f.name, "unit": f.unit, "value": f.value, "sigma": f.sigma, "prior": f.prior, "told": f.told});
     let markers: Vec<_> = found
         .markers
         .iter()
