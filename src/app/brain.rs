@@ -9,6 +9,7 @@ use crate::pipeline::{Health, Output, Pipeline, Ticks};
 use crate::time::{MonoTime, Span};
 
 use super::card::CardOrders;
+use super::config_file;
 use super::devices::Surroundings;
 use super::events::{self, Event as OperatorEvent};
 use super::health::{self, Figures, Latencies};
@@ -55,7 +56,7 @@ pub fn run(
         around,
         board,
         outlets,
-        pipeline: Pipeline::new(config),
+        pipeline: Pipeline::with_terrain(config, config_file::terrain_of(config)),
         ticks: Ticks::default(),
         latencies: Latencies::default(),
         outputs: Vec::new(),

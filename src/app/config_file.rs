@@ -1,8 +1,11 @@
 //! Reading configuration files.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use crate::config::{Config, ConfigError};
+use crate::geo::Tile;
+use crate::io::{self, terrain::TileError};
 
 /// Why a configuration file gave no configuration.
 #[derive(Debug, thiserror::Error)]
@@ -23,11 +26,33 @@ pub enum ConfigFileError {
         /// What is wrong.
         source: ConfigError,
     },
+    /// The terrain it names could not be read.
+    #[error("configuration {}: ground.terrain: {source}", path.display())]
+    Terrain {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: TileError,
+    },
 }
 
 /// Reads and checks a configuration file.
 pub fn load(path: &Path) -> Result<Config, ConfigFileError> {
     let text = std::fs::read_to_string(path)
         .map_err(|source| ConfigFileError::Unreadable { path: path.to_owned(), source })?;
-    Config::parse(&text).map_err(|source| ConfigFileError::Invalid { path: path.to_owned(), source })
+    let config =
+        Config::parse(&text).map_err(|source| ConfigFileError::Invalid { path: path.to_owned(), source })?;
+    if let Some(terrain) = &config.ground.terrain {
+        io::terrain::load(Path::new(terrain))
+            .map_err(|source| ConfigFileError::Terrain { path: path.to_owned(), source })?;
+    }
+    Ok(config)
+}
+
+/// The terrain tile of a configuration. `None` where it names none, or where it cannot be read:
+/// [`load`] has refused that already, and a recording's own configuration may name a tile of another
+/// machine, of which the pipeline then tells.
+pub fn terrain_of(config: &Config) -> Option<Arc<Tile>> {
+    let path = config.ground.terrain.as_ref()?;
+    io::terrain::load(Path::new(path)).ok().map(Arc::new)
 }

@@ -5,6 +5,7 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 use std::time::Duration;
 
+use super::config_file;
 use crate::config::{Config, ConfigError};
 use crate::io::capture::{CaptureItem, CaptureReader, attached_config};
 use crate::io::clock::HostClock;
@@ -151,7 +152,7 @@ impl<'a> Run<'a> {
         let clock = HostClock::start();
         Self {
             config,
-            pipeline: Pipeline::new(config),
+            pipeline: Pipeline::with_terrain(config, config_file::terrain_of(config)),
             recorder: Recorder::new(config),
             outputs: Vec::new(),
             summary: Summary::default(),

@@ -1,5 +1,6 @@
 //! `windhover calibrate`
 
+mod board;
 mod boresight;
 mod intrinsics;
 
@@ -14,6 +15,8 @@ pub(super) struct Args {
 
 #[derive(clap::Subcommand, Debug)]
 enum What {
+    /// Draw a chessboard to print
+    Board(board::Args),
     /// The lens, from photographs of a printed board
     Intrinsics(intrinsics::Args),
     /// How camera and compass are mounted and timed, from flights over markers at rest
@@ -22,6 +25,7 @@ enum What {
 
 pub(super) fn run(args: &Args) -> CliResult {
     match &args.what {
+        What::Board(args) => board::run(args),
         What::Intrinsics(args) => intrinsics::run(args),
         What::Boresight(args) => boresight::run(args),
     }

@@ -1,6 +1,10 @@
 //! The ground the vehicle drives on, as a surface in the NED frame.
 
+use std::sync::Arc;
+
 use nalgebra::Vector3;
+
+use super::Terrain;
 
 /// A ground surface.
 #[derive(Clone, Debug, PartialEq)]
@@ -10,13 +14,16 @@ pub enum Ground {
         /// Down coordinate of the plane, metres.
         down_m: f64,
     },
+    /// Heights of a terrain tile.
+    Terrain(Arc<Terrain>),
 }
 
 impl Ground {
     /// Down coordinate of the surface under a point, metres.
-    pub fn down_m(&self, _north_m: f64, _east_m: f64) -> f64 {
+    pub fn down_m(&self, north_m: f64, east_m: f64) -> f64 {
         match self {
             Self::Flat { down_m } => *down_m,
+            Self::Terrain(terrain) => terrain.down_m(north_m, east_m),
         }
     }
 
@@ -28,13 +35,15 @@ impl Ground {
                 let range = (down_m - above_m - origin.z) / direction.z;
                 (direction.z > 0.0 && range > 0.0 && range.is_finite()).then_some(range)
             }
+            Self::Terrain(terrain) => terrain.intersect(origin, direction, above_m),
         }
     }
 
     /// Slope ∂down/∂(north, east) under a point.
-    pub fn slope(&self, _north_m: f64, _east_m: f64) -> [f64; 2] {
+    pub fn slope(&self, north_m: f64, east_m: f64) -> [f64; 2] {
         match self {
             Self::Flat { .. } => [0.0, 0.0],
+            Self::Terrain(terrain) => terrain.slope(north_m, east_m),
         }
     }
 }

@@ -11,6 +11,7 @@ mod declination;
 mod frames;
 mod ground;
 mod locate;
+mod terrain;
 mod wgs84;
 
 pub use camera::{CameraModel, Projection};
@@ -21,4 +22,5 @@ pub use frames::{
 };
 pub use ground::Ground;
 pub use locate::{GroundPoint, LocateError, PoseSigmas, locate, locate_with_covariance};
+pub use terrain::{Terrain, TerrainError, Tile};
 pub use wgs84::{Geodetic, LocalFrame};

@@ -16,4 +16,5 @@ pub mod proto;
 pub mod records;
 pub mod serial;
 pub mod store;
+pub mod terrain;
 pub mod mavlink;

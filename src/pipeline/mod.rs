@@ -15,10 +15,12 @@ pub use frame::{DecodedFrame, FrameFault};
 pub use output::{Health, Notice, NoticeKind, Output, SourceHealth, TargetHealth};
 pub use ticks::{TICK, Ticks};
 
+use std::sync::Arc;
+
 use crate::config::{Config, MarkerKind};
 use crate::detect::FrameDetector;
 use crate::estimate::{Estimator, EstimatorOutput, PaperEstimator};
-use crate::geo::Geodetic;
+use crate::geo::{Geodetic, Tile};
 use crate::msg::{
     AttitudeSample, Event, EventBody, FrameObservations, FramePayload, GnssEpoch, MarkerDetection, MarkerId,
     Source, Stamped, TargetEstimate, TrackStatus,
@@ -55,6 +57,11 @@ struct Estimators {
 impl Pipeline {
     /// A pipeline with this configuration, before its first event.
     pub fn new(config: &Config) -> Self {
+        Self::with_terrain(config, None)
+    }
+
+    /// The same over the terrain tile that `ground.terrain` of the configuration names.
+    pub fn with_terrain(config: &Config, terrain: Option<Arc<Tile>>) -> Self {
         Self {
             config: config.clone(),
             want_rgb: wants_rgb(config),
@@ -62,7 +69,7 @@ impl Pipeline {
             compass: CompassLine::new(config),
             detector: FrameDetector::new(config),
             observations: FrameObservations::default(),
-            finder: SiteFinder::new(),
+            finder: SiteFinder::new(terrain),
             estimators: None,
             monitor: Monitor::new(config),
             last_exposure: None,
@@ -156,6 +163,9 @@ impl Pipeline {
         let Some(settled) = self.finder.offer(epoch, &self.config) else { return };
         if let Some(words) = settled.declination_notice {
             out.push(notice(t, NoticeKind::Declination, Some(Source::Compass), words));
+        }
+        if let Some(words) = settled.ground_notice {
+            out.push(notice(t, NoticeKind::DatumSet, Some(Source::Gps), words));
         }
         let datum: Geodetic = settled.site.frame.datum();
         let words = format!(

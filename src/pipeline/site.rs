@@ -1,8 +1,10 @@
 //! Where the flight is: the NED origin, the ground, the declination, settled by the first fixes.
 
+use std::sync::Arc;
+
 use crate::config::{Config, Declination, GroundSource};
 use crate::estimate::Site;
-use crate::geo::{self, Geodetic, Ground, LocalFrame};
+use crate::geo::{self, Geodetic, Ground, LocalFrame, Terrain, Tile};
 use crate::msg::{FixKind, GnssEpoch};
 
 /// Fixes whose median height is the ground where the ground is where the aircraft took off.
@@ -15,17 +17,19 @@ pub(super) struct SiteFinder {
     first: Option<Geodetic>,
     heights_m: Vec<f64>,
     seen: usize,
+    terrain: Option<Arc<Tile>>,
 }
 
 /// A settled site, and what an operator should know of its declination.
 pub(super) struct SettledSite {
     pub(super) site: Site,
     pub(super) declination_notice: Option<String>,
+    pub(super) ground_notice: Option<String>,
 }
 
 impl SiteFinder {
-    pub(super) fn new() -> Self {
-        Self { first: None, heights_m: Vec::with_capacity(TAKEOFF_FIXES), seen: 0 }
+    pub(super) fn new(terrain: Option<Arc<Tile>>) -> Self {
+        Self { first: None, heights_m: Vec::with_capacity(TAKEOFF_FIXES), seen: 0, terrain }
     }
 
     /// Takes a fix; the site when it is settled.
@@ -34,7 +38,12 @@ impl SiteFinder {
         let first = *self.first.get_or_insert(at);
         self.seen += 1;
         let geoid_m = epoch.geoid_m.unwrap_or(0.0);
-        let ground_height_m = match (config.ground.elevation_msl_m, config.ground.source) {
+        let tile = self.terrain.clone().filter(|tile| tile.covers(first.lat_deg, first.lon_deg));
+        let elevation_msl_m = tile
+            .as_ref()
+            .map(|t| t.height_msl_m(first.lat_deg, first.lon_deg))
+            .or(config.ground.elevation_msl_m);
+        let ground_height_m = match (elevation_msl_m, config.ground.source) {
             (Some(elevation_msl_m), _) => elevation_msl_m + geoid_m,
             (None, Some(GroundSource::Takeoff)) => {
                 self.heights_m.push(at.height_m);
@@ -51,9 +60,16 @@ impl SiteFinder {
             lon_deg: d.lon_deg,
             height_m: d.height_m,
         });
-        let ground = Ground::Flat { down_m: datum.height_m - ground_height_m };
-        let site = Site { frame: LocalFrame::new(datum), ground, declination_rad };
-        Some(SettledSite { site, declination_notice })
+        let frame = LocalFrame::new(datum);
+        let ground_notice = (tile.is_none() && config.ground.terrain.is_some()).then(|| {
+            "no terrain tile covers the first fix (it could not be read, or is of another place): level ground at that fix's height instead".to_owned()
+        });
+        let ground = match tile {
+            Some(tile) => Ground::Terrain(Arc::new(Terrain::new(tile, &frame, geoid_m))),
+            None => Ground::Flat { down_m: datum.height_m - ground_height_m },
+        };
+        let site = Site { frame, ground, declination_rad };
+        Some(SettledSite { site, declination_notice, ground_notice })
     }
 
     /// Declination in radians and what to say of it; `None` while waiting for a date.

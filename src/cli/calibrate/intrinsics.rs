@@ -48,9 +48,9 @@ pub(super) struct Args {
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Board {
-    columns: usize,
-    rows: usize,
+pub(super) struct Board {
+    pub(super) columns: usize,
+    pub(super) rows: usize,
 }
 
 impl FromStr for Board {
@@ -68,7 +68,7 @@ impl FromStr for Board {
     }
 }
 
-fn positive(text: &str) -> Result<f64, String> {
+pub(super) fn positive(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|_| format!("{text:?} is not a number"))?;
     if value > 0.0 && value.is_finite() { Ok(value) } else { Err("must be above zero".into()) }
 }

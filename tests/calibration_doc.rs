@@ -1,0 +1,102 @@
+//! Every command of `docs/calibration.md`, run as it stands there by the real binary.
+
+use std::path::Path;
+use std::process::Command;
+
+use nalgebra::{Rotation3, Vector2, Vector3};
+use windhover::geo::{CameraModel, ned_from_body_321};
+
+const DOC: &str = include_str!("../docs/calibration.md");
+
+#[test]
+fn every_command_of_the_page_works() {
+    let dir = tempfile::tempdir().expect("a scratch directory");
+    photographs(&dir.path().join("photos"));
+    std::fs::write(dir.path().join("windhover.toml"), include_str!("../config/windhover.toml"))
+        .expect("writable");
+    let commands = commands_of(DOC);
+    assert!(commands.len() >= 10, "{commands:?}");
+    for command in commands {
+        // The page is ours and the shell is what its readers use: it expands photos/*.png.
+        let bin = env!("CARGO_BIN_EXE_windhover");
+        let line = command.replacen("windhover", &format!("'{bin}'"), 1);
+        let run = Command::new("sh").arg("-c").arg(&line).current_dir(dir.path()).output().expect("a shell");
+        let said = String::from_utf8_lossy(&run.stderr);
+        assert!(run.status.success(), "{command}\n{said}");
+    }
+    for file in ["board.svg", "plots/coverage.svg", "plots/residuals.svg", "predicted.svg", "compared.svg"] {
+        let text = std::fs::read_to_string(dir.path().join(file)).expect(file);
+        assert!(text.contains("<svg") && !text.contains("NaN"), "{file}");
+    }
+    let page = std::fs::read_to_string(dir.path().join("report.html")).expect("the report");
+    for section in ["Summary", "Errors", "Map", "States", "Measurements", "Sensors", "Camera", "Frames"] {
+        assert!(page.contains(&format!("<h2>{section}</h2>")), "{section}");
+    }
+    assert!(page.len() < 3_000_000 && !page.contains("NaN") && !page.contains("http://localhost"));
+}
+
+/// The lines of the page's `sh` blocks.
+fn commands_of(page: &str) -> Vec<&str> {
+    let mut inside = false;
+    let mut commands = Vec::new();
+    for line in page.lines() {
+        match line {
+            "```sh" => inside = true,
+            "```" => inside = false,
+            _ if inside => commands.push(line),
+            _ => {}
+        }
+    }
+    commands
+}
+
+/// Photographs of a 9 x 6 board of 25 mm, tilted each way.
+fn photographs(dir: &Path) {
+    std::fs::create_dir(dir).expect("writable");
+    let camera = CameraModel {
+        fx: 620.0,
+        fy: 618.0,
+        cx: 322.0,
+        cy: 241.0,
+        distortion: [-0.15, 0.03, 0.0, 0.0, 0.0],
+        skew: 0.0,
+    };
+    let tilts = [(0.5, 0.0), (-0.5, 0.1), (0.1, 0.5), (0.0, -0.5), (0.4, 0.4), (-0.4, -0.4)];
+    for (k, (pitch, roll)) in tilts.into_iter().enumerate() {
+        let rotation = ned_from_body_321(0.0, pitch, roll);
+        let middle = Vector3::new(0.1, 0.0625, 0.0);
+        let translation = Vector3::new(0.0, 0.0, 0.42) - rotation * middle;
+        let mut image = image::GrayImage::new(640, 480);
+        for (u, v, pixel) in image.enumerate_pixels_mut() {
+            let light: f64 = (0..9)
+                .map(|s| {
+                    let at = Vector2::new(
+                        f64::from(u) + f64::from(s % 3) * 0.6 - 0.6,
+                        f64::from(v) + f64::from(s / 3) * 0.6 - 0.6,
+                    );
+                    brightness(&camera, &rotation, &translation, at)
+                })
+                .sum();
+            pixel.0 = [(light / 9.0) as u8];
+        }
+        image.save(dir.join(format!("board{k}.png"))).expect("writable");
+    }
+}
+
+fn brightness(
+    camera: &CameraModel,
+    rotation: &Rotation3<f64>,
+    translation: &Vector3<f64>,
+    px: Vector2<f64>,
+) -> f64 {
+    let Some(m) = camera.normalised(px) else { return 110.0 };
+    let ray = rotation.inverse() * Vector3::new(m.x, m.y, 1.0);
+    let origin = rotation.inverse() * -translation;
+    let at = (origin - ray * (origin.z / ray.z)) / 0.025;
+    let (c, r) = (at.x + 1.0, at.y + 1.0);
+    if !(-0.6..10.6).contains(&c) || !(-0.6..7.6).contains(&r) {
+        return 110.0;
+    }
+    let dark = (0.0..10.0).contains(&c) && (0.0..7.0).contains(&r) && (c.floor() + r.floor()) as i64 % 2 == 0;
+    if dark { 30.0 } else { 220.0 }
+}
