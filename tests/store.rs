@@ -123,7 +123,9 @@ fn python() -> Option<&'static str> {
         let tried = Command::new(python).args(["-c", "import mcap"]).stderr(Stdio::null()).status();
         tried.is_ok_and(|status| status.success())
     };
-    ["python3", "python"].into_iter().find(has_mcap)
+    // The one `make test` sets up, or the system's.
+    let own = concat!(env!("CARGO_MANIFEST_DIR"), "/target/venv/bin/python");
+    [own, "python3"].into_iter().find(has_mcap)
 }
 
 #[test]

@@ -50,7 +50,7 @@ pub struct StoreConfig {
     /// never run dry.
     pub free_floor_mb: u64,
     /// The oldest closed flights without `keep` are deleted to have this much free before recording
-    /// needs it; 0 deletes nothing for room.
+    /// needs it, or a tenth of the card where that is less; 0 deletes nothing for room.
     pub free_target_mb: u64,
     /// All flights together may take this many gigabytes; 0 is no limit.
     pub max_gb: f64,

@@ -13,10 +13,6 @@ use crate::time::UtcTime;
 /// Silences shorter than this are not worth a line.
 const GAP_SHOWN_NS: u64 = 1_000_000_000;
 
-/// What the card writes for each byte of a segment at the default settings, file system included:
-/// measured, docs/storage.md.
-const AMPLIFICATION: f64 = 1.1;
-
 pub(super) fn list(root: &Path, json: bool) -> CliResult {
     let (flights, errors) = inspect::list(root)?;
     let present = inspect::in_the_air(root)?;
@@ -155,14 +151,13 @@ fn show_wear(info: &FlightInfo, capacity: Option<u64>) {
     }
     let rate = info.bytes as f64 / seconds;
     println!(
-        "\n  recording like this writes {} an hour; a card of {}",
-        size((rate * 3600.0) as u64),
+        "\n  recording like this costs the card {} an hour; one of {}",
+        size(((rate + wear::OVERHEAD_BYTES_PER_S) * 3600.0) as u64),
         size(capacity)
     );
     for cycles in [10_000.0, 100_000.0] {
-        if let Some(life) = wear::life(capacity, cycles, rate, AMPLIFICATION) {
-            println!("    of {cycles:>6} cycles lasts about {:.0} hours in the air", life.hours);
-        }
+        let life = wear::life(capacity, cycles, rate);
+        println!("    and {cycles:>6} cycles lasts about {:.0} hours in the air", life.hours);
     }
 }
 

@@ -98,14 +98,22 @@ impl Store {
     }
 
     /// Ends the flight properly: everything handed in is written, the segment is closed. Handles left
-    /// elsewhere lose what they hand in from now on. Waits for the card.
+    /// elsewhere lose what they hand in from now on. Waits for the card, and half a second at most for
+    /// the index.
     pub fn stop(self) {
         let Self { handle, writers, keeper } = self;
         handle.intake.close();
         // A thread that panicked has said so; the flight is sealed at the next start.
         writers.into_iter().for_each(|thread| drop(thread.join()));
         handle.shared.stop();
-        keeper.into_iter().for_each(|thread| drop(thread.join()));
+        // The keeper may be in the middle of sealing or indexing: what it leaves is found again, and
+        // nothing waits for it.
+        for _ in 0..50 {
+            if keeper.as_ref().is_none_or(JoinHandle::is_finished) {
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
     }
 }
 

@@ -103,7 +103,7 @@ impl Keeper {
     pub(super) fn run(mut self, inbox: &Receiver<Message>) {
         loop {
             self.open_index();
-            let wait = if self.tasks.is_empty() { 500 } else { 0 };
+            let wait = if self.tasks.is_empty() { 100 } else { 0 };
             match inbox.recv_timeout(Duration::from_millis(wait)) {
                 Ok(message) => self.hear(message),
                 // The recorder is gone before the store says stop: nothing comes any more.
@@ -240,8 +240,11 @@ impl Keeper {
         }
     }
 
+    /// Whether this is the flight in the air. Its number tells, whatever its name has become since.
     fn is_present(&self, name: &str) -> bool {
-        self.present.as_ref().is_some_and(|(_, present)| present == name)
+        self.present.as_ref().is_some_and(|(session, present)| {
+            present == name || flight::session_of(&self.volume.path(FLIGHTS).join(name)) == Some(*session)
+        })
     }
 
     /// Compares the directories with the index: what the index does not know, or was not closed, is
@@ -253,7 +256,8 @@ impl Keeper {
         on_card.retain(|name| !self.is_present(name));
         on_card.sort_by_cached_key(|name| std::cmp::Reverse(retention::age_order(&root, name)));
         for (run, name) in &known {
-            if !on_card.contains(name) && !self.is_present(name) {
+            let present = self.present.as_ref().is_some_and(|(session, _)| session == run);
+            if !on_card.contains(name) && !present {
                 self.held.push(Change::Forget(*run));
             }
         }
@@ -291,17 +295,15 @@ impl Keeper {
     }
 
     fn retain(&mut self) -> StoreResult<()> {
-        let present = self.present.as_ref().map(|(_, name)| name.clone());
+        let present = self.present.as_ref().map(|(session, _)| *session);
         let start = self.shared.start();
-        let deleted = retention::make_room(&self.volume, &self.config, present.as_deref(), start)?;
+        let deleted = retention::make_room(&self.volume, &self.config, present, start)?;
         for (info, reason) in deleted {
             self.held.push(Change::Forget(info.session));
             self.shared.notice(StoreNotice::Deleted { flight: info.name, reason });
         }
-        let floor = self.config.free_floor_mb.max(self.config.free_target_mb) << 20;
-        if let Ok((free, _)) = self.volume.space()
-            && self.config.free_target_mb > 0
-            && free < floor
+        if let Ok((free, total)) = self.volume.space()
+            && free < retention::wanted_free(&self.config, total)
         {
             self.shared.notice(StoreNotice::AlmostFull { free_mb: free >> 20 });
         }

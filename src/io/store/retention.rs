@@ -27,27 +27,34 @@ pub fn start_of(name: &str) -> Option<UtcTime> {
     })
 }
 
-/// The flights that must go, oldest first, and why. `free` in bytes; ages are against `now`, the
+/// Bytes that shall be free: as configured, but never more than a tenth of the card, so that a small
+/// card is not emptied.
+pub fn wanted_free(config: &StoreConfig, capacity: u64) -> u64 {
+    (config.free_target_mb << 20).min(capacity / 10)
+}
+
+/// The flights that must go, oldest first, and why. `free` and `wanted` in bytes; `present` is the run
+/// that must not; ages are against `now`, the
 /// start of the present flight as the receiver told it, or not looked at where it is not known.
 pub fn doomed(
     flights: &[FlightInfo],
-    present: Option<&str>,
+    present: Option<u32>,
     config: &StoreConfig,
-    free: u64,
+    (free, wanted): (u64, u64),
     now: Option<UtcTime>,
 ) -> Vec<(FlightInfo, String)> {
     let mut total: u64 = flights.iter().map(|f| f.bytes).sum();
     let mut free = free;
     let limit = (config.max_gb * 1e9) as u64;
     let mut gone = Vec::new();
-    for flight in flights.iter().filter(|f| !f.keep && Some(f.name.as_str()) != present) {
+    for flight in flights.iter().filter(|f| !f.keep && Some(f.session) != present) {
         let age_days = now
             .zip(start_of(&flight.name))
             .map(|(now, start)| (now.unix_ns() - start.unix_ns()) as f64 / 86_400e9);
         let reason = if config.max_age_days > 0.0 && age_days.is_some_and(|days| days > config.max_age_days) {
             format!("older than {} days", config.max_age_days)
-        } else if config.free_target_mb > 0 && free < config.free_target_mb << 20 {
-            format!("to have {} MB free", config.free_target_mb)
+        } else if free < wanted {
+            format!("to have {} MB free", wanted >> 20)
         } else if limit > 0 && total > limit {
             format!("all flights together took more than {} GB", config.max_gb)
         } else {
@@ -64,12 +71,12 @@ pub fn doomed(
 pub fn make_room(
     volume: &Volume,
     config: &StoreConfig,
-    present: Option<&str>,
+    present: Option<u32>,
     now: Option<UtcTime>,
 ) -> StoreResult<Vec<(FlightInfo, String)>> {
-    let (free, _) = volume.space()?;
-    let short = config.free_target_mb > 0 && free < config.free_target_mb << 20;
-    if !short && config.max_gb <= 0.0 && (config.max_age_days <= 0.0 || now.is_none()) {
+    let (free, total) = volume.space()?;
+    let wanted = wanted_free(config, total);
+    if free >= wanted && config.max_gb <= 0.0 && (config.max_age_days <= 0.0 || now.is_none()) {
         return Ok(Vec::new());
     }
     let mut flights = Vec::new();
@@ -78,7 +85,7 @@ pub fn make_room(
     }
     flights.sort_by(|a, b| (a.session, &a.name).cmp(&(b.session, &b.name)));
     let mut gone = Vec::new();
-    for (info, reason) in doomed(&flights, present, config, free, now) {
+    for (info, reason) in doomed(&flights, present, config, (free, wanted), now) {
         // Somebody may have marked it since.
         if flight::flight_info(volume.root(), &info.name).is_ok_and(|now| now.keep) {
             continue;
@@ -111,7 +118,8 @@ mod tests {
     }
 
     fn names(config: &StoreConfig, free: u64, now: Option<UtcTime>) -> Vec<String> {
-        let gone = doomed(&flights(), Some("boot-5"), config, free, now);
+        let wanted = wanted_free(config, 1 << 40);
+        let gone = doomed(&flights(), Some(5), config, (free, wanted), now);
         gone.into_iter().map(|(f, _)| f.name).collect()
     }
 
@@ -123,6 +131,13 @@ mod tests {
         assert_eq!(names(&config, 0, None), ["boot-1", "20261110T100000Z"]);
         let none_left = StoreConfig { free_target_mb: 1 << 20, ..config };
         assert_eq!(names(&none_left, 0, None), ["boot-1", "20261110T100000Z", "20261120T100000Z"]);
+    }
+
+    #[test]
+    fn a_small_card_is_not_emptied() {
+        let config = StoreConfig { free_target_mb: 1024, ..StoreConfig::default() };
+        assert_eq!(wanted_free(&config, 512 << 20), (512 << 20) / 10);
+        assert_eq!(wanted_free(&config, 64 << 30), 1024 << 20);
     }
 
     #[test]
