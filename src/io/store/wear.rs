@@ -5,7 +5,11 @@
 pub struct Life {
     /// Erase cycles of its cells.
     pub cycles: f64,
-    /// What a second of recording writes beside the segments' own bytes, whatever is recorded: file
+    /// Hours of recording until then.
+    pub hours: f64,
+}
+
+/// What a second of recording writes beside the segments' own bytes, whatever is recorded: file
 /// system journal, inode and index for one commit. Measured on ext4: 67 kB with frames, 69 kB
 /// without (docs/storage.md).
 pub const OVERHEAD_BYTES_PER_S: f64 = 70_000.0;
