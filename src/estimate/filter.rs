@@ -1,7 +1,10 @@
 //! The estimator as the pipeline sees it: measurements in whatever order they come, estimates out.
 
+use std::collections::VecDeque;
+
 use crate::align::{History, Stamp};
 use crate::config::Config;
+use crate::geo::wrap_angle;
 use crate::msg::{
     AttitudeSample, Disposition, FrameObservations, FramePrediction, FusionResult, FusionSource, GnssEpoch,
     Ownship, Stamped, TargetEstimate,
@@ -36,8 +39,8 @@ pub enum EstimatorOutput {
 pub struct Estimator {
     core: Core,
     history: History<AnyMeasurement, State>,
-    /// The last compass reading heard before there was a state.
-    compass: Option<Stamped<AttitudeSample>>,
+    /// Compass readings heard before there was a state.
+    compass: VecDeque<Stamped<AttitudeSample>>,
     lag: Span,
     /// Exposure time of the last frame whose smoothed estimate has been told.
     smoothed_to: Option<MonoTime>,
@@ -45,8 +48,11 @@ pub struct Estimator {
 
 /// Without any measurement for so long the state is worth nothing.
 const SILENCE: Span = Span::from_ns(60_000_000_000);
-/// A compass reading this old still starts the filter.
-const COMPASS_AGE: Span = Span::from_ns(1_000_000_000);
+/// Compass readings this old still start the filter, if there are enough of them.
+const COMPASS_AGE: Span = Span::from_ns(3_000_000_000);
+/// Readings kept to start from, and the fewest that outvote a wrong one.
+const READINGS: usize = 15;
+const FEWEST_READINGS: usize = 3;
 /// Most measurements in the history: three devices at 100 Hz over ten seconds.
 const CAPACITY: usize = 3_000;
 /// Means beyond these are no flight: metres from the datum, metres a second.
@@ -60,7 +66,7 @@ impl Estimator {
         Self {
             history: History::new(span, CAPACITY, core.state.clone(), MonoTime::default()),
             core,
-            compass: None,
+            compass: VecDeque::with_capacity(READINGS + 1),
             lag: Span::from_ms(config.estimator.smoother_lag_ms),
             smoothed_to: None,
         }
@@ -89,7 +95,10 @@ impl Estimator {
     pub fn attitude(&mut self, sample: &Stamped<AttitudeSample>, out: &mut Vec<EstimatorOutput>) {
         if !self.core.state.alive {
             if sample.value.heading.is_some() {
-                self.compass = Some(*sample);
+                self.compass.push_back(*sample);
+                if self.compass.len() > READINGS {
+                    self.compass.pop_front();
+                }
             }
             self.refused(FusionSource::CompassHeading, sample.t_valid, Disposition::NoOwnship, out);
             return;
@@ -191,22 +200,23 @@ impl Estimator {
     }
 
     fn start(&mut self, epoch: &Stamped<GnssEpoch>, out: &mut Vec<EstimatorOutput>) -> bool {
-        let Some(compass) = self.compass.filter(|c| (epoch.t_valid - c.t_valid).abs() <= COMPASS_AGE) else {
+        self.compass.retain(|c| (epoch.t_recv - c.t_recv).abs() <= COMPASS_AGE);
+        if self.compass.len() < FEWEST_READINGS {
             return false;
-        };
+        }
+        let Some(typical) = most_typical(&self.compass) else { return false };
         let core = &mut self.core;
         core.state.learnt.copy_from(&core.learning.start);
-        if !start(&mut core.state, epoch.t_valid, &epoch.value, &compass.value, &core.models) {
+        if !start(&mut core.state, epoch.t_valid, &epoch.value, &typical, &core.models) {
             return false;
         }
         let state = &self.core.state;
         self.history.restart(epoch.t_valid, |base| base.copy_from(state));
-        // The reading that gave the first heading ties heading to the compass's bias.
-        let stamp = Stamp { t_valid: epoch.t_valid, t_recv: epoch.t_recv, seq: 0 };
-        self.take(stamp, FusionSource::CompassHeading, out, |m| {
-            m.kind = Kind::Attitude;
-            m.attitude = compass.value;
-        });
+        for reading in std::mem::take(&mut self.compass) {
+            if reading.t_valid >= epoch.t_valid {
+                self.attitude(&reading, out);
+            }
+        }
         true
     }
 
@@ -258,7 +268,7 @@ impl Estimator {
         core.state.echoes.iter_mut().for_each(|echo| echo.live = false);
         core.state.probe.live = false;
         core.state.cov.fill(0.0);
-        self.compass = None;
+        self.compass.clear();
         let t = core.state.t;
         self.history.restart(t, |_| {});
         out.push(EstimatorOutput::Reset { reason });
@@ -299,6 +309,20 @@ impl Estimator {
             test_ratio: f64::NAN,
         }));
     }
+}
+
+/// The reading that differs least from all others in sum: a wrong one among them does not win.
+fn most_typical(readings: &VecDeque<Stamped<AttitudeSample>>) -> Option<AttitudeSample> {
+    let apart = |a: &AttitudeSample, b: &AttitudeSample| {
+        let heading = a.heading.zip(b.heading).map_or(0.0, |(a, b)| wrap_angle(a - b).abs());
+        let tilt = |a: &crate::geo::Tilt, b: &crate::geo::Tilt| {
+            wrap_angle(a.pitch - b.pitch).abs() + wrap_angle(a.roll - b.roll).abs()
+        };
+        heading + a.tilt.zip(b.tilt).map_or(0.0, |(a, b)| tilt(&a, &b))
+    };
+    let in_sum = |a: &AttitudeSample| readings.iter().map(|b| apart(a, &b.value)).sum::<f64>();
+    let best = readings.iter().min_by(|a, b| in_sum(&a.value).total_cmp(&in_sum(&b.value)));
+    best.map(|reading| reading.value)
 }
 
 fn stamp_of<T>(stamped: &Stamped<T>) -> Stamp {

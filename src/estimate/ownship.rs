@@ -302,11 +302,11 @@ pub(super) fn start(
     state.probe.live = false;
     state.echoes.iter_mut().for_each(|echo| echo.live = false);
     let mut variances = [0.0; at::OWN];
-    // Position and heading start wide and are tied to the sensors' biases by the first updates.
+    // Position starts wide and is tied to the receiver's bias by the first update.
     variances[at::POSITION..at::POSITION + 3].fill(1e4);
     variances[at::VELOCITY..at::VELOCITY + 3].fill(if velocity.is_some() { 1.0 } else { 100.0 });
     variances[at::ATTITUDE..at::ATTITUDE + 2].fill(START_TILT.powi(2));
-    variances[at::ATTITUDE + 2] = 0.5;
+    variances[at::ATTITUDE + 2] = models.heading_bias_var + START_HEADING.powi(2);
     variances[at::RATE..at::RATE + 3].fill(0.3 * 0.3);
     variances[at::FORCE..at::FORCE + 2].fill(state.learnt.side_force_var);
     variances[at::FORCE + 2] = state.learnt.thrust_var;
@@ -318,11 +318,16 @@ pub(super) fn start(
     for (i, variance) in variances.into_iter().enumerate() {
         state.cov.set(i, i, variance);
     }
+    // Heading is the reading less the bias: where the one errs, so does the other.
+    state.cov.set(at::ATTITUDE + 2, at::HEADING_BIAS, -models.heading_bias_var);
+    state.cov.set(at::HEADING_BIAS, at::ATTITUDE + 2, -models.heading_bias_var);
     true
 }
 
 /// Tilt at the start, one sigma, rad: what a helicopter may fly with whatever its compass says.
 const START_TILT: f64 = 0.1;
+/// What a heading reading may have changed since it was taken, one sigma, rad.
+const START_HEADING: f64 = 0.1;
 /// Zero offset of a tilt sensor, one sigma, rad (0.4°: data sheets allow 0.2° to 0.5°).
 const START_TILT_BIAS: f64 = 0.007;
 /// How far from 1 the share of tilt read may be at the start, one sigma.

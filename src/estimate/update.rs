@@ -92,8 +92,9 @@ impl Workspace {
         Self { whitened: Grid::zeros(MAX_MEASURED, n), dx: vec![0.0; n], gains: vec![[0.0; MAX_MEASURED]; n] }
     }
 
-    /// Fuses `z`. With a gate (a chi-square value) the noise of a measurement outside it is raised by
-    /// how far outside it lies (soft gate), and one absurdly far outside is refused.
+    /// Fuses `z`. With a gate (a chi-square value) the noise of a measurement outside it is raised until
+    /// its innovation lies on the gate (soft gate: `R ← R + (ratio − 1) S`, so its weight falls as
+    /// 1/ratio however uncertain the state is), and one absurdly far outside is refused.
     pub(super) fn fuse(&mut self, state: &mut State, z: &mut Measurement, gate: Option<f64>) -> Outcome {
         let mut outcome = Outcome {
             disposition: Disposition::Invalid,
@@ -106,7 +107,12 @@ impl Workspace {
         let m = z.m;
         self.project(state, z);
         let spread = self.spread(z);
-        let mut s = add(&spread, &z.noise, m);
+        let mut s = spread;
+        for i in 0..m {
+            for j in 0..m {
+                s[i][j] += z.noise[i][j];
+            }
+        }
         for i in 0..m {
             outcome.innovation_var[i] = s[i][i];
         }
@@ -124,14 +130,10 @@ impl Workspace {
         }
         if outcome.ratio > 1.0 {
             outcome.disposition = Disposition::Deweighted;
-            z.noise.iter_mut().flatten().for_each(|x| *x *= outcome.ratio);
-            s = add(&spread, &z.noise, m);
-            if !cholesky(&mut s, m) {
-                outcome.disposition = Disposition::Invalid;
-                return outcome;
-            }
-            white = z.residual;
-            forward(&s, m, &mut white);
+            // Innovation covariance raised until the innovation lies on the gate.
+            let root = outcome.ratio.sqrt();
+            s.iter_mut().flatten().for_each(|x| *x *= root);
+            white.iter_mut().for_each(|x| *x /= root);
         }
         self.apply(state, z, &s, &white);
         outcome
@@ -216,14 +218,4 @@ impl Workspace {
             }
         }
     }
-}
-
-fn add(a: &Small, b: &Small, m: usize) -> Small {
-    let mut sum = *a;
-    for i in 0..m {
-        for j in 0..m {
-            sum[i][j] += b[i][j];
-        }
-    }
-    sum
 }
