@@ -5,12 +5,13 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use nalgebra::{Matrix3, SMatrix, SVector};
-use windhover::estimate::{Estimator, EstimatorOutput, PaperEstimator, Site};
+use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+use windhover::config::Config;
+use windhover::estimate::{Bound, BoundTruth, Estimator, EstimatorOutput, PaperEstimator, Site};
 use windhover::geo::{Ground, wrap_angle};
 use windhover::msg::{Stamped, TargetEstimate, TrackStatus};
 use windhover::simulate::{Sample, Scenario, SensorSuite, World};
-use windhover::time::Span;
+use windhover::time::{MonoTime, Span};
 
 /// What is scored begins here, seconds into the flight.
 const BURN_S: f64 = 6.0;
@@ -81,6 +82,125 @@ impl Score {
     }
 }
 
+/// The truth as the bound takes it.
+fn truth_at(world: &World, t: MonoTime, gps_delay_s: f64) -> BoundTruth {
+    let own = world.ownship(t);
+    let targets = (0..world.vehicles()).map(|i| {
+        let v = world.vehicle(i, t);
+        [v.north_m, v.east_m, v.heading_rad, v.speed_mps, v.yaw_rate_radps]
+    });
+    BoundTruth {
+        position: own.position_ned_m,
+        velocity: own.velocity_ned_mps,
+        acceleration: own.acceleration_ned_mps2,
+        ned_from_body: own.ned_from_body,
+        rate: own.body_rate_radps,
+        tilt_gain: world.scenario().compass.tilt_gain,
+        gps_delay_s,
+        targets: targets.collect(),
+    }
+}
+
+/// The configuration whose intensities of motion are those of the true motion, from its increments
+/// over a fifth of a second (two tenths for the vehicle, as long as the filter remembers), and whose
+/// noise figures are the true ones.
+fn told_the_truth(world: &World) -> Config {
+    const STEP_S: f64 = 0.2;
+    let scenario = world.scenario();
+    let mut config = scenario.config.clone();
+    let times = || (0..).map(|k| BURN_S + STEP_S * f64::from(k)).take_while(|t| *t < scenario.duration_s);
+    let rms = |increment: &dyn Fn(f64) -> f64| {
+        let (sum, n) = times().fold((0.0, 0.0), |(s, n), t| (s + increment(t).powi(2), n + 1.0));
+        f64::sqrt(sum / f64::max(n, 1.0))
+    };
+    let walk = |value: &dyn Fn(MonoTime) -> f64| {
+        rms(&|t| value(world.time(t + STEP_S)) - value(world.time(t))) / STEP_S.sqrt()
+    };
+    let e = &mut config.estimator;
+    let vehicle = |t| world.vehicle(0, t);
+    // A vehicle at rest has no intensity at all; a figure must be positive.
+    e.target_speed_walk = walk(&|t| vehicle(t).speed_mps).max(0.02);
+    e.target_yaw_rate_walk = walk(&|t| vehicle(t).yaw_rate_radps).max(0.01);
+    let rate = |axis: usize| walk(&|t| world.ownship(t).body_rate_radps[axis]);
+    e.tilt_rate_walk = (0.5 * (rate(0).powi(2) + rate(1).powi(2))).sqrt();
+    e.yaw_rate_walk = rate(2);
+    let force = |axis: usize| {
+        walk(&|t| {
+            let own = world.ownship(t);
+            let felt = own.acceleration_ned_mps2 - Vector3::z() * 9.806_65;
+            (own.ned_from_body.inverse() * felt)[axis]
+        })
+    };
+    // A Gauss–Markov process of variance s² walks by 2 s²/τ.
+    let sigma = |walk: f64| walk * (0.5 * e.force_tau_s).sqrt();
+    (e.side_force_mps2, e.thrust_mps2) = (sigma((force(0) * force(1)).sqrt()), sigma(force(2)));
+    let (gps, compass) = (&scenario.gps, &scenario.compass);
+    (config.gps.bias_sigma_m, config.gps.noise_m) = (gps.bias_sigma_m, gps.noise_m);
+    config.gps.velocity_noise_mps = gps.velocity_noise_mps;
+    config.compass.heading_noise_deg = compass.heading_noise_deg;
+    config.compass.tilt_noise_deg = compass.tilt_noise_deg;
+    config
+}
+
+/// Mean variances of the bound over a run, of every target.
+#[derive(Default)]
+struct BoundScore {
+    frames: f64,
+    variance: SVector<f64, 5>,
+}
+
+impl BoundScore {
+    fn add(&mut self, covariance: &SMatrix<f64, 5, 5>) {
+        self.frames += 1.0;
+        self.variance += covariance.diagonal();
+    }
+
+    fn figures(&self) -> Figures {
+        let rms = |i: usize| (self.variance[i] / self.frames.max(1.0)).sqrt();
+        let none = f64::NAN;
+        Figures([none, rms(2).to_degrees(), rms(3), rms(4), none, none, none, none])
+    }
+}
+
+/// The bound over a flight: its measurements in order of when they were true.
+fn bound(world: &Arc<World>, site: &Site) -> Figures {
+    let mut suite = SensorSuite::new(Arc::clone(world));
+    let delay_s = suite.gps_latency_error().s();
+    let mut taken = Vec::new();
+    while let Some(sample) = suite.next() {
+        let t = match &sample {
+            Sample::Gnss { stamped, .. } => stamped.t_valid - Span::from_s(delay_s),
+            Sample::Attitude { t_true, .. } => *t_true,
+            Sample::Frame { truth, .. } => truth.t_true,
+        };
+        let seen = matches!(sample, Sample::Frame { .. }).then(|| suite.observations().clone());
+        taken.push((t, sample, seen));
+    }
+    taken.sort_by_key(|(t, ..)| *t);
+    let mut bound = Bound::new(&told_the_truth(world), site);
+    let mut score = BoundScore::default();
+    for (t, sample, seen) in &taken {
+        // A fix enters where its stamp puts it, with the delay that is to be learnt.
+        let truth = truth_at(world, *t, 0.0);
+        match sample {
+            Sample::Gnss { stamped, .. } => bound.gnss(*t, &stamped.value, &truth),
+            Sample::Attitude { stamped, .. } => bound.attitude(*t, &stamped.value, &truth),
+            Sample::Frame { .. } => {
+                if let Some(seen) = seen {
+                    bound.frame(*t, seen, &truth);
+                }
+                let scored = world.seconds(*t) >= BURN_S;
+                for target in (0..world.vehicles()).filter(|_| scored) {
+                    if let Some(covariance) = bound.target(target) {
+                        score.add(&covariance);
+                    }
+                }
+            }
+        }
+    }
+    score.figures()
+}
+
 /// rel m, heading deg, speed, yaw rate, NEES of three, of five, of position, coverage.
 #[derive(Clone, Copy)]
 struct Figures([f64; 8]);
@@ -108,6 +228,7 @@ struct Run {
     filter: Figures,
     smoothed: Figures,
     paper: Figures,
+    bound: Figures,
     us_per_frame: f64,
     resets: usize,
     delay_error_ms: f64,
@@ -174,6 +295,7 @@ fn run(scenario: &Scenario, seed: u64, verbose: bool) -> Run {
         filter: f.figures(),
         smoothed: s.figures(),
         paper: p.figures(),
+        bound: bound(&world, &site),
         us_per_frame: busy.as_secs_f64() * 1e6 / frames.max(1) as f64,
         resets,
         delay_error_ms: filter.gps_delay_s() * 1e3 - error,
@@ -222,6 +344,7 @@ fn main() {
         println!("{name:<18} filter    {}", of(|r| r.filter));
         println!("{name:<18} smoothed  {}", of(|r| r.smoothed));
         println!("{name:<18} paper     {}", of(|r| r.paper));
+        println!("{name:<18} bound     {}", of(|r| r.bound));
         let n = results.len() as f64;
         let mean = |pick: fn(&Run) -> f64| results.iter().map(pick).sum::<f64>() / n;
         println!(

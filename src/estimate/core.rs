@@ -48,6 +48,8 @@ pub(super) struct Core {
     /// What became of measurements; filled only while `reporting`.
     pub(super) results: Vec<FusionResult>,
     pub(super) reporting: bool,
+    /// For the bound: the mean is the truth, so innovations are taken as zero and nothing is gated.
+    pub(super) at_truth: bool,
 }
 
 impl Core {
@@ -91,6 +93,7 @@ impl Core {
             state,
             results: Vec::with_capacity(64),
             reporting: false,
+            at_truth: false,
         }
     }
 
@@ -108,10 +111,18 @@ impl Core {
 
     /// Fuses what stands in `self.z` through the gate, and reports it.
     pub(super) fn fuse_gated(&mut self, source: FusionSource) -> Outcome {
-        let gate = self.models.gates[self.z.m];
-        let outcome = self.work.fuse(&mut self.state, &mut self.z, Some(gate));
+        let gate = (!self.at_truth).then_some(self.models.gates[self.z.m]);
+        let outcome = self.fuse(gate);
         self.report(source, outcome);
         outcome
+    }
+
+    /// Fuses what stands in `self.z`.
+    pub(super) fn fuse(&mut self, gate: Option<f64>) -> Outcome {
+        if self.at_truth {
+            self.z.residual.fill(0.0);
+        }
+        self.work.fuse(&mut self.state, &self.z, gate)
     }
 
     fn report(&mut self, source: FusionSource, outcome: Outcome) {

@@ -4,6 +4,7 @@
 //!
 //! `docs/estimator.md` gives state, models and what each choice is worth.
 
+mod bound;
 mod core;
 mod filter;
 mod learn;
@@ -18,6 +19,7 @@ mod track;
 mod update;
 mod vision;
 
+pub use bound::{Bound, BoundTruth};
 pub use filter::{Estimator, EstimatorOutput};
 pub use paper::PaperEstimator;
 

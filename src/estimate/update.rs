@@ -95,7 +95,7 @@ impl Workspace {
     /// Fuses `z`. With a gate (a chi-square value) the noise of a measurement outside it is raised until
     /// its innovation lies on the gate (soft gate: `R ← R + (ratio − 1) S`, so its weight falls as
     /// 1/ratio however uncertain the state is), and one absurdly far outside is refused.
-    pub(super) fn fuse(&mut self, state: &mut State, z: &mut Measurement, gate: Option<f64>) -> Outcome {
+    pub(super) fn fuse(&mut self, state: &mut State, z: &Measurement, gate: Option<f64>) -> Outcome {
         let mut outcome = Outcome {
             disposition: Disposition::Invalid,
             ratio: f64::NAN,

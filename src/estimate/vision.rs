@@ -142,7 +142,7 @@ impl Core {
         if gated {
             return self.fuse_gated(FusionSource::Marker).ratio <= 1.0;
         }
-        let outcome = self.work.fuse(&mut self.state, &mut self.z, None);
+        let outcome = self.fuse(None);
         outcome.disposition == Disposition::Fused
     }
 
@@ -242,7 +242,7 @@ impl Core {
             self.z.set(1, place + k, d.y);
         }
         if !gated {
-            self.work.fuse(&mut self.state, &mut self.z, None);
+            self.fuse(None);
             return;
         }
         if self.fuse_gated(FusionSource::Feature).ratio > 1.0 {
