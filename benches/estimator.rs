@@ -102,19 +102,19 @@ fn truth_at(world: &World, t: MonoTime, gps_delay_s: f64) -> BoundTruth {
 }
 
 /// The configuration whose intensities of motion are those of the true motion, from its increments
-/// over a fifth of a second (two tenths for the vehicle, as long as the filter remembers), and whose
+/// over about as long as the filter remembers (0.2 s with ground features, else 0.5 s), and whose
 /// noise figures are the true ones.
 fn told_the_truth(world: &World) -> Config {
-    const STEP_S: f64 = 0.2;
+    let step_s = if world.scenario().camera.features > 0 { 0.2 } else { 0.5 };
     let scenario = world.scenario();
     let mut config = scenario.config.clone();
-    let times = || (0..).map(|k| BURN_S + STEP_S * f64::from(k)).take_while(|t| *t < scenario.duration_s);
+    let times = || (0..).map(|k| BURN_S + step_s * f64::from(k)).take_while(|t| *t < scenario.duration_s);
     let rms = |increment: &dyn Fn(f64) -> f64| {
         let (sum, n) = times().fold((0.0, 0.0), |(s, n), t| (s + increment(t).powi(2), n + 1.0));
         f64::sqrt(sum / f64::max(n, 1.0))
     };
     let walk = |value: &dyn Fn(MonoTime) -> f64| {
-        rms(&|t| value(world.time(t + STEP_S)) - value(world.time(t))) / STEP_S.sqrt()
+        rms(&|t| value(world.time(t + step_s)) - value(world.time(t))) / step_s.sqrt()
     };
     let e = &mut config.estimator;
     let vehicle = |t| world.vehicle(0, t);
