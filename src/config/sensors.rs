@@ -254,7 +254,7 @@ mod defaults {
         15.0
     }
     pub(super) fn heading_bias_sigma_deg() -> f64 {
-        2.0
+        1.5
     }
     pub(super) fn heading_noise_deg() -> f64 {
         0.5

@@ -111,6 +111,7 @@ impl State {
         }
         for i in 0..self.targets.len() {
             if self.targets[i].held && self.targets[i].last_seen == now {
+                self.learn_rest(learning, i, since_s);
                 for k in 0..2 {
                     self.learn_target(learning, i, k, since_s / learning.over_s);
                 }
@@ -137,6 +138,48 @@ impl State {
         blend(&mut self.learnt.target_q[i][k], square / age_s, gain, learning.start.target_q[i][k]);
     }
 }
+
+impl State {
+    /// A vehicle that has stood still for a second is taken to stand: its intensities fall fast, where
+    /// the fit alone would take long, since increments that cannot be told from noise teach it little.
+    ///
+    /// The test is `(v̂, ω̂) P⁻¹ (v̂, ω̂)ᵀ`, two on average for a vehicle at rest. One that creeps slower than
+    /// can be seen fails it as soon as the smaller intensity has sharpened the estimate.
+    fn learn_rest(&mut self, learning: &Learning, i: usize, since_s: f64) {
+        let s = self.target_at(i);
+        let (vv, ww, vw) = (self.cov.at(s + 3, s + 3), self.cov.at(s + 4, s + 4), self.cov.at(s + 3, s + 4));
+        let target = &mut self.targets[i];
+        let [.., v, w] = target.mean;
+        let test = (v * v * ww - 2.0 * v * w * vw + w * w * vv) / (vv * ww - vw * vw).max(1e-18);
+        target.motion += (since_s / REST_S).min(1.0) * (test.min(MOVING) - target.motion);
+        if target.motion < RESTING {
+            let keep = (-since_s / REST_S).exp();
+            for (q, start) in self.learnt.target_q[i].iter_mut().zip(&learning.start.target_q[i]) {
+                *q = (*q * keep).max(start * LEAST * LEAST);
+            }
+        }
+    }
+
+    /// A target whose markers have all left the gate has begun to move: its intensities are what is
+    /// configured again, and its motion is as uncertain as they make it in half a second.
+    pub(super) fn wake(&mut self, learning: &Learning, i: usize) {
+        let s = self.target_at(i);
+        self.targets[i].motion = MOVING;
+        for (k, start) in learning.start.target_q[i].iter().enumerate() {
+            let q = &mut self.learnt.target_q[i][k];
+            if *q < *start {
+                *q = *start;
+                self.cov.add(s + 3 + k, s + 3 + k, 0.5 * *start);
+            }
+        }
+    }
+}
+
+/// Time over which a vehicle must have stood still to be taken to stand, s.
+const REST_S: f64 = 0.5;
+/// Value of the test (mean of two at rest) below which it stands, and the most one frame counts.
+const RESTING: f64 = 2.5;
+pub(super) const MOVING: f64 = 20.0;
 
 /// Shortest increment looked at, s.
 const SHORTEST_S: f64 = 0.1;

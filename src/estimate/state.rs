@@ -104,6 +104,8 @@ pub(super) struct Target {
     pub(super) last_seen: MonoTime,
     /// Frames it was seen in since it was last started.
     pub(super) seen: u32,
+    /// Sliding mean of the test that it stands still; see `learn_rest`.
+    pub(super) motion: f64,
     /// When the present track was (last) started: nothing ties it to copies from before.
     pub(super) started: MonoTime,
     /// When and where (north, east) it was first seen since it was last unknown.

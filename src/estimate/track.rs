@@ -3,6 +3,7 @@
 use crate::msg::TrackStatus;
 use crate::time::MonoTime;
 
+use super::learn::MOVING;
 use super::state::{State, Target, at};
 
 /// Frames a new track must be seen in before it is believed.
@@ -31,6 +32,7 @@ pub(super) fn started(mean: [f64; at::TARGET], t: MonoTime) -> Target {
         last_seen: t,
         seen: 1,
         rejected: 0,
+        motion: MOVING,
         started: t,
         first_seen,
     }

@@ -103,6 +103,7 @@ impl Core {
                 self.start_target(index, markers, None);
                 return;
             }
+            self.state.wake(&self.learning, index);
         }
         self.state.settle(index);
     }
