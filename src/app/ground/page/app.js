@@ -190,7 +190,7 @@ function camera(p) {
     if (m.corners.length === 8) { for (let i = 0; i < 8; i += 2) c[i ? "lineTo" : "moveTo"](...q(m.corners[i], m.corners[i + 1])); c.closePath(); }
     else { const [x, y] = q(m.u, m.v); c.arc(x, y, Math.max(3, m.size * k / 2), 0, TAU); }
     c.stroke();
-    const [x, y] = q(m.u, m.v); c.font = "600 12px system-ui, sans-serif"; c.lineWidth = 3; c.strokeStyle = "#000a"; c.strokeText(m.id, x + 8, y - 8); c.fillStyle = "#fff"; c.fillText(m.id, x + 8, y - 8); c.lineWidth = 2;
+    const [x, y] = q(m.u, m.v); c.font = "600 12px system-ui, sans-serif"; c.lineWidth = 3; c.strokeStyle = "#000a"; const name = m.id.split(" ").pop(); c.strokeText(name, x + 8, y - 8); c.fillStyle = "#fff"; c.fillText(name, x + 8, y - 8); c.lineWidth = 2;
   }
   $("camera-note").textContent = `frame ${t.frame}, ${t.markers.length} marker${t.markers.length === 1 ? "" : "s"}`;
 }

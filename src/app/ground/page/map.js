@@ -21,7 +21,7 @@ function surface(canvas) {
 
 class FieldMap {
   constructor(canvas) {
-    this.canvas = canvas; this.center = null; this.scale = 4; this.follow = true; this.tiles = null;
+    this.canvas = canvas; this.center = null; this.scale = 12; this.follow = true; this.tiles = null;
     this.cache = new Map(); this.fingers = new Map(); this.moved = () => {};
     canvas.addEventListener("pointerdown", e => { canvas.setPointerCapture(e.pointerId); this.fingers.set(e.pointerId, e); });
     for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, e => this.fingers.delete(e.pointerId));
