@@ -1,5 +1,6 @@
 //! What is looked for in a frame, and where: predicted places first, the rest in strips while tracking.
 
+use super::disc_pairs::DiscPairs;
 use super::features::{Circle, FeatureTracker};
 use super::tag::{Region, TagDetector};
 use crate::config::{Config, MarkerKind, TagFamily};
@@ -20,6 +21,7 @@ pub struct FrameDetector {
     min_px: f64,
     next_strip: usize,
     scratch: Vec<MarkerDetection>,
+    discs: Option<DiscPairs>,
     features: FeatureTracker,
     occupied: Vec<Circle>,
 }
@@ -44,6 +46,7 @@ impl FrameDetector {
             min_px: detector.min_px,
             next_strip: 0,
             scratch: Vec::new(),
+            discs: DiscPairs::new(config),
             features: FeatureTracker::new(detector.ground_features),
             occupied: Vec::new(),
         }
@@ -53,7 +56,7 @@ impl FrameDetector {
     pub fn process(
         &mut self,
         image: ImageView<'_>,
-        _rgb: Option<&RgbImage>,
+        rgb: Option<&RgbImage>,
         prediction: Option<&FramePrediction>,
         out: &mut FrameObservations,
     ) {
@@ -63,6 +66,9 @@ impl FrameDetector {
             return;
         }
         self.find_tags(image, prediction, &mut out.markers);
+        if let Some(discs) = &mut self.discs {
+            discs.find(image, rgb, prediction, &mut out.markers);
+        }
         self.occupied.clear();
         self.occupied.extend(prediction.iter().flat_map(|p| &p.occupied));
         self.occupied.extend(out.markers.iter().map(|m| (m.center_px, m.size_px)));

@@ -3,6 +3,8 @@
 mod binarise;
 mod codes;
 mod components;
+mod disc;
+mod disc_pairs;
 mod edges;
 mod family;
 mod features;

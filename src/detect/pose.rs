@@ -203,20 +203,21 @@ mod tests {
     }
 
     #[test]
-    fn far_away_and_nearly_square_on_both_poses_are_given_as_alike() {
-        let rotation = UnitQuaternion::from_euler_angles(0.4, 0.0, 0.4);
-        let truth = Isometry3::from_parts(Translation3::new(0.5, 0.3, 14.0), rotation);
-        let mut seen = corners(&truth, 0.48);
-        seen[0].x += 0.1;
-        seen[2].y -= 0.1;
-        let poses = tag_poses(&seen, &[Matrix2::identity() * 0.01; 4], 0.48, &camera()).expect("a pose");
-        let other = poses.other.expect("the mirror image");
-        assert!(poses.ambiguity > 0.1, "{}", poses.ambiguity);
-        let nearest = [poses.best, other]
-            .map(|p| p.camera_from_tag.rotation.angle_to(&truth.rotation))
-            .into_iter()
-            .fold(f64::MAX, f64::min);
-        assert!(nearest < 0.15, "{nearest}");
+    fn the_farther_away_the_less_the_two_poses_differ() {
+        let mut last = -1.0;
+        for distance in [4.0, 14.0, 50.0] {
+            let rotation = UnitQuaternion::from_euler_angles(0.4, 0.0, 0.4);
+            let truth = Isometry3::from_parts(Translation3::new(0.5, 0.3, distance), rotation);
+            let mut seen = corners(&truth, 0.48);
+            seen[0].x += 0.02;
+            seen[2].y -= 0.02;
+            let poses = tag_poses(&seen, &[Matrix2::identity() * 0.01; 4], 0.48, &camera()).expect("a pose");
+            assert!(poses.ambiguity > last && poses.ambiguity <= 1.0, "{} at {distance} m", poses.ambiguity);
+            last = poses.ambiguity;
+            let angle = |p: TagPose| p.camera_from_tag.rotation.angle_to(&truth.rotation);
+            let nearest = poses.other.map_or(f64::MAX, angle).min(angle(poses.best));
+            assert!(nearest < 0.2, "{nearest} at {distance} m");
+        }
     }
 
     #[test]

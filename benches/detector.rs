@@ -1,0 +1,76 @@
+//! What a frame costs the detector: whole frames at two smallest sizes, a tracked region, ground features.
+//!
+//! `cargo bench --bench detector`. The frame is generated: textured ground, noise, two tags of 40 and 90 px.
+
+use std::hint::black_box;
+
+use criterion::{Criterion, criterion_group, criterion_main};
+use nalgebra::Vector2;
+use rand::{Rng, SeedableRng};
+use windhover::config::TagFamily;
+use windhover::detect::{Region, Simd, TagDetector, tag_pattern};
+use windhover::msg::GrayImage;
+
+fn put_tag(image: &mut GrayImage, id: u32, at: (usize, usize), cell: usize) {
+    let pattern = tag_pattern(TagFamily::Tag36h11, id);
+    for y in 0..pattern.side() * cell {
+        for x in 0..pattern.side() * cell {
+            let light = if pattern.white(x / cell, y / cell) { 200 } else { 30 };
+            image.data[(at.1 + y) * image.stride + at.0 + x] = light;
+        }
+    }
+}
+
+/// 1280×1024: slabs of brick size with light joints, two tags, blur of three pixels, noise.
+fn frame() -> GrayImage {
+    let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(1);
+    let mut sharp = GrayImage::new(1280, 1024);
+    let slabs: Vec<u8> = (0..4096).map(|_| rng.random_range(70..110)).collect();
+    for (i, p) in sharp.data.iter_mut().enumerate() {
+        let (u, v) = (i % 1280, i / 1280);
+        let course = v / 18;
+        let shifted = u + course % 2 * 20;
+        *p = if v % 18 < 3 || shifted % 40 < 3 { 150 } else { slabs[(shifted / 40 * 57 + course * 31) % 4096] };
+    }
+    put_tag(&mut sharp, 3, (500, 400), 5);
+    put_tag(&mut sharp, 4, (700, 420), 11);
+    let mut image = sharp.clone();
+    for v in 1..1023 {
+        for u in 1..1279 {
+            let sum: u32 = (0..9).map(|k| u32::from(sharp.data[(v + k / 3 - 1) * 1280 + u + k % 3 - 1])).sum();
+            let noise = rng.random_range(-8i32..=8);
+            image.data[v * 1280 + u] = (sum as i32 / 9 + noise).clamp(0, 255) as u8;
+        }
+    }
+    image
+}
+
+fn tags(c: &mut Criterion) {
+    let image = frame();
+    let mut out = Vec::new();
+    for min_px in [24.0, 16.0] {
+        for (name, simd) in [("best", Simd::best()), ("scalar", Simd::scalar())] {
+            let mut detector = TagDetector::new(&[TagFamily::Tag36h11], min_px, 2).with_simd(simd);
+            detector.detect(image.view(), &mut out);
+            assert_eq!(out.len(), 2, "both tags are found");
+            c.bench_function(&format!("detector/frame 1280x1024/min {min_px} px/{name}"), |b| {
+                b.iter(|| {
+                    out.clear();
+                    detector.detect(black_box(image.view()), &mut out);
+                });
+            });
+            out.clear();
+        }
+    }
+    let mut detector = TagDetector::new(&[TagFamily::Tag36h11], 24.0, 2);
+    let region = Region::around(image.view(), Vector2::new(525.0, 425.0), 127.5).expect("inside the frame");
+    c.bench_function("detector/region 256x256", |b| {
+        b.iter(|| {
+            out.clear();
+            detector.detect_region(black_box(image.view()), region, &mut out);
+        });
+    });
+}
+
+criterion_group!(benches, tags);
+criterion_main!(benches);

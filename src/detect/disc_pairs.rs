@@ -1,0 +1,226 @@
+//! Which disc of the configuration each round region is: by size, by colour, by place, or not at all.
+
+use nalgebra::{Matrix2, Vector2};
+
+use super::disc::{Blob, DiscFinder, center_shift};
+use crate::config::{Brightness, CameraConfig, Config, MarkerKind};
+use crate::msg::{FramePrediction, GrayImage, ImageView, MarkerDetection, MarkerId, RgbImage};
+
+/// What a disc looks like against its surroundings.
+#[derive(Clone, Copy, PartialEq, Debug)]
+enum Look {
+    Light,
+    Dark,
+    Color([u8; 3]),
+}
+
+/// A disc of the configuration.
+#[derive(Clone, Copy, PartialEq, Debug)]
+struct Disc {
+    target: usize,
+    marker: usize,
+    diameter_m: f64,
+    look: Look,
+    at: Vector2<f64>,
+}
+
+/// Finds the configured discs; keeps its buffers.
+#[derive(Clone, Debug)]
+pub(super) struct DiscPairs {
+    discs: Vec<Disc>,
+    finder: DiscFinder,
+    plane: GrayImage,
+    blobs: Vec<(usize, Blob)>,
+    found: Vec<Blob>,
+    focal_px: f64,
+    principal: Vector2<f64>,
+}
+
+/// Sigmas of a predicted centre within which a disc is taken.
+const GATE_SIGMAS: f64 = 4.0;
+
+/// How far a disc's size may be from the predicted one, and a pair's ratio from the configured one.
+const SIZE_SLACK: f64 = 0.25;
+const RATIO_SLACK: f64 = 0.12;
+
+impl DiscPairs {
+    /// The discs of a configuration; `None` where it has none.
+    pub fn new(config: &Config) -> Option<Self> {
+        let mut discs = Vec::new();
+        for (target, t) in config.target.iter().enumerate() {
+            for (marker, m) in t.marker.iter().enumerate().filter(|(_, m)| m.kind == MarkerKind::Disc) {
+                let look = match (m.brightness, m.color.as_deref().and_then(parse_color)) {
+                    (_, Some(color)) => Look::Color(color),
+                    (Some(Brightness::Dark), None) => Look::Dark,
+                    _ => Look::Light,
+                };
+                let diameter_m = m.diameter_m?;
+                let at = Vector2::new(m.position_m[0], m.position_m[1]);
+                discs.push(Disc { target, marker, diameter_m, look, at });
+            }
+        }
+        let CameraConfig { intrinsics, .. } = &config.camera;
+        (!discs.is_empty()).then(|| Self {
+            discs,
+            finder: DiscFinder::new(),
+            plane: GrayImage::default(),
+            blobs: Vec::new(),
+            found: Vec::new(),
+            focal_px: 0.5 * (intrinsics.fx + intrinsics.fy),
+            principal: Vector2::new(intrinsics.cx, intrinsics.cy),
+        })
+    }
+
+    /// Appends the discs that can be told from all others.
+    pub fn find(
+        &mut self,
+        image: ImageView<'_>,
+        rgb: Option<&RgbImage>,
+        prediction: Option<&FramePrediction>,
+        out: &mut Vec<MarkerDetection>,
+    ) {
+        self.blobs.clear();
+        for i in 0..self.discs.len() {
+            // Discs that look alike are searched once.
+            let look = self.discs[i].look;
+            match self.discs[..i].iter().position(|d| d.look == look) {
+                Some(same) => {
+                    let alike: Vec<_> = self.blobs.iter().filter(|b| b.0 == same).map(|b| (i, b.1)).collect();
+                    self.blobs.extend(alike);
+                }
+                None => self.search(i, image, rgb),
+            }
+        }
+        let targets = self.discs.iter().map(|d| d.target).max().map_or(0, |t| t + 1);
+        for target in 0..targets {
+            self.assign(target, prediction, out);
+        }
+    }
+
+    fn search(&mut self, disc: usize, image: ImageView<'_>, rgb: Option<&RgbImage>) {
+        let look = self.discs[disc].look;
+        self.found.clear();
+        let sizes = (0.0, 0.5 * image.width.min(image.height) as f64);
+        let rgb = rgb.filter(|c| (c.width, c.height) == (image.width, image.height));
+        match (look, rgb) {
+            (Look::Dark, _) => self.finder.find(image, sizes, &mut self.found),
+            (Look::Light, _) => {
+                negative(image, &mut self.plane);
+                self.finder.find(self.plane.view(), sizes, &mut self.found);
+            }
+            (Look::Color(color), Some(rgb)) => {
+                color_distance(rgb, color, &mut self.plane);
+                self.finder.find(self.plane.view(), sizes, &mut self.found);
+            }
+            // A grey frame of a coloured disc: lighter or darker, there is no telling which.
+            (Look::Color(_), None) => {
+                self.finder.find(image, sizes, &mut self.found);
+                negative(image, &mut self.plane);
+                self.finder.find(self.plane.view(), sizes, &mut self.found);
+            }
+        }
+        self.blobs.extend(self.found.iter().map(|b| (disc, *b)));
+    }
+
+    /// Gives a target's discs to regions where there is one way to do so.
+    fn assign(&self, target: usize, prediction: Option<&FramePrediction>, out: &mut Vec<MarkerDetection>) {
+        let discs: Vec<usize> = (0..self.discs.len()).filter(|&i| self.discs[i].target == target).collect();
+        let candidates: Vec<Vec<&Blob>> = discs
+            .iter()
+            .map(|&i| self.blobs.iter().filter(|b| b.0 == i && self.expected(i, &b.1, prediction)).map(|b| &b.1).collect())
+            .collect();
+        match discs.as_slice() {
+            [only] => {
+                // Nothing but its place tells a single disc from other round things.
+                let predicted = predicted(&self.discs[*only], prediction).is_some();
+                if let ([blob], true) = (candidates[0].as_slice(), predicted) {
+                    out.push(self.detection(*only, blob));
+                }
+            }
+            [first, second, ..] => {
+                let (a, b) = (&self.discs[*first], &self.discs[*second]);
+                let mut pairs = candidates[0]
+                    .iter()
+                    .flat_map(|p| candidates[1].iter().map(move |q| (*p, *q)))
+                    .filter(|(p, q)| is_pair((a, p), (b, q)));
+                if let (Some((p, q)), None) = (pairs.next(), pairs.next()) {
+                    out.push(self.detection(*first, p));
+                    out.push(self.detection(*second, q));
+                }
+            }
+            [] => {}
+        }
+    }
+
+    /// Whether a region is where and as large as a disc is expected, if it is.
+    fn expected(&self, disc: usize, blob: &Blob, prediction: Option<&FramePrediction>) -> bool {
+        predicted(&self.discs[disc], prediction).is_none_or(|m| {
+            (blob.center - m.center_px).norm() <= GATE_SIGMAS * m.sigma_px + 3.0
+                && (blob.diameter / m.size_px - 1.0).abs() <= SIZE_SLACK
+        })
+    }
+
+    fn detection(&self, disc: usize, blob: &Blob) -> MarkerDetection {
+        let Disc { target, marker, .. } = self.discs[disc];
+        MarkerDetection {
+            marker: MarkerId::Disc { target, marker },
+            center_px: blob.center + center_shift(blob, self.focal_px, self.principal),
+            center_cov_px2: blob.cov,
+            corners_px: None,
+            corner_cov_px2: [Matrix2::zeros(); 4],
+            hamming: 0,
+            margin: 0.0,
+            size_px: blob.diameter,
+        }
+    }
+}
+
+fn predicted<'a>(
+    disc: &Disc,
+    prediction: Option<&'a FramePrediction>,
+) -> Option<&'a crate::msg::MarkerPrediction> {
+    let id = MarkerId::Disc { target: disc.target, marker: disc.marker };
+    prediction?.markers.iter().find(|m| m.marker == id)
+}
+
+/// Whether two regions have the sizes and the distance of two discs of one plane, seen at most 60° aslant.
+fn is_pair((a, p): (&Disc, &Blob), (b, q): (&Disc, &Blob)) -> bool {
+    let apart = (p.center - q.center).norm();
+    if apart < 0.5 * (p.diameter.min(q.diameter)) {
+        return false;
+    }
+    let ratio = (p.diameter / q.diameter) / (a.diameter_m / b.diameter_m);
+    // The larger axis is not foreshortened: it gives the scale.
+    let px_per_m = p.half_axes[0].max(1.0) * 2.0 / a.diameter_m;
+    let distance = apart / px_per_m / (a.at - b.at).norm().max(1e-6);
+    (ratio - 1.0).abs() <= RATIO_SLACK && (0.45..=1.25).contains(&distance)
+}
+
+fn parse_color(text: &str) -> Option<[u8; 3]> {
+    let digits = text.strip_prefix('#')?;
+    let part = |k: usize| u8::from_str_radix(digits.get(2 * k..2 * k + 2)?, 16).ok();
+    Some([part(0)?, part(1)?, part(2)?])
+}
+
+fn negative(image: ImageView<'_>, to: &mut GrayImage) {
+    (to.width, to.height, to.stride) = (image.width, image.height, image.width);
+    to.data.clear();
+    (0..image.height).for_each(|v| to.data.extend(image.row(v).iter().map(|p| !p)));
+}
+
+/// Distance in chromaticity from a colour, dark where near: shares of red, green and blue do not change
+/// with the light.
+fn color_distance(rgb: &RgbImage, color: [u8; 3], to: &mut GrayImage) {
+    (to.width, to.height, to.stride) = (rgb.width, rgb.height, rgb.width);
+    let shares = |c: [u8; 3]| {
+        let sum = c.iter().map(|&x| f32::from(x)).sum::<f32>() + 24.0;
+        c.map(|x| (f32::from(x) + 8.0) / sum)
+    };
+    let wanted = shares(color);
+    to.data.clear();
+    to.data.extend(rgb.data.chunks_exact(3).map(|p| {
+        let here = shares([p[0], p[1], p[2]]);
+        let distance: f32 = wanted.iter().zip(here).map(|(a, b)| (a - b).abs()).sum();
+        (distance * 300.0).min(255.0) as u8
+    }));
+}

@@ -1,0 +1,186 @@
+//! The tag detector on generated tags: honest covariance, one answer on every machine, nothing out of noise.
+
+use nalgebra::{Matrix3, Vector2, Vector3};
+use proptest::prelude::*;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+use windhover::config::TagFamily;
+use windhover::detect::{Simd, TagDetector, TagPattern, tag_pattern};
+use windhover::msg::{GrayImage, ImageView, MarkerDetection, MarkerId};
+
+/// A generated image and where its tag's corners are.
+struct Drawn {
+    image: GrayImage,
+    corners: [Vector2<f64>; 4],
+    id: u32,
+}
+
+/// Takes tag coordinates (border square from −1 to 1) to pixels: a tilted square seen in perspective.
+fn random_view(rng: &mut ChaCha8Rng, edge: f64, size: f64) -> Matrix3<f64> {
+    let (turn, tilt, towards) =
+        (rng.random_range(0.0..6.28), rng.random_range(0.0..0.5f64), rng.random_range(0.0..6.28f64));
+    let axis = nalgebra::Unit::new_normalize(Vector3::new(towards.cos(), towards.sin(), 0.0));
+    let rotation = nalgebra::Rotation3::from_axis_angle(&axis, tilt)
+        * nalgebra::Rotation3::from_axis_angle(&Vector3::z_axis(), turn);
+    let (focal, depth) = (1000.0, 2.0 * 1000.0 / edge);
+    let middle = size / 2.0;
+    let (du, dv) = (rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
+    let camera = Matrix3::new(focal, 0.0, middle + du, 0.0, focal, middle + dv, 0.0, 0.0, 1.0);
+    let r = rotation.matrix();
+    camera * Matrix3::from_columns(&[r.column(0).into(), r.column(1).into(), Vector3::new(0.0, 0.0, depth)])
+}
+
+/// Reflectance at a point of the tag plane: the print, then ground.
+fn reflectance(pattern: &TagPattern, x: f64, y: f64) -> f64 {
+    let cell = 2.0 / pattern.border as f64;
+    let half = pattern.side() as f64 / 2.0;
+    let (cx, cy) = (x / cell + half, y / cell + half);
+    let on_print = cx >= 0.0 && cy >= 0.0 && cx < 2.0 * half && cy < 2.0 * half;
+    match on_print {
+        true if pattern.white(cx as usize, cy as usize) => 0.85,
+        true => 0.08,
+        false => 0.35 + 0.05 * ((x * 3.1).sin() + (y * 2.3).cos()),
+    }
+}
+
+fn draw(rng: &mut ChaCha8Rng, edge: f64) -> Drawn {
+    let size = (edge * 1.5 + 40.0).ceil();
+    let view = random_view(rng, edge, size);
+    let id = rng.random_range(0..587);
+    let pattern = tag_pattern(TagFamily::Tag36h11, id);
+    let back = view.try_inverse().expect("a view has an inverse");
+    let (blur, motion) = (rng.random_range(0.4..1.0), rng.random_range(0.0..3.0f64));
+    let direction = rng.random_range(0.0..6.28f64);
+    // One kernel an image: pixel square, blur and motion, in pairs about its middle so that it shifts nothing.
+    let mut kernel = Vec::new();
+    for k in 0..14 {
+        let along = ((f64::from(k) + 0.5) / 14.0 - 0.5) * motion;
+        let normal: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(rng));
+        let square: [f64; 2] = std::array::from_fn(|_| rng.random_range(-0.5..0.5));
+        let at = Vector2::new(
+            along * direction.cos() + blur * normal[0] + square[0],
+            along * direction.sin() + blur * normal[1] + square[1],
+        );
+        kernel.extend([at, -at]);
+    }
+    let gain = rng.random_range(120.0..230.0);
+    let noise = rng.random_range(2.0..6.0);
+    let mut image = GrayImage::new(size as usize, size as usize);
+    let width = image.width;
+    for (i, pixel) in image.data.iter_mut().enumerate() {
+        let at = Vector2::new((i % width) as f64, (i / width) as f64);
+        let light: f64 = kernel
+            .iter()
+            .map(|k| {
+                let p = back * Vector3::new(at.x + k.x, at.y + k.y, 1.0);
+                reflectance(&pattern, p.x / p.z, p.y / p.z)
+            })
+            .sum();
+        let grain: f64 = StandardNormal.sample(rng);
+        *pixel = (gain * light / kernel.len() as f64 + noise * grain + 0.5).clamp(0.0, 255.0) as u8;
+    }
+    let corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)].map(|(x, y)| {
+        let p = view * Vector3::new(x, y, 1.0);
+        Vector2::new(p.x / p.z, p.y / p.z)
+    });
+    Drawn { image, corners, id }
+}
+
+fn found_in(detector: &mut TagDetector, drawn: &Drawn) -> Option<MarkerDetection> {
+    let mut out = Vec::new();
+    detector.detect(drawn.image.view(), &mut out);
+    out.into_iter().find(|m| m.marker == MarkerId::Tag { family: TagFamily::Tag36h11, id: drawn.id })
+}
+
+/// Mean normalised error squared, RMS error, mean error and share found, of `count` tags of a class.
+fn score(edges: std::ops::Range<f64>, count: usize, seed: u64) -> (f64, f64, Vector2<f64>, f64) {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut detector = TagDetector::new(&[TagFamily::Tag36h11], 16.0, 2);
+    let (mut nes, mut square, mut sum, mut corners, mut tags) = (0.0, 0.0, Vector2::zeros(), 0.0, 0.0);
+    for _ in 0..count {
+        let edge = rng.random_range(edges.clone());
+        let drawn = draw(&mut rng, edge);
+        let Some(found) = found_in(&mut detector, &drawn) else { continue };
+        tags += 1.0;
+        let seen = found.corners_px.expect("a tag has corners");
+        for i in 0..4 {
+            let error = seen[i] - drawn.corners[i];
+            let inverse = found.corner_cov_px2[i].try_inverse().expect("a covariance");
+            nes += (error.transpose() * inverse * error)[0];
+            square += error.norm_squared();
+            sum += error;
+            corners += 1.0;
+        }
+    }
+    (nes / corners, (square / corners).sqrt(), sum / corners, tags / count as f64)
+}
+
+#[test]
+fn corner_covariance_is_honest_in_every_size_class() {
+    let mut failures = Vec::new();
+    for (edges, worst_rms, least_found) in [(20.0..36.0, 0.3, 0.9), (36.0..60.0, 0.2, 0.98), (60.0..100.0, 0.1, 0.98)]
+    {
+        let (nes, rms, bias, found) = score(edges.clone(), 550, 11);
+        println!("{edges:?}: NES {nes:.2}, RMS {rms:.3} px, bias {:.4} {:.4}, found {found:.3}", bias.x, bias.y);
+        failures.extend((!(1.5..=2.5).contains(&nes)).then(|| format!("{edges:?}: normalised error squared {nes}")));
+        failures.extend((rms > worst_rms).then(|| format!("{edges:?}: RMS {rms} px")));
+        failures.extend((bias.amax() >= 0.02).then(|| format!("{edges:?}: bias {bias} px")));
+        failures.extend((found < least_found).then(|| format!("{edges:?}: {found} found")));
+    }
+    assert_eq!(failures, Vec::<String>::new(), "seed 11");
+}
+
+#[test]
+fn scalar_and_vector_kernels_find_the_same_bit_for_bit() {
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    for min_px in [10.0, 16.0, 24.0] {
+        let mut best = TagDetector::new(&TagFamily::ALL, min_px, 2);
+        let mut scalar = best.clone().with_simd(Simd::scalar());
+        for _ in 0..12 {
+            let edge = rng.random_range(24.0..80.0);
+            let drawn = draw(&mut rng, edge);
+            let (mut a, mut b) = (Vec::new(), Vec::new());
+            best.detect(drawn.image.view(), &mut a);
+            scalar.detect(drawn.image.view(), &mut b);
+            assert_eq!(a, b, "seed 5");
+        }
+    }
+}
+
+#[test]
+fn noise_and_stripes_hold_no_tags() {
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    let mut detector = TagDetector::new(&[TagFamily::Tag36h11, TagFamily::Tag41h12, TagFamily::Tag25h9], 10.0, 3);
+    for period in [1, 5, 9, 14] {
+        let mut image = GrayImage::new(400, 300);
+        for (i, p) in image.data.iter_mut().enumerate() {
+            let stripe = if (i % 400) / period % 2 == (i / 400) / (period + 2) % 2 { 150 } else { 40 };
+            *p = if period == 1 { rng.random() } else { stripe + rng.random_range(0..20) };
+        }
+        let mut out = Vec::new();
+        detector.detect(image.view(), &mut out);
+        assert_eq!(out, [], "period {period}, seed 3");
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+    #[test]
+    fn any_image_of_any_size_is_survived(
+        width in 1usize..140, height in 1usize..140, extra in 0usize..9,
+        pixels in prop::collection::vec(any::<u8>(), 1..600), coarse in 1usize..24, min_px in 8.0..60.0f64,
+    ) {
+        let stride = width + extra;
+        let data: Vec<u8> =
+            (0..stride * height).map(|i| pixels[(i % stride / coarse * 31 + i / stride / coarse * 17) % pixels.len()]).collect();
+        let view = ImageView { width, height, stride, data: &data };
+        let mut detector = TagDetector::new(&TagFamily::ALL, min_px, 3);
+        let mut out = Vec::new();
+        detector.detect(view, &mut out);
+        for found in &out {
+            let corners = found.corners_px.expect("a tag has corners");
+            prop_assert!(corners.iter().all(|c| c.iter().all(|x| x.is_finite())));
+        }
+    }
+}
