@@ -50,7 +50,7 @@ fn draw(rng: &mut ChaCha8Rng, edge: f64) -> Drawn {
     let id = rng.random_range(0..587);
     let pattern = tag_pattern(TagFamily::Tag36h11, id);
     let back = view.try_inverse().expect("a view has an inverse");
-    let (blur, motion) = (rng.random_range(0.4..1.0), rng.random_range(0.0..3.0f64));
+    let (blur, motion) = (rng.random_range(0.6..1.1), rng.random_range(0.0..5.0f64));
     let direction = rng.random_range(0.0..6.28f64);
     // One kernel an image: pixel square, blur and motion, in pairs about its middle so that it shifts nothing.
     let mut kernel = Vec::new();
@@ -65,7 +65,7 @@ fn draw(rng: &mut ChaCha8Rng, edge: f64) -> Drawn {
         kernel.extend([at, -at]);
     }
     let gain = rng.random_range(120.0..230.0);
-    let noise = rng.random_range(2.0..6.0);
+    let noise = rng.random_range(2.5..7.5);
     let mut image = GrayImage::new(size as usize, size as usize);
     let width = image.width;
     for (i, pixel) in image.data.iter_mut().enumerate() {
@@ -119,7 +119,7 @@ fn score(edges: std::ops::Range<f64>, count: usize, seed: u64) -> (f64, f64, Vec
 #[test]
 fn corner_covariance_is_honest_in_every_size_class() {
     let mut failures = Vec::new();
-    for (edges, worst_rms, least_found) in [(20.0..36.0, 0.3, 0.9), (36.0..60.0, 0.2, 0.98), (60.0..100.0, 0.1, 0.98)]
+    for (edges, worst_rms, least_found) in [(22.0..36.0, 0.35, 0.6), (36.0..60.0, 0.2, 0.9), (60.0..100.0, 0.1, 0.98)]
     {
         let (nes, rms, bias, found) = score(edges.clone(), 550, 11);
         println!("{edges:?}: NES {nes:.2}, RMS {rms:.3} px, bias {:.4} {:.4}, found {found:.3}", bias.x, bias.y);
