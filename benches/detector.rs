@@ -30,14 +30,19 @@ fn frame() -> GrayImage {
         let (u, v) = (i % 1280, i / 1280);
         let course = v / 18;
         let shifted = u + course % 2 * 20;
-        *p = if v % 18 < 3 || shifted % 40 < 3 { 150 } else { slabs[(shifted / 40 * 57 + course * 31) % 4096] };
+        *p = if v % 18 < 3 || shifted % 40 < 3 {
+            150
+        } else {
+            slabs[(shifted / 40 * 57 + course * 31) % 4096]
+        };
     }
     put_tag(&mut sharp, 3, (500, 400), 5);
     put_tag(&mut sharp, 4, (700, 420), 11);
     let mut image = sharp.clone();
     for v in 1..1023 {
         for u in 1..1279 {
-            let sum: u32 = (0..9).map(|k| u32::from(sharp.data[(v + k / 3 - 1) * 1280 + u + k % 3 - 1])).sum();
+            let sum: u32 =
+                (0..9).map(|k| u32::from(sharp.data[(v + k / 3 - 1) * 1280 + u + k % 3 - 1])).sum();
             let noise = rng.random_range(-8i32..=8);
             image.data[v * 1280 + u] = (sum as i32 / 9 + noise).clamp(0, 255) as u8;
         }

@@ -119,11 +119,17 @@ fn score(edges: std::ops::Range<f64>, count: usize, seed: u64) -> (f64, f64, Vec
 #[test]
 fn corner_covariance_is_honest_in_every_size_class() {
     let mut failures = Vec::new();
-    for (edges, worst_rms, least_found) in [(22.0..36.0, 0.35, 0.6), (36.0..60.0, 0.2, 0.9), (60.0..100.0, 0.1, 0.98)]
+    for (edges, worst_rms, least_found) in
+        [(22.0..36.0, 0.35, 0.6), (36.0..60.0, 0.2, 0.9), (60.0..100.0, 0.1, 0.98)]
     {
         let (nes, rms, bias, found) = score(edges.clone(), 550, 11);
-        println!("{edges:?}: NES {nes:.2}, RMS {rms:.3} px, bias {:.4} {:.4}, found {found:.3}", bias.x, bias.y);
-        failures.extend((!(1.5..=2.5).contains(&nes)).then(|| format!("{edges:?}: normalised error squared {nes}")));
+        println!(
+            "{edges:?}: NES {nes:.2}, RMS {rms:.3} px, bias {:.4} {:.4}, found {found:.3}",
+            bias.x, bias.y
+        );
+        failures.extend(
+            (!(1.5..=2.5).contains(&nes)).then(|| format!("{edges:?}: normalised error squared {nes}")),
+        );
         failures.extend((rms > worst_rms).then(|| format!("{edges:?}: RMS {rms} px")));
         failures.extend((bias.amax() >= 0.02).then(|| format!("{edges:?}: bias {bias} px")));
         failures.extend((found < least_found).then(|| format!("{edges:?}: {found} found")));
@@ -151,7 +157,8 @@ fn scalar_and_vector_kernels_find_the_same_bit_for_bit() {
 #[test]
 fn noise_and_stripes_hold_no_tags() {
     let mut rng = ChaCha8Rng::seed_from_u64(3);
-    let mut detector = TagDetector::new(&[TagFamily::Tag36h11, TagFamily::Tag41h12, TagFamily::Tag25h9], 10.0, 3);
+    let mut detector =
+        TagDetector::new(&[TagFamily::Tag36h11, TagFamily::Tag41h12, TagFamily::Tag25h9], 10.0, 3);
     for period in [1, 5, 9, 14] {
         let mut image = GrayImage::new(400, 300);
         for (i, p) in image.data.iter_mut().enumerate() {

@@ -70,7 +70,10 @@ impl DiscFinder {
                 && c.top > 0
                 && usize::from(c.right) + 1 < width
                 && usize::from(c.bottom) + 1 < height;
-            inside && w.max(h) + 1.0 >= least && w.min(h) <= sizes.1 + 2.0 && w.min(h) >= LEAST_AXES * 0.9 * w.max(h)
+            inside
+                && w.max(h) + 1.0 >= least
+                && w.min(h) <= sizes.1 + 2.0
+                && w.min(h) >= LEAST_AXES * 0.9 * w.max(h)
         };
         self.labeller.label(&self.bits, keep);
         for (component, outline) in self.labeller.kept() {
@@ -175,7 +178,8 @@ fn rim(image: ImageView<'_>, ellipse: &Ellipse) -> ([Vector2<f64>; RAYS], usize)
             f64::from(bilinear(image, [p.x as f32, p.y as f32]))
         };
         let end = ellipse.center + d * (radius + HALF as f64 * spacing);
-        if end.x < 0.0 || end.y < 0.0 || end.x > (image.width - 1) as f64 || end.y > (image.height - 1) as f64 {
+        if end.x < 0.0 || end.y < 0.0 || end.x > (image.width - 1) as f64 || end.y > (image.height - 1) as f64
+        {
             continue;
         }
         let mut before = at(0);

@@ -127,7 +127,13 @@ impl DiscPairs {
         let discs: Vec<usize> = (0..self.discs.len()).filter(|&i| self.discs[i].target == target).collect();
         let candidates: Vec<Vec<&Blob>> = discs
             .iter()
-            .map(|&i| self.blobs.iter().filter(|b| b.0 == i && self.expected(i, &b.1, prediction)).map(|b| &b.1).collect())
+            .map(|&i| {
+                self.blobs
+                    .iter()
+                    .filter(|b| b.0 == i && self.expected(i, &b.1, prediction))
+                    .map(|b| &b.1)
+                    .collect()
+            })
             .collect();
         match discs.as_slice() {
             [only] => {
