@@ -74,7 +74,7 @@ impl Feeder {
         let thread = std::thread::spawn(move || {
             let mut n = 0u32;
             while !asked.load(Ordering::Acquire) {
-                if n % 4 == 0 {
+                if n.is_multiple_of(4) {
                     gps.send(epoch(n / 4).as_bytes());
                 }
                 compass.send(sentence("C123.4P-0.5R0.3T21.0").as_bytes());
