@@ -41,7 +41,7 @@ install -m 644 "$here/windhover.toml" "$root/etc/windhover/windhover.toml"
 echo payload >"$root/etc/hostname"
 cat >"$root/etc/fstab" <<'FSTAB'
 /dev/vda / ext4 ro 0 1
-LABEL=WINDHOVER /var/lib/windhover ext4 noatime,nofail,x-systemd.device-timeout=30s 0 2
+LABEL=WINDHOVER /var/lib/windhover ext4 noatime,nofail,x-systemd.device-timeout=180s 0 2
 FSTAB
 chroot "$root" systemctl --quiet enable windhover.service bench-camera.service bench-control.service
 chroot "$root" systemctl --quiet mask serial-getty@ttyS0.service serial-getty@ttyS1.service systemd-timesyncd.service \

@@ -6,6 +6,7 @@ use crate::config::{CompassFormat, Config, Part};
 use crate::io::camera::{self, CameraSettings};
 use crate::io::clock::HostClock;
 use crate::io::device::{Fault, NoteKind, Report, Stop};
+use crate::io::pps;
 use crate::io::serial::{self, SerialSettings};
 use crate::msg::{EventBody, Source};
 
@@ -65,6 +66,22 @@ pub fn camera(config: &Config, around: &Surroundings, heart: &Heart) {
     };
     let told = Told::new(Part::Camera, Source::Camera, around, heart);
     camera::run(&settings, around.clock, &around.stop, &|report| told.take(report));
+}
+
+/// Watches the receiver's pulse until the end is asked for. A pulse line that is missing costs nothing
+/// but accuracy: it is no part that readiness waits for.
+pub fn pulses(config: &Config, around: &Surroundings, heart: &Heart) {
+    let Some(device) = &config.gps.pps_device else { return };
+    let tell = |report| {
+        heart.beat();
+        match report {
+            Report::Up(text) => around.log.tell(Event::DeviceUp, "pps", text),
+            Report::Down(fault) => around.log.tell(Event::DeviceDown, "pps", fault.to_string()),
+            _ => {}
+        }
+    };
+    let pulse = |t| around.inbox.put(t, EventBody::Pulse);
+    pps::run(device, around.clock, &around.stop, &tell, &pulse);
 }
 
 /// Where a device's reports go.

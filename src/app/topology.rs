@@ -1,7 +1,7 @@
 //! The whole task graph on one page.
 //!
 //! ```text
-//!   gps ──────┐                         ┌─► store   (card: flights, index)
+//!   gps, pps ─┐                         ┌─► store   (card: flights, index)
 //!   compass ──┼─► inbox ─► pipeline ────┼─► link    (ground stations, MAVLink)
 //!   camera ───┘                         └─► board ◄── health (health line, watchdog, signals, power)
 //!                         every task ─────► log     (journal, file)
@@ -17,7 +17,7 @@
 //!
 //! | task | restart rule |
 //! |---|---|
-//! | gps, compass, camera | open the device again, waiting ¼ s to 5 s |
+//! | gps, pps, compass, camera | open the device again, waiting ¼ s to 5 s |
 //! | pipeline | ends the process: a filter in an unknown state is not repaired |
 //! | store | opens the card again; the daemon flies on without |
 //! | link | calls again; the daemon flies on without |
@@ -52,6 +52,8 @@ pub const CAMERA: TaskRule = TaskRule { name: "camera", restart: Restart::Retrie
 pub const PIPELINE: TaskRule = TaskRule { name: "pipeline", restart: Restart::EndsProcess };
 /// The data card.
 pub const STORE: TaskRule = TaskRule { name: "store", restart: Restart::Retries };
+/// The receiver's pulse, where one is configured.
+pub const PPS: TaskRule = TaskRule { name: "pps", restart: Restart::Retries };
 /// The wireless link.
 pub const LINK: TaskRule = TaskRule { name: "link", restart: Restart::Retries };
 
@@ -96,6 +98,10 @@ pub fn start(config: &Config, clock: HostClock, log: &Log) -> std::io::Result<Gr
         let (config, around, board) = (config.clone(), around.clone(), board.clone());
         let (outlets, orders) = (Outlets::new(&config, slot, downlink), orders.clone());
         tasks.spawn(PIPELINE, move |heart| brain::run(&config, &around, &board, outlets, &orders, &heart))?;
+    }
+    if config.gps.pps_device.is_some() {
+        let (config, around) = (config.clone(), around.clone());
+        tasks.spawn(PPS, move |heart| devices::pulses(&config, &around, &heart))?;
     }
     for (rule, device) in [
         (GPS, devices::gps as fn(&Config, &Surroundings, &super::supervise::Heart)),

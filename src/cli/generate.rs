@@ -40,7 +40,17 @@ pub(super) fn run(args: &Args) -> CliResult {
 fn man(directory: &Path) -> std::io::Result<()> {
     let mut command = Cli::command();
     command.build();
-    clap_mangen::generate_to(command, directory)
+    man_of(&command, directory)
+}
+
+/// A page of the command and of each below it; not of `help`, whose pages would say it all again.
+fn man_of(command: &clap::Command, directory: &Path) -> std::io::Result<()> {
+    let name = command.get_display_name().unwrap_or_else(|| command.get_name());
+    let mut page = Vec::new();
+    clap_mangen::Man::new(command.clone()).title(name.to_owned()).render(&mut page)?;
+    std::fs::write(directory.join(format!("{name}.1")), page)?;
+    let shown = |below: &&clap::Command| below.get_name() != "help" && !below.is_hide_set();
+    command.get_subcommands().filter(shown).try_for_each(|below| man_of(below, directory))
 }
 
 fn completions(directory: &Path) -> std::io::Result<()> {
