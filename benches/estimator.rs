@@ -96,6 +96,7 @@ fn truth_at(world: &World, t: MonoTime, gps_delay_s: f64) -> BoundTruth {
         ned_from_body: own.ned_from_body,
         rate: own.body_rate_radps,
         tilt_gain: world.scenario().compass.tilt_gain,
+        drag_per_s: world.scenario().helicopter.drag_per_s,
         gps_delay_s,
         targets: targets.collect(),
     }
@@ -127,7 +128,8 @@ fn told_the_truth(world: &World) -> Config {
     let force = |axis: usize| {
         walk(&|t| {
             let own = world.ownship(t);
-            let felt = own.acceleration_ned_mps2 - Vector3::z() * 9.806_65;
+            let drag = own.velocity_ned_mps * scenario.helicopter.drag_per_s;
+            let felt = own.acceleration_ned_mps2 + drag - Vector3::z() * 9.806_65;
             (own.ned_from_body.inverse() * felt)[axis]
         })
     };

@@ -30,6 +30,8 @@ pub struct BoundTruth {
     pub rate: Vector3<f64>,
     /// How much of the tilt the compass reads.
     pub tilt_gain: f64,
+    /// Drag, 1/s.
+    pub drag_per_s: f64,
     /// How much older GPS is than its stamp says, s.
     pub gps_delay_s: f64,
     /// Per target: rear axle north, east, heading, speed, yaw rate.
@@ -106,7 +108,9 @@ impl Bound {
         own.velocity = truth.velocity;
         own.ned_from_body = truth.ned_from_body;
         own.rate = truth.rate;
-        own.force = truth.ned_from_body.inverse() * (truth.acceleration - Vector3::z() * GRAVITY);
+        own.drag_per_s = truth.drag_per_s;
+        let drag = truth.velocity * truth.drag_per_s;
+        own.force = truth.ned_from_body.inverse() * (truth.acceleration + drag - Vector3::z() * GRAVITY);
         own.tilt_gain = truth.tilt_gain;
         own.gps_delay_s = truth.gps_delay_s;
         for (target, mean) in self.core.state.targets.iter_mut().zip(&truth.targets) {

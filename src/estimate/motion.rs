@@ -1,6 +1,6 @@
 //! How everything moves from one instant to the next, and how uncertainty grows with it.
 //!
-//! Helicopter: `ṗ = v`, `v̇ = R f + g`, `Ṙ = R [ω]×`; rate and specific force are Gauss–Markov. A
+//! Helicopter: `ṗ = v`, `v̇ = R f + g − c v`, `Ṙ = R [ω]×`; rate and specific force are Gauss–Markov. A
 //! rotor pushes along its axis, so the force across it is small: this ties tilt to acceleration, as
 //! strongly as that force's learnt sigma allows. Vehicle: `ẋ = v cos ψ`, `ẏ = v sin ψ`, `ψ̇ = ω`, with
 //! v and ω random walks (paper eq. 26). Ground features stand still.
@@ -23,6 +23,8 @@ struct Step {
     dt: f64,
     /// `ned_from_body`.
     rotation: Matrix3<f64>,
+    velocity: Vector3<f64>,
+    drag_per_s: f64,
     /// ∂v̇/∂attitude.
     tilt: Matrix3<f64>,
     rate_decay: f64,
@@ -56,6 +58,8 @@ impl State {
         let step = Step {
             dt,
             rotation: *self.own.rotation(),
+            velocity: self.own.velocity,
+            drag_per_s: self.own.drag_per_s,
             tilt: -skew(&(self.own.ned_from_body * self.own.force)),
             rate_decay: (-dt / tau.rate_s).exp(),
             force_decay: (-dt / tau.force_s).exp(),
@@ -211,7 +215,9 @@ impl Step {
         let dt = self.dt;
         let three = |row: &[f64], i: usize| Vector3::new(row[i], row[i + 1], row[i + 2]);
         let attitude = three(row, at::ATTITUDE);
-        let pushed = self.tilt * attitude + self.rotation * three(row, at::FORCE);
+        let pushed = self.tilt * attitude + self.rotation * three(row, at::FORCE)
+            - three(row, at::VELOCITY) * self.drag_per_s
+            - self.velocity * row[at::DRAG];
         let turned = self.rotation * three(row, at::RATE);
         for i in 0..3 {
             row[at::POSITION + i] += dt * row[at::VELOCITY + i] + 0.5 * dt * dt * pushed[i];

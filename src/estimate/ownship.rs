@@ -315,6 +315,7 @@ pub(super) fn start(
     variances[at::TILT_GAIN] = START_TILT_GAIN.powi(2);
     variances[at::TILT_BIAS..at::TILT_BIAS + 2].fill(START_TILT_BIAS.powi(2));
     variances[at::GPS_DELAY] = models.gps_delay_var;
+    variances[at::DRAG] = START_DRAG_PER_S.powi(2);
     for (i, variance) in variances.into_iter().enumerate() {
         state.cov.set(i, i, variance);
     }
@@ -328,6 +329,8 @@ pub(super) fn start(
 const START_TILT: f64 = 0.1;
 /// What a heading reading may have changed since it was taken, one sigma, rad.
 const START_HEADING: f64 = 0.1;
+/// Drag of a small helicopter, one sigma, 1/s: 0.1 to 0.3 is usual.
+const START_DRAG_PER_S: f64 = 0.2;
 /// Zero offset of a tilt sensor, one sigma, rad (0.4°: data sheets allow 0.2° to 0.5°).
 const START_TILT_BIAS: f64 = 0.007;
 /// How far from 1 the share of tilt read may be at the start, one sigma.

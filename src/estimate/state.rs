@@ -31,8 +31,10 @@ pub(super) mod at {
     pub(in super::super) const TILT_BIAS: usize = 20;
     /// How much older GPS is than configured, s.
     pub(in super::super) const GPS_DELAY: usize = 22;
+    /// Drag: acceleration per metre a second through the air, 1/s.
+    pub(in super::super) const DRAG: usize = 23;
     /// Length of the helicopter's part.
-    pub(in super::super) const OWN: usize = 23;
+    pub(in super::super) const OWN: usize = 24;
     /// Length of a target's part: north, east, heading, speed, yaw rate.
     pub(in super::super) const TARGET: usize = 5;
     /// Length of a feature's part: north, east.
@@ -55,6 +57,7 @@ pub(super) struct Own {
     pub(super) tilt_gain: f64,
     pub(super) tilt_bias: Vector2<f64>,
     pub(super) gps_delay_s: f64,
+    pub(super) drag_per_s: f64,
 }
 
 impl Default for Own {
@@ -70,14 +73,15 @@ impl Default for Own {
             tilt_gain: 1.0,
             tilt_bias: Vector2::zeros(),
             gps_delay_s: 0.0,
+            drag_per_s: 0.0,
         }
     }
 }
 
 impl Own {
-    /// Acceleration in NED: specific force turned into NED, plus gravity.
+    /// Acceleration in NED: `R f + g − c v`, where the drag of the wind is part of f.
     pub(super) fn acceleration(&self) -> Vector3<f64> {
-        self.ned_from_body * self.force + Vector3::new(0.0, 0.0, GRAVITY)
+        self.ned_from_body * self.force + Vector3::new(0.0, 0.0, GRAVITY) - self.velocity * self.drag_per_s
     }
 
     /// `ned_from_body` as a matrix.
@@ -86,7 +90,7 @@ impl Own {
     }
 
     fn is_finite(&self) -> bool {
-        let scalars = [self.heading_bias, self.tilt_gain, self.gps_delay_s];
+        let scalars = [self.heading_bias, self.tilt_gain, self.gps_delay_s, self.drag_per_s];
         let vectors = [&self.position, &self.velocity, &self.rate, &self.force, &self.gps_bias];
         vectors.iter().all(|v| v.iter().all(|x| x.is_finite()))
             && scalars.iter().all(|x| x.is_finite())
@@ -282,6 +286,7 @@ impl State {
         own.tilt_gain += dx[at::TILT_GAIN];
         own.tilt_bias += Vector2::new(dx[at::TILT_BIAS], dx[at::TILT_BIAS + 1]);
         own.gps_delay_s += dx[at::GPS_DELAY];
+        own.drag_per_s += dx[at::DRAG];
         let mut rest = &dx[at::OWN..];
         for target in &mut self.targets {
             let (mine, others) = rest.split_at(at::TARGET);
