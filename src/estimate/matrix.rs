@@ -1,5 +1,7 @@
 //! Dense row-major storage with the few operations the filter needs; nothing here allocates once made.
 
+#![expect(clippy::needless_range_loop, reason = "matrix arithmetic reads by its indices")]
+
 /// Rows of equal length in one block.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Grid {

@@ -1,5 +1,7 @@
 //! The helicopter's own sensors: GPS position and velocity, compass heading and tilt.
 
+#![expect(clippy::needless_range_loop, reason = "matrix arithmetic reads by its indices")]
+
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use crate::geo::{Geodetic, ned_from_body_321, skew, tilt_from_down, wrap_angle};

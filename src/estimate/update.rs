@@ -1,5 +1,7 @@
 //! One measurement into the state: gate, gain, mean, covariance, delayed copies.
 
+#![expect(clippy::needless_range_loop, reason = "matrix arithmetic reads by its indices")]
+
 use crate::msg::Disposition;
 
 use super::matrix::{Grid, MAX_MEASURED, Small, axpy, cholesky, forward};
