@@ -389,3 +389,6 @@ fn spread(sigma_px: f32) -> [[f32; 2]; SAMPLES] {
         [sign * radius * c, sign * radius * s]
     })
 }
+
+#[cfg(test)]
+mod tests;
