@@ -170,7 +170,10 @@ fn fixes_are_read_as_they_were_sent() {
         let (Some(lat), Some(velocity)) = (same.lat_deg, same.vel_ned_mps) else { continue };
         assert!((fix.value.lat_deg.expect("a fix") - lat).abs() < 1e-9);
         assert!((fix.value.vel_ned_mps.expect("a fix") - velocity).norm() < 0.011);
-        assert_eq!(fix.value.alt_msl_m.map(|x| (x * 10.0).round()), same.alt_msl_m.map(|x| (x * 10.0).round()));
+        assert_eq!(
+            fix.value.alt_msl_m.map(|x| (x * 10.0).round()),
+            same.alt_msl_m.map(|x| (x * 10.0).round())
+        );
         compared += 1;
     }
     assert!(compared > 260, "{compared} fixes compared of {}", sent.len());

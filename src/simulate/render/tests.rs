@@ -42,9 +42,7 @@ fn found(world: &World, image: &GrayImage, t_s: f64) -> Vec<(MarkerTruth, Option
 fn order(detection: &MarkerDetection, truth: &MarkerTruth) -> [usize; 4] {
     detection.corners_px.expect("a tag").map(|at| {
         (0..4)
-            .min_by(|a, b| {
-                (truth.corners_px[*a] - at).norm().total_cmp(&(truth.corners_px[*b] - at).norm())
-            })
+            .min_by(|a, b| (truth.corners_px[*a] - at).norm().total_cmp(&(truth.corners_px[*b] - at).norm()))
             .expect("there are four")
     })
 }
