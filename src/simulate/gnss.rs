@@ -23,6 +23,8 @@ pub(super) struct GnssSample {
 #[derive(Clone, Debug)]
 pub(super) struct GnssReceiver {
     stream: Stream,
+    /// Apart, so that the same epochs come as values and as bytes.
+    stamps: Stream,
     latency: Span,
     bias_m: Vector3<f64>,
     next_utc_ns: i64,
@@ -43,7 +45,8 @@ impl GnssReceiver {
         let step_ns = (NS_PER_S as f64 / sim.rate_hz.max(0.01)).round() as i64;
         let first = world.utc(0.0).unix_ns();
         let next_utc_ns = first.div_euclid(step_ns) * step_ns + step_ns;
-        Self { stream, latency: Span::from_ms(latency_ms), bias_m, next_utc_ns, step_ns }
+        let stamps = Stream::of(world.seed(), Purpose::GnssStamps);
+        Self { stream, stamps, latency: Span::from_ms(latency_ms), bias_m, next_utc_ns, step_ns }
     }
 
     /// True latency minus the configured one.
@@ -88,7 +91,7 @@ impl GnssReceiver {
 
     /// What the fit of arrival times leaves in a stamp.
     pub(super) fn stamp_noise(&mut self, scenario: &Scenario) -> Span {
-        Span::from_ms(self.stream.normal() * scenario.gps.stamp_noise_ms)
+        Span::from_ms(self.stamps.normal() * scenario.gps.stamp_noise_ms)
     }
 }
 

@@ -22,6 +22,7 @@ pub(super) enum Purpose {
     Scene = 8,
     GnssLine = 9,
     CompassLine = 10,
+    GnssStamps = 11,
     Vehicle = 100,
 }
 
