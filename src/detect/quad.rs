@@ -31,7 +31,7 @@ pub(super) fn may_be_border(c: &Component, limits: SizeLimits, width: usize, hei
     // A square's box is 1 to √2 of its edge; blur and threshold may eat a pixel. A tag of the least size
     // seen aslant is shorter one way and longer the other.
     let size_fits = long + 1.0 >= limits.least && short <= 1.5 * limits.most;
-    let shape_fits = short + 1.0 >= 0.55 * limits.least && short >= LEAST_ASPECT * long;
+    let shape_fits = short + 1.0 >= 0.55 * limits.least && short >= 0.6 * LEAST_ASPECT * long;
     // A border is a quarter to a half of its tag; of a large one only a rim is dark against what is near.
     let area = c.area as f32;
     let fill_fits = area >= (0.17 * w * h).min(2.0 * (w + h)) && area <= MOST_FILL * w * h;

@@ -48,12 +48,15 @@ struct Located {
 /// gives 2·10⁻⁴ to 6·10⁻⁴ towards the rim.
 const LENS_CURVATURE: f64 = 3e-4;
 
-/// Neighbouring points share pixels, so that their errors are alike: independent points are fewer by this.
+/// Neighbouring points share pixels, so that their errors are alike: independent points are fewer by this,
+/// and by more where blur reaches from cell to cell, below about `SHARED_CELL` pixels a cell. Measured on
+/// generated tags.
 const SHARED: f64 = 1.7;
+const SHARED_CELL: f64 = 4.0;
 
 /// Error that neighbouring cells put on an edge, pixels at one pixel a cell: blur brings them in where cells
 /// are small, and with the cube of their size it is gone. Measured on generated tags.
-const NEIGHBOURS: f64 = 3.6;
+const NEIGHBOURS: f64 = 4.5;
 
 /// What stays of an edge's error when noise is averaged away: sampling, neighbouring cells, print. Pixels.
 const FLOOR_PX: f64 = 0.02;
@@ -268,7 +271,8 @@ impl Model {
     }
 
     fn result(&self, information: &Information, variance: f64, cell: f64) -> Option<Refined> {
-        let covariance = information.cholesky()?.inverse() * (variance * SHARED);
+        let shared = SHARED * (1.0 + (SHARED_CELL / cell).powi(3));
+        let covariance = information.cholesky()?.inverse() * (variance * shared);
         let neighbours = (NEIGHBOURS / cell.powi(3)).min(0.25);
         let floor = Matrix2::identity() * (FLOOR_PX * FLOOR_PX + neighbours * neighbours);
         let at = |xi: f64, eta: f64| {
