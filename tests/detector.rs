@@ -117,6 +117,7 @@ fn score(edges: std::ops::Range<f64>, count: usize, seed: u64) -> (f64, f64, Vec
 }
 
 #[test]
+#[ignore = "draws 1650 tags, a minute: cargo test --test detector -- --ignored"]
 fn corner_covariance_is_honest_in_every_size_class() {
     let mut failures = Vec::new();
     for (edges, worst_rms, least_found) in
