@@ -10,13 +10,13 @@ use crate::io::proto::windhover as wh;
 use crate::plot::{Chart, Ink, Mark, ellipse};
 
 /// Ellipses drawn along a path.
-const ELLIPSES: usize = 24;
+const ELLIPSES: usize = 10;
 /// Mahalanobis distance that holds 95 % of a Gaussian in the plane.
 const SCALE_95: f64 = 2.447_746_8;
 
 /// The section; nothing where no position is known.
 pub(super) fn section(context: &Context<'_>) -> Option<Section> {
-    let mut chart = Chart::new("", 1100.0, 640.0).labels("east (m)", "north (m)").equal();
+    let mut chart = Chart::new("", 820.0, 600.0).labels("east (m)", "north (m)").equal();
     let flight = context.flight;
     let fixes = fixes(context);
     let own: Vec<[f64; 2]> = flight.ownship.iter().map(|o| [o.east_m, o.north_m]).collect();
