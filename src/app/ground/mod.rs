@@ -137,25 +137,35 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     let linked = tokio::spawn(link.run(stop));
     tasks.spawn(report(handle, Arc::clone(&view), live.clone(), settings.terminal));
     tasks.spawn(tell(events, Arc::clone(&view), live.clone()));
-    let taken = tokio::spawn(intake(records, to_disk, view, live));
+    let ended = watch::Sender::new(false);
+    let taken = tokio::spawn(intake(records, ended.subscribe(), to_disk, view, live));
     let outcome = tokio::select! {
         _ = linked => Ok(()),
         Some(error) = failure.recv() => Err(error.into()),
     };
-    // The link's end closes the records' channel, and that the disk's: what was received is kept.
+    // The link ended: what was received is handed on, the disk's channel closes, everything is kept.
+    ended.send_replace(true);
     let _ = tokio::time::timeout(Duration::from_secs(5), taken).await;
     let _ = tokio::task::spawn_blocking(move || disk.join()).await;
     outcome
 }
 
-/// Hands records to the disk and to the pages. A full disk queue holds the link back.
+/// Hands records to the disk and to the pages, until the link has ended and nothing waits. A full disk
+/// queue holds the link back.
 async fn intake(
     mut records: mpsc::Receiver<FromPayload>,
+    mut ended: watch::Receiver<bool>,
     to_disk: std::sync::mpsc::SyncSender<Arrival>,
     view: Arc<Mutex<View>>,
     live: broadcast::Sender<Arc<str>>,
 ) {
-    while let Some(message) = records.recv().await {
+    loop {
+        let message = tokio::select! {
+            biased;
+            message = records.recv() => message,
+            _ = ended.wait_for(|ended| *ended) => None,
+        };
+        let Some(message) = message else { return };
         let news = match message {
             FromPayload::Record(arrival) => {
                 let news = lock(&view).record(&arrival);
