@@ -4,6 +4,7 @@
 //! and whether all arrived once; `cargo bench --bench link -- cut25 slow` runs those named.
 
 #[path = "../tests/link/relay.rs"]
+#[expect(dead_code, reason = "the tests use the rest")]
 mod relay;
 #[path = "../tests/link/team.rs"]
 #[expect(dead_code, reason = "shared with the tests, which use more of it")]

@@ -60,7 +60,7 @@ fn second_of(frame_bytes: usize, now_ns: u64) -> Vec<RawRecord> {
         log_ns: now_ns + k * 10_000_000,
         publish_ns: now_ns,
         sequence: k as u32,
-        data: (0..size).map(|i| (i as u64 * 2_654_435_761 >> 11) as u8).collect::<Vec<_>>().into(),
+        data: (0..size).map(|i| ((i as u64 * 2_654_435_761) >> 11) as u8).collect::<Vec<_>>().into(),
         weight,
     };
     let mut all: Vec<_> = (0..60).map(|k| record(&small, Weight::Small, 150, k)).collect();

@@ -8,7 +8,7 @@
 //! values: it never reads a clock, logs, waits or touches a device. `io` moves events and records;
 //! `app` wires; `cli` talks to people. `tests/architecture.rs` holds this.
 
-#![warn(clippy::unwrap_used, clippy::disallowed_methods)]
+#![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 // -- core: values in, values out
 pub mod time;

@@ -18,8 +18,11 @@ struct Drawn {
 
 /// Takes tag coordinates (border square from −1 to 1) to pixels: a tilted square seen in perspective.
 fn random_view(rng: &mut ChaCha8Rng, edge: f64, size: f64) -> Matrix3<f64> {
-    let (turn, tilt, towards) =
-        (rng.random_range(0.0..6.28), rng.random_range(0.0..0.5f64), rng.random_range(0.0..6.28f64));
+    let (turn, tilt, towards) = (
+        rng.random_range(0.0..std::f64::consts::TAU),
+        rng.random_range(0.0..0.5f64),
+        rng.random_range(0.0..std::f64::consts::TAU),
+    );
     let axis = nalgebra::Unit::new_normalize(Vector3::new(towards.cos(), towards.sin(), 0.0));
     let rotation = nalgebra::Rotation3::from_axis_angle(&axis, tilt)
         * nalgebra::Rotation3::from_axis_angle(&Vector3::z_axis(), turn);
@@ -51,7 +54,7 @@ fn draw(rng: &mut ChaCha8Rng, edge: f64) -> Drawn {
     let pattern = tag_pattern(TagFamily::Tag36h11, id);
     let back = view.try_inverse().expect("a view has an inverse");
     let (blur, motion) = (rng.random_range(0.6..1.1), rng.random_range(0.0..5.0f64));
-    let direction = rng.random_range(0.0..6.28f64);
+    let direction = rng.random_range(0.0..std::f64::consts::TAU);
     // One kernel an image: pixel square, blur and motion, in pairs about its middle so that it shifts nothing.
     let mut kernel = Vec::new();
     for k in 0..14 {

@@ -1,6 +1,6 @@
 //! The paper's Monte Carlo analysis of geo-positioning (its condition 35), with the closed form.
 //!
-//! Every sample draws an error for each source, runs the real [`locate`](crate::geo::locate) on the
+//! Every sample draws an error for each source, runs the real [`locate`] on the
 //! wrong pose, pixel and camera, and compares with the true ground point.
 
 use nalgebra::{Matrix2, Matrix3, Rotation3, Vector2, Vector3};

@@ -19,11 +19,11 @@ const SHIPPED: &str = include_str!("../../config/windhover.toml");
 /// Predict how well the ground is located: draw errors of GPS, compass, pixel and camera, run
 /// geo-positioning on each draw, and compare with the closed form.
 ///
-/// Pose, pixel and error sigmas are the section [montecarlo] of the configuration; by default the
+/// Pose, pixel and error sigmas are the section `[montecarlo]` of the configuration; by default the
 /// paper's: the camera level, 10 m above ground, GPS 3 m (95 %), tilt 0.2 degrees.
 #[derive(clap::Args, Debug)]
 pub(super) struct Args {
-    /// Configuration with camera, mount and [montecarlo]; the paper's camera where absent
+    /// Configuration with camera, mount and `[montecarlo]`; the paper's camera where absent
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Number of draws

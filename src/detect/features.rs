@@ -139,7 +139,7 @@ impl FeatureTracker {
         for part in 0..across * down {
             let (u, v) = (part % across * w, part / across * h);
             let taken = self.tracks.iter().any(|t| {
-                let (tu, tv) = (level.from_frame(t.at[0]), level.from_frame(t.at[1]));
+                let (tu, tv) = (level.of_frame(t.at[0]), level.of_frame(t.at[1]));
                 (tu as usize / w, tv as usize / h) == (part % across, part / across)
             });
             if !taken && let Some((score, at)) = best_corner(level, (u, v, w, h), occupied, &mut self.scores)
@@ -198,7 +198,7 @@ fn carry(from: &Stack<'_>, to: &Stack<'_>, at: [f32; 2]) -> Option<[f32; 2]> {
     let mut shift = [0.0, 0.0];
     for n in (0..levels).rev() {
         let (a, b) = (from.pyramid.level(from.frame, n), to.pyramid.level(to.frame, n));
-        let here = at.map(|c| a.from_frame(c));
+        let here = at.map(|c| a.of_frame(c));
         let guess = [here[0] + shift[0] / b.scale, here[1] + shift[1] / b.scale];
         if !inside(a.image, here) || !inside(b.image, guess) {
             if n > 0 {

@@ -43,7 +43,7 @@ impl Grid {
             for x in 0..side {
                 let centre = |k: usize| k as f64 + 0.5 - pad as f64;
                 let p = narrow(h.apply(centre(x), centre(y)));
-                values[y * side + x] = bilinear(level.image, p.map(|c| level.from_frame(c)));
+                values[y * side + x] = bilinear(level.image, p.map(|c| level.of_frame(c)));
             }
         }
         Some(Self { side, pad, values })

@@ -26,12 +26,12 @@ pub(super) struct Level<'a> {
 
 impl Level<'_> {
     /// Coordinates in this level of coordinates in the frame.
-    pub fn from_frame(&self, u: f32) -> f32 {
+    pub fn of_frame(self, u: f32) -> f32 {
         (u + 0.5) / self.scale - 0.5
     }
 
     /// Coordinates in the frame of coordinates in this level.
-    pub fn to_frame(&self, u: f32) -> f32 {
+    pub fn to_frame(self, u: f32) -> f32 {
         (u + 0.5) * self.scale - 0.5
     }
 }
@@ -135,7 +135,7 @@ mod tests {
                 for u in 0..level.image.width {
                     let expected = 4.0 * level.to_frame(u as f32);
                     assert!((f32::from(level.image.row(0)[u]) - expected).abs() <= 1.0);
-                    assert!((level.from_frame(level.to_frame(u as f32)) - u as f32).abs() < 1e-5);
+                    assert!((level.of_frame(level.to_frame(u as f32)) - u as f32).abs() < 1e-5);
                 }
             }
         }

@@ -22,7 +22,8 @@ fn is_up(event: &LinkEvent) -> bool {
 }
 
 struct Pair {
-    keys: Keys,
+    /// The files of the keys live as long as this.
+    _keys: Keys,
     payload: Payload,
     relay: Relay,
     station: Station,
@@ -34,7 +35,7 @@ async fn pair(radio: Radio, seed: u64) -> Pair {
     let relay = Relay::start(payload.address, radio, seed).await;
     let station = Station::first(&station_settings(keys.files(Role::Station, "base"), Some(relay.address)));
     assert!(within(PATIENCE, || any(&station.events, is_up)).await, "no connection");
-    Pair { keys, payload, relay, station }
+    Pair { _keys: keys, payload, relay, station }
 }
 
 async fn send(payload: &Payload, count: u32, every: Duration) -> u32 {

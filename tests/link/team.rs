@@ -75,7 +75,8 @@ pub struct Payload {
     pub handle: LinkHandle,
     pub address: SocketAddr,
     pub events: Log,
-    stop: watch::Sender<bool>,
+    /// The payload runs while this lives.
+    _stop: watch::Sender<bool>,
     task: tokio::task::JoinHandle<()>,
     clock: HostClock,
 }
@@ -103,7 +104,7 @@ impl Payload {
         let address = link.local_addr().expect("bound");
         let stop = watch::Sender::new(false);
         let task = tokio::spawn(link.run(stop.subscribe()));
-        Self { handle, address, events: collect(events), stop, task, clock: HostClock::start() }
+        Self { handle, address, events: collect(events), _stop: stop, task, clock: HostClock::start() }
     }
 
     /// Sends one record of 160 bytes, as the estimator would; its log time is now.
@@ -117,11 +118,6 @@ impl Payload {
             data: vec![0x5a; 160],
         };
         self.handle.send(&record).expect("a record for the ground")
-    }
-
-    pub async fn stop(self) {
-        self.stop.send_replace(true);
-        let _ = self.task.await;
     }
 
     /// Ends without a word, as when power fails.
@@ -148,7 +144,6 @@ pub struct Station {
     pub address: SocketAddr,
     pub got: Arc<Mutex<BTreeMap<u32, Got>>>,
     pub events: Log,
-    pub thumbnails: Arc<Mutex<u32>>,
     stop: watch::Sender<bool>,
     task: tokio::task::JoinHandle<()>,
 }
@@ -178,15 +173,10 @@ impl Station {
         let (link, handle, mut records, events) = StationLink::open(settings, recall).expect("a station");
         let address = link.local_addr().expect("bound");
         let (into, clock, started) = (Arc::clone(&got), HostClock::start(), tokio::time::Instant::now());
-        let thumbnails = Arc::new(Mutex::new(0));
-        let count = Arc::clone(&thumbnails);
         let acknowledge = handle.clone();
         tokio::spawn(async move {
             while let Some(message) = records.recv().await {
-                let FromPayload::Record(arrival) = message else {
-                    *count.lock().expect("not poisoned") += 1;
-                    continue;
-                };
+                let FromPayload::Record(arrival) = message else { continue };
                 let mut got = into.lock().expect("not poisoned");
                 let got = got.entry(arrival.run).or_default();
                 *got.times.entry(arrival.number).or_default() += 1;
@@ -201,7 +191,7 @@ impl Station {
         });
         let stop = watch::Sender::new(false);
         let task = tokio::spawn(link.run(stop.subscribe()));
-        Self { handle, address, got, events: collect(events), thumbnails, stop, task }
+        Self { handle, address, got, events: collect(events), stop, task }
     }
 
     pub fn first(settings: &StationSettings) -> Self {
