@@ -76,7 +76,8 @@ fn the_command_line_tends_flights() {
     assert_eq!((shown["estimates"].as_u64(), shown["closed"].as_bool()), (Some(30), Some(true)));
     stdout(&windhover(root, &["show", "boot-2"]));
     stdout(&windhover(root, &["rebuild"]));
-    stdout(&windhover(root, &["verify"]));
+    let verified = windhover(root, &["verify"]);
+    assert!(verified.status.success(), "{}", String::from_utf8_lossy(&verified.stdout));
 
     // A cut segment is found, mended and whole again; nothing that was in it is lost.
     let segment = root.join(FLIGHTS).join("boot-1/000000.mcap");
