@@ -69,6 +69,9 @@ fn the_command_line_tends_flights() {
     let root = dir.path();
     record_flight(root, 30);
     record_flight(root, 20);
+    // A stop waits half a second for the flight to be closed; on a busy machine repair does the rest.
+    std::thread::sleep(Duration::from_millis(500));
+    stdout(&windhover(root, &["repair"]));
     let list = stdout(&windhover(root, &["list"]));
     assert!(list.contains("boot-1") && list.contains("boot-2"), "{list}");
     let shown = stdout(&windhover(root, &["show", "boot-1", "--json"]));
