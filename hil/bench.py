@@ -157,12 +157,12 @@ def camera_faults(bench):
 
 
 def hang(bench):
-    """A task that hangs: the watchdog has the daemon started again, and it is ready again."""
+    """A daemon that hangs: the watchdog has the daemon started again, and it is ready again."""
     machine = bench.machine("hang")
     try:
         feed = bench.up(machine)
         pid = machine.service("MainPID")
-        # Stops the pipeline's thread alone: SIGSTOP stops a process, the freezer of ptrace a thread.
+        # SIGSTOP stops every thread of the process, not one task alone: the watchdog is no longer stroked.
         machine.run(f"kill -STOP {pid}")
         began = time.monotonic()
         while machine.service("MainPID") in (pid, "0"):
