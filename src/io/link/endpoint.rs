@@ -287,11 +287,15 @@ impl Door {
     pub async fn dial(self, address: String) {
         let mut current: Option<Connection> = None;
         let mut told_unresolved = false;
+        // A call of ours beside a silent connection may have reached the peer though its answer did not
+        // reach us: then it is this call that took over, and nobody else.
+        let mut called_beside = false;
         loop {
             if let Some(connection) = &current {
                 match watch(connection).await {
                     Watched::Closed => current = None,
-                    Watched::Silent => {}
+                    Watched::Silent => called_beside = true,
+                    Watched::Superseded if called_beside => current = None,
                     Watched::Superseded => {
                         // Another way to the same peer, or another program with our certificate: taking
                         // over from it at once would go on without end.
@@ -307,6 +311,7 @@ impl Door {
                         match self.call(candidate).await {
                             Called::Answered(connection) => {
                                 current = Some(connection);
+                                called_beside = false;
                                 break;
                             }
                             Called::Refused => tokio::time::sleep(CALL).await,
