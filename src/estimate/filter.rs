@@ -7,7 +7,7 @@ use crate::config::Config;
 use crate::geo::wrap_angle;
 use crate::msg::{
     AttitudeSample, Disposition, FrameObservations, FramePrediction, FusionResult, FusionSource, GnssEpoch,
-    Ownship, Stamped, TargetEstimate,
+    Ownship, Stamped, TargetEstimate, WarmFilter,
 };
 use crate::time::{MonoTime, Span};
 
@@ -42,6 +42,8 @@ pub struct Estimator {
     /// Compass readings heard before there was a state.
     compass: VecDeque<Stamped<AttitudeSample>>,
     lag: Span,
+    /// What the next start continues from.
+    warm: Option<WarmFilter>,
     /// Exposure time of the last frame whose smoothed estimate has been told.
     smoothed_to: Option<MonoTime>,
 }
@@ -68,8 +70,19 @@ impl Estimator {
             core,
             compass: VecDeque::with_capacity(READINGS + 1),
             lag: Span::from_ms(config.estimator.smoother_lag_ms),
+            warm: None,
             smoothed_to: None,
         }
+    }
+
+    /// Continues, at the first start, from the sensors' errors as an earlier run had learnt them.
+    pub fn resume(&mut self, warm: WarmFilter) {
+        self.warm = Some(warm);
+    }
+
+    /// What [`Self::resume`] takes; `None` while nothing is known.
+    pub fn warm_state(&self) -> Option<WarmFilter> {
+        self.core.state.alive.then(|| self.core.state.warm())
     }
 
     /// Whether the helicopter's own state is known.
@@ -209,6 +222,9 @@ impl Estimator {
         core.state.learnt.copy_from(&core.learning.start);
         if !start(&mut core.state, epoch.t_valid, &epoch.value, &typical, &core.models) {
             return false;
+        }
+        if let Some(warm) = self.warm.take() {
+            core.state.resume(&warm, &core.models, &core.learning);
         }
         let state = &self.core.state;
         self.history.restart(epoch.t_valid, |base| base.copy_from(state));

@@ -32,8 +32,8 @@ pub(super) struct Learnt {
 }
 
 /// Limits of what is learnt, as factors on the configured standard deviation.
-const LEAST: f64 = 0.05;
-const MOST: f64 = 5.0;
+pub(super) const LEAST: f64 = 0.05;
+pub(super) const MOST: f64 = 5.0;
 
 /// The configured values and how fast to leave them.
 #[derive(Clone, Debug)]

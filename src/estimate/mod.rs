@@ -18,6 +18,7 @@ mod state;
 mod track;
 mod update;
 mod vision;
+mod warm;
 
 pub use bound::{Bound, BoundTruth};
 pub use filter::{Estimator, EstimatorOutput};

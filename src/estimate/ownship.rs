@@ -330,7 +330,7 @@ pub(super) fn start(
 /// Tilt at the start, one sigma, rad: what a helicopter may fly with whatever its compass says.
 const START_TILT: f64 = 0.1;
 /// What a heading reading may have changed since it was taken, one sigma, rad.
-const START_HEADING: f64 = 0.1;
+pub(super) const START_HEADING: f64 = 0.1;
 /// Drag of a small helicopter, one sigma, 1/s: 0.1 to 0.3 is usual.
 const START_DRAG_PER_S: f64 = 0.2;
 /// Zero offset of a tilt sensor, one sigma, rad (0.4°: data sheets allow 0.2° to 0.5°).

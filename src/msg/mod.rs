@@ -5,6 +5,7 @@ mod event;
 mod image;
 mod measure;
 mod predict;
+mod warm;
 
 pub use estimate::{
     Disposition, FusionResult, FusionSource, Ownship, TargetEstimate, TargetState, TrackStatus,
@@ -15,3 +16,4 @@ pub use measure::{
     AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, MarkerDetection, MarkerId, Stamped,
 };
 pub use predict::{FramePrediction, MarkerPrediction};
+pub use warm::{WARM_STATES, WarmArrival, WarmFilter, WarmSite, WarmState};

@@ -2,8 +2,11 @@
 
 use crate::config::Config;
 use crate::decode::{CompassDecoder, DecodeCounts, GnssDecoder, HeardAttitude, HeardEpoch};
-use crate::msg::{AttitudeSample, GnssEpoch, Stamped};
+use crate::msg::{AttitudeSample, GnssEpoch, Stamped, WarmArrival};
 use crate::time::{GnssClock, MonoTime, Span, SteadyClock};
+
+/// Arrivals kept for a warm start: the jitter of a 5 Hz receiver over 10 s.
+const WARM_ARRIVALS: usize = 50;
 
 /// Time on the wire: ten bits a byte (8N1).
 fn on_the_wire(bytes: usize, baud: u32) -> Span {
@@ -76,6 +79,18 @@ impl GpsLine {
             let t_valid = fitted.map_or(began - self.latency, |(t, _)| t);
             out.push(Stamped { t_valid, t_recv: heard.t_last_byte, seq, value: heard.epoch });
         }
+    }
+
+    /// Recent arrivals, for [`Self::resume`].
+    pub(super) fn arrivals(&self) -> Vec<WarmArrival> {
+        let arrivals = self.clock.arrivals(WARM_ARRIVALS);
+        arrivals.into_iter().map(|(t, offset_ns)| WarmArrival { t_ns: t.ns(), offset_ns }).collect()
+    }
+
+    /// Continues the clock fit of an earlier run.
+    pub(super) fn resume(&mut self, arrivals: &[WarmArrival]) {
+        let arrivals: Vec<_> = arrivals.iter().map(|a| (MonoTime::from_ns(a.t_ns), a.offset_ns)).collect();
+        self.clock.resume(&arrivals);
     }
 
     /// One-sigma of the fit from UTC to host time.

@@ -23,7 +23,7 @@ use crate::estimate::{Estimator, EstimatorOutput, PaperEstimator};
 use crate::geo::{Geodetic, Tile};
 use crate::msg::{
     AttitudeSample, Event, EventBody, FrameObservations, FramePayload, GnssEpoch, MarkerDetection, MarkerId,
-    Source, Stamped, TargetEstimate, TrackStatus,
+    Source, Stamped, TargetEstimate, TrackStatus, WarmFilter, WarmSite, WarmState,
 };
 use crate::time::{MonoTime, Span};
 use lines::{CompassLine, GpsLine};
@@ -40,6 +40,8 @@ pub struct Pipeline {
     observations: FrameObservations,
     finder: SiteFinder,
     estimators: Option<Estimators>,
+    /// An earlier run's filter, until there is one to continue it.
+    warm: Option<WarmFilter>,
     monitor: Monitor,
     last_exposure: Option<MonoTime>,
     epochs: Vec<Stamped<GnssEpoch>>,
@@ -52,6 +54,7 @@ pub struct Pipeline {
 struct Estimators {
     joint: Estimator,
     paper: PaperEstimator,
+    site: WarmSite,
 }
 
 impl Pipeline {
@@ -71,6 +74,7 @@ impl Pipeline {
             observations: FrameObservations::default(),
             finder: SiteFinder::new(terrain),
             estimators: None,
+            warm: None,
             monitor: Monitor::new(config),
             last_exposure: None,
             epochs: Vec::new(),
@@ -78,6 +82,27 @@ impl Pipeline {
             estimated: Vec::new(),
             papered: Vec::new(),
         }
+    }
+
+    /// Continues from what an earlier run of the same flight had learnt: site, clock fit, sensors' slow
+    /// errors. A state of another place or configuration is not used. Call before the first event; the
+    /// same state and events always give the same outputs.
+    #[must_use]
+    pub fn with_warm_state(mut self, warm: WarmState) -> Self {
+        self.gps.resume(&warm.arrivals);
+        self.finder.resume(warm.site);
+        self.warm = warm.filter.filter(WarmFilter::is_sound);
+        self
+    }
+
+    /// What a restarted program should continue from; `None` while the site is not settled.
+    pub fn warm_state(&self) -> Option<WarmState> {
+        let estimators = self.estimators.as_ref()?;
+        Some(WarmState {
+            site: estimators.site,
+            arrivals: self.gps.arrivals(),
+            filter: estimators.joint.warm_state(),
+        })
     }
 
     /// Takes an event; appends what follows from it.
@@ -174,10 +199,12 @@ impl Pipeline {
         );
         out.push(notice(t, NoticeKind::DatumSet, Some(Source::Gps), words));
         out.push(Output::Datum(t, datum));
-        self.estimators = Some(Estimators {
-            joint: Estimator::new(&self.config, &settled.site),
-            paper: PaperEstimator::new(&self.config, &settled.site),
-        });
+        let mut joint = Estimator::new(&self.config, &settled.site);
+        if let Some(warm) = self.warm.take() {
+            joint.resume(warm);
+        }
+        let paper = PaperEstimator::new(&self.config, &settled.site);
+        self.estimators = Some(Estimators { joint, paper, site: settled.warm });
     }
 
     fn compass_bytes(&mut self, bytes: &[u8], event: &Event, out: &mut Vec<Output>) {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::config::{Config, Declination, GroundSource};
 use crate::estimate::Site;
 use crate::geo::{self, Geodetic, Ground, LocalFrame, Terrain, Tile};
-use crate::msg::{FixKind, GnssEpoch};
+use crate::msg::{FixKind, GnssEpoch, WarmSite};
 
 /// Fixes whose median height is the ground where the ground is where the aircraft took off.
 const TAKEOFF_FIXES: usize = 5;
@@ -18,29 +18,39 @@ pub(super) struct SiteFinder {
     heights_m: Vec<f64>,
     seen: usize,
     terrain: Option<Arc<Tile>>,
+    warm: Option<WarmSite>,
 }
 
 /// A settled site, and what an operator should know of its declination.
 pub(super) struct SettledSite {
     pub(super) site: Site,
+    /// The same as plain numbers, for a warm start.
+    pub(super) warm: WarmSite,
     pub(super) declination_notice: Option<String>,
     pub(super) ground_notice: Option<String>,
 }
 
 impl SiteFinder {
     pub(super) fn new(terrain: Option<Arc<Tile>>) -> Self {
-        Self { first: None, heights_m: Vec::with_capacity(TAKEOFF_FIXES), seen: 0, terrain }
+        Self { first: None, heights_m: Vec::with_capacity(TAKEOFF_FIXES), seen: 0, terrain, warm: None }
+    }
+
+    /// Settles on an earlier run's site at the first fix.
+    pub(super) fn resume(&mut self, warm: WarmSite) {
+        self.warm = Some(warm);
     }
 
     /// Takes a fix; the site when it is settled.
     pub(super) fn offer(&mut self, epoch: &GnssEpoch, config: &Config) -> Option<SettledSite> {
         let at = position(epoch)?;
+        if let Some(warm) = self.warm.take().filter(|warm| agrees(warm, &at, config)) {
+            return Some(self.settled(warm, None, config));
+        }
         let first = *self.first.get_or_insert(at);
         self.seen += 1;
         let geoid_m = epoch.geoid_m.unwrap_or(0.0);
-        let tile = self.terrain.clone().filter(|tile| tile.covers(first.lat_deg, first.lon_deg));
-        let elevation_msl_m = tile
-            .as_ref()
+        let elevation_msl_m = self
+            .tile_at(first)
             .map(|t| t.height_msl_m(first.lat_deg, first.lon_deg))
             .or(config.ground.elevation_msl_m);
         let ground_height_m = match (elevation_msl_m, config.ground.source) {
@@ -55,21 +65,31 @@ impl SiteFinder {
             (None, None) => first.height_m,
         };
         let (declination_rad, declination_notice) = self.declination(epoch, at, config)?;
-        let datum = config.datum.map_or(Geodetic { height_m: ground_height_m, ..first }, |d| Geodetic {
-            lat_deg: d.lat_deg,
-            lon_deg: d.lon_deg,
-            height_m: d.height_m,
-        });
+        let datum = config
+            .datum
+            .map_or([first.lat_deg, first.lon_deg, ground_height_m], |d| [d.lat_deg, d.lon_deg, d.height_m]);
+        let warm = WarmSite { datum, ground_height_m, geoid_m, declination_rad };
+        Some(self.settled(warm, declination_notice, config))
+    }
+
+    fn tile_at(&self, at: Geodetic) -> Option<Arc<Tile>> {
+        self.terrain.clone().filter(|tile| tile.covers(at.lat_deg, at.lon_deg))
+    }
+
+    fn settled(&self, warm: WarmSite, declination_notice: Option<String>, config: &Config) -> SettledSite {
+        let [lat_deg, lon_deg, height_m] = warm.datum;
+        let datum = Geodetic { lat_deg, lon_deg, height_m };
         let frame = LocalFrame::new(datum);
+        let tile = self.tile_at(self.first.unwrap_or(datum));
         let ground_notice = (tile.is_none() && config.ground.terrain.is_some()).then(|| {
             "no terrain tile covers the first fix (it could not be read, or is of another place): level ground at that fix's height instead".to_owned()
         });
         let ground = match tile {
-            Some(tile) => Ground::Terrain(Arc::new(Terrain::new(tile, &frame, geoid_m))),
-            None => Ground::Flat { down_m: datum.height_m - ground_height_m },
+            Some(tile) => Ground::Terrain(Arc::new(Terrain::new(tile, &frame, warm.geoid_m))),
+            None => Ground::Flat { down_m: datum.height_m - warm.ground_height_m },
         };
-        let site = Site { frame, ground, declination_rad };
-        Some(SettledSite { site, declination_notice, ground_notice })
+        let site = Site { frame, ground, declination_rad: warm.declination_rad };
+        SettledSite { site, warm, declination_notice, ground_notice }
     }
 
     /// Declination in radians and what to say of it; `None` while waiting for a date.
@@ -95,6 +115,24 @@ impl SiteFinder {
             Err(error) => (0.0, Some(error.to_string())),
         })
     }
+}
+
+/// Farthest from an earlier run's datum that a flight is still the same one, degrees (some 10 km).
+const SAME_FLIGHT_DEG: f64 = 0.1;
+
+/// Whether an earlier run's site is here and is what the configuration asks for.
+fn agrees(warm: &WarmSite, at: &Geodetic, config: &Config) -> bool {
+    let [lat_deg, lon_deg, height_m] = warm.datum;
+    let near = (lat_deg - at.lat_deg).abs() < SAME_FLIGHT_DEG
+        && (lon_deg - at.lon_deg).abs() < SAME_FLIGHT_DEG / at.lat_deg.to_radians().cos().max(0.01);
+    // Stored numbers may have lost their last digit.
+    let equal = |a: f64, b: f64| (a - b).abs() <= 1e-9 * a.abs().max(1.0);
+    let as_configured =
+        config.datum.is_none_or(|d| {
+            equal(d.lat_deg, lat_deg) && equal(d.lon_deg, lon_deg) && equal(d.height_m, height_m)
+        }) && config.ground.elevation_msl_m.is_none_or(|e| equal(e + warm.geoid_m, warm.ground_height_m))
+            && config.compass.declination_deg.is_none_or(|d| equal(d.to_radians(), warm.declination_rad));
+    near && as_configured && height_m.is_finite() && warm.ground_height_m.is_finite()
 }
 
 /// A three-dimensional position above the ellipsoid.

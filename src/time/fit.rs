@@ -80,6 +80,22 @@ impl GnssClock {
         }
     }
 
+    /// The newest arrivals the fit is made over, oldest first: host time and that less the time of day
+    /// (up to whole days). What [`Self::resume`] takes.
+    pub fn arrivals(&self, most: usize) -> Vec<(MonoTime, i64)> {
+        let Some((reference, reference_ns)) = self.reference else { return Vec::new() };
+        let newest = self.points.iter().skip(self.points.len().saturating_sub(most));
+        newest.map(|&(t, x)| (reference + Span::from_s(t), reference_ns + Span::from_ms(x).ns())).collect()
+    }
+
+    /// Continues from the arrivals of an earlier clock of the same receiver and host. New arrivals that
+    /// do not lie with them begin a new fit, as after any step.
+    pub fn resume(&mut self, arrivals: &[(MonoTime, i64)]) {
+        if !arrivals.is_empty() {
+            self.restart(arrivals);
+        }
+    }
+
     /// An epoch of this time of day (from 86 400 s on in a leap second) began to arrive.
     pub fn observe(&mut self, time_of_day_ns: i64, arrival: MonoTime) {
         let leapt = self.last_time_of_day_ns.replace(time_of_day_ns);
