@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -25,8 +25,10 @@ const SUSPICIOUS: Duration = Duration::from_millis(2_500);
 const CALL: Duration = Duration::from_secs(4);
 /// Pause after another connection took over.
 const YIELD: Duration = Duration::from_secs(30);
-/// Pause between calls.
+/// Pause between calls; it doubles, up to [`CALL`], while connections end young.
 const PAUSE: Duration = Duration::from_millis(300);
+/// A connection that ends before is young.
+const YOUNG: Duration = Duration::from_secs(10);
 /// Handshakes under way above which a caller must first prove its address.
 const BUSY: usize = 8;
 /// How often the key files are looked at.
@@ -113,6 +115,24 @@ pub struct Peer {
     pub name: String,
     /// The connection.
     pub connection: Connection,
+    superseded: Arc<AtomicBool>,
+}
+
+impl Peer {
+    /// Closes the connection because a newer one of the same peer took its place.
+    pub(super) fn supersede(&self) {
+        self.superseded.store(true, Ordering::Relaxed);
+        self.connection.close(VarInt::from_u32(close::SUPERSEDED), b"a newer connection took over");
+    }
+
+    /// Whether a newer connection took its place, by our doing or the other side's. A close of our own
+    /// alone does not say so: a session that ended for any other reason is closed by us as well.
+    fn was_superseded(&self) -> bool {
+        use quinn::ConnectionError as E;
+        self.superseded.load(Ordering::Relaxed)
+            || matches!(self.connection.close_reason(), Some(E::ApplicationClosed(said))
+                if said.error_code == VarInt::from_u32(close::SUPERSEDED))
+    }
 }
 
 /// Sends events to the operator without ever waiting.
@@ -193,6 +213,8 @@ pub struct Door {
     endpoint: Endpoint,
     role: Role,
     files: KeyFiles,
+    /// When the files were last written, as of just before they were read.
+    stamps: Vec<Option<std::time::SystemTime>>,
     identity: Arc<Mutex<Arc<Identity>>>,
     events: Events,
     arrivals: mpsc::Sender<Peer>,
@@ -208,6 +230,7 @@ impl Door {
         events: Events,
         arrivals: mpsc::Sender<Peer>,
     ) -> Result<Self, LinkError> {
+        let stamps = stamps(files);
         let identity = Identity::load(files, role)?;
         let socket = match listen {
             Some(address) => bind(address)?,
@@ -224,6 +247,7 @@ impl Door {
             endpoint,
             role,
             files: files.clone(),
+            stamps,
             identity: Arc::new(Mutex::new(Arc::new(identity))),
             events,
             arrivals,
@@ -253,17 +277,17 @@ impl Door {
 
     /// Lets peers in, until the port is closed.
     pub async fn listen(self) {
-        let underway = Arc::new(AtomicU64::new(0));
+        // They end with this task: a port that is given up is free at once.
+        let mut underway = tokio::task::JoinSet::new();
         while let Some(incoming) = self.endpoint.accept().await {
-            let busy = underway.load(Ordering::Relaxed) as usize >= BUSY;
-            if busy && !incoming.remote_address_validated() && incoming.may_retry() {
+            while underway.try_join_next().is_some() {}
+            if underway.len() >= BUSY && !incoming.remote_address_validated() && incoming.may_retry() {
                 // Costs the caller a round trip and us nothing; forged addresses end here.
                 let _ = incoming.retry();
                 continue;
             }
-            let (door, underway) = (self.clone(), Arc::clone(&underway));
-            underway.fetch_add(1, Ordering::Relaxed);
-            tokio::spawn(async move {
+            let door = self.clone();
+            underway.spawn(async move {
                 let address = incoming.remote_address();
                 let outcome = match incoming.accept() {
                     Ok(connecting) => match tokio::time::timeout(CALL, connecting).await {
@@ -278,22 +302,26 @@ impl Door {
                     }
                     Err(e) => door.events.refused(address, refusal(&e).0),
                 }
-                underway.fetch_sub(1, Ordering::Relaxed);
             });
         }
     }
 
     /// Calls a peer, and again whenever the connection is gone or silent, until the port is closed.
     pub async fn dial(self, address: String) {
-        let mut current: Option<Connection> = None;
+        let mut current: Option<Peer> = None;
         let mut told_unresolved = false;
+        let (mut pause, mut answered) = (PAUSE, tokio::time::Instant::now());
         // A call of ours beside a silent connection may have reached the peer though its answer did not
         // reach us: then it is this call that took over, and nobody else.
         let mut called_beside = false;
         loop {
-            if let Some(connection) = &current {
-                match watch(connection).await {
-                    Watched::Closed => current = None,
+            if let Some(peer) = &current {
+                match watch(peer).await {
+                    Watched::Closed => {
+                        let young = answered.elapsed() < YOUNG;
+                        pause = if young { (2 * pause).min(CALL) } else { PAUSE };
+                        current = None;
+                    }
                     Watched::Silent => called_beside = true,
                     Watched::Superseded if called_beside => current = None,
                     Watched::Superseded => {
@@ -309,9 +337,10 @@ impl Door {
                     told_unresolved = false;
                     for candidate in found {
                         match self.call(candidate).await {
-                            Called::Answered(connection) => {
-                                current = Some(connection);
+                            Called::Answered(peer) => {
+                                current = Some(peer);
                                 called_beside = false;
+                                answered = tokio::time::Instant::now();
                                 break;
                             }
                             Called::Refused => tokio::time::sleep(CALL).await,
@@ -326,7 +355,7 @@ impl Door {
                 }
                 Err(_) => {}
             }
-            tokio::time::sleep(PAUSE).await;
+            tokio::time::sleep(pause).await;
         }
     }
 
@@ -340,7 +369,7 @@ impl Door {
         };
         match tokio::time::timeout(CALL, connecting).await {
             Ok(Ok(connection)) => match self.greet(connection).await {
-                Some(connection) => Called::Answered(connection),
+                Some(peer) => Called::Answered(peer),
                 None => Called::Refused,
             },
             Ok(Err(e)) => {
@@ -356,7 +385,7 @@ impl Door {
     }
 
     /// Checks the role in the peer's certificate and hands the peer on.
-    async fn greet(&self, connection: Connection) -> Option<Connection> {
+    async fn greet(&self, connection: Connection) -> Option<Peer> {
         let known = peer_certificate(&connection).and_then(|der| peer_of(&der));
         let name = match known {
             Some((role, name)) if role == self.role.peer() => name,
@@ -371,13 +400,14 @@ impl Door {
         open.retain(|_, c| c.close_reason().is_none());
         open.insert(connection.stable_id(), connection.clone());
         *self.open.lock().unwrap_or_else(PoisonError::into_inner) = open;
-        self.arrivals.send(Peer { name, connection: connection.clone() }).await.ok()?;
-        Some(connection)
+        let peer = Peer { name, connection, superseded: Arc::default() };
+        self.arrivals.send(peer.clone()).await.ok()?;
+        Some(peer)
     }
 
     /// Reads the key files again when they change: a revoked peer is out within seconds.
     pub async fn watch_keys(self) {
-        let mut seen = stamps(&self.files);
+        let mut seen = self.stamps.clone();
         loop {
             tokio::time::sleep(KEYS_WATCH).await;
             let now = stamps(&self.files);
@@ -414,7 +444,7 @@ impl Door {
 }
 
 enum Called {
-    Answered(Connection),
+    Answered(Peer),
     Refused,
     Unanswered,
 }
@@ -426,23 +456,21 @@ enum Watched {
 }
 
 /// Waits until a connection is closed, or nothing was heard on it for a while.
-async fn watch(connection: &Connection) -> Watched {
+async fn watch(peer: &Peer) -> Watched {
+    let connection = &peer.connection;
     let mut heard = connection.stats().udp_rx.datagrams;
     let mut since = tokio::time::Instant::now();
     loop {
         tokio::select! {
             reason = connection.closed() => {
-                return match &reason {
-                    quinn::ConnectionError::LocallyClosed => Watched::Superseded,
-                    quinn::ConnectionError::ApplicationClosed(said)
-                        if said.error_code == VarInt::from_u32(close::SUPERSEDED) => Watched::Superseded,
-                    quinn::ConnectionError::ConnectionClosed(_) => {
-                        // Thrown out, most likely for the certificate: no use in hurrying.
-                        tokio::time::sleep(CALL).await;
-                        Watched::Closed
-                    }
-                    _ => Watched::Closed,
-                };
+                if peer.was_superseded() {
+                    return Watched::Superseded;
+                }
+                if matches!(reason, quinn::ConnectionError::ConnectionClosed(_)) {
+                    // Thrown out, most likely for the certificate: no use in hurrying.
+                    tokio::time::sleep(CALL).await;
+                }
+                return Watched::Closed;
             }
             () = tokio::time::sleep(PAUSE) => {}
         }

@@ -6,12 +6,11 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use quinn::{Connection, VarInt};
 use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 
 use super::backlog::{Backlog, Extent, MemoryBacklog};
-use super::endpoint::{Door, Events, LinkError, LinkEvent, Peer, close};
+use super::endpoint::{Door, Events, LinkError, LinkEvent, Peer};
 use super::keys::Role;
 use super::live::downlink_class;
 use super::pace::Bucket;
@@ -98,7 +97,7 @@ pub struct LinkStatus {
 
 /// A station's latest connection.
 struct Connected {
-    connection: Connection,
+    peer: Peer,
     status: StationStatus,
     /// Whether the operator was told that it is up; a connection that takes over inherits it.
     told: Arc<AtomicBool>,
@@ -289,17 +288,15 @@ impl PayloadLink {
             backfilled: 0,
             wanted: 0,
         };
-        let connection = peer.connection.clone();
         let told = {
             let mut stations = self.shared.stations();
             let old = stations.remove(&peer.name);
-            let open = old.as_ref().filter(|old| old.connection.close_reason().is_none());
+            let open = old.as_ref().filter(|old| old.peer.connection.close_reason().is_none());
             let told = open.map_or_else(Arc::default, |old| Arc::clone(&old.told));
             if let Some(old) = old {
-                let code = VarInt::from_u32(close::SUPERSEDED);
-                old.connection.close(code, b"a newer connection took over");
+                old.peer.supersede();
             }
-            let connected = Connected { connection: connection.clone(), status, told: Arc::clone(&told) };
+            let connected = Connected { peer: peer.clone(), status, told: Arc::clone(&told) };
             stations.insert(peer.name.clone(), connected);
             told
         };
@@ -313,8 +310,8 @@ impl PayloadLink {
             };
             let ended = session::serve(&shared, &peer, up).await;
             let mut stations = shared.stations();
-            let ours =
-                stations.get(&peer.name).is_some_and(|c| c.connection.stable_id() == connection.stable_id());
+            let id = peer.connection.stable_id();
+            let ours = stations.get(&peer.name).is_some_and(|c| c.peer.connection.stable_id() == id);
             if ours {
                 stations.remove(&peer.name);
                 events.ended(&peer, ended);

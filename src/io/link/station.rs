@@ -6,11 +6,10 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use quinn::{Connection, VarInt};
 use tokio::sync::{Notify, mpsc, watch};
 use tokio::time::Instant;
 
-use super::endpoint::{Door, Events, LinkError, LinkEvent, Peer, close};
+use super::endpoint::{Door, Events, LinkError, LinkEvent, Peer};
 use super::inbox::{Inbox, Progress};
 use super::keys::Role;
 use super::ranges::RangeSet;
@@ -113,7 +112,7 @@ pub(super) struct PayloadState {
     pub(super) stored: Notify,
     pub(super) status: Mutex<PayloadStatus>,
     pub(super) heard: Mutex<Instant>,
-    connection: Mutex<Connection>,
+    peer: Mutex<Peer>,
     /// Whether the operator was told that it is up.
     told: AtomicBool,
 }
@@ -151,7 +150,7 @@ impl StationHandle {
         let states: Vec<_> = lock(&self.shared.payloads).values().cloned().collect();
         let of = |state: Arc<PayloadState>| {
             let mut status = lock(&state.status).clone();
-            let connection = lock(&state.connection).clone();
+            let connection = lock(&state.peer).connection.clone();
             status.connected &= connection.close_reason().is_none();
             status.rtt_ms = connection.rtt().as_secs_f64() * 1e3;
             status.address = connection.remote_address();
@@ -233,8 +232,8 @@ impl StationLink {
     fn state_of(&self, peer: &Peer) -> Arc<PayloadState> {
         let mut payloads = lock(&self.shared.payloads);
         if let Some(state) = payloads.get(&peer.name) {
-            let old = std::mem::replace(&mut *lock(&state.connection), peer.connection.clone());
-            old.close(VarInt::from_u32(close::SUPERSEDED), b"a newer connection took over");
+            let old = std::mem::replace(&mut *lock(&state.peer), peer.clone());
+            old.supersede();
             lock(&state.status).connected = true;
             *lock(&state.heard) = Instant::now();
             return Arc::clone(state);
@@ -255,7 +254,7 @@ impl StationLink {
             stored: Notify::new(),
             status: Mutex::new(status),
             heard: Mutex::new(Instant::now()),
-            connection: Mutex::new(peer.connection.clone()),
+            peer: Mutex::new(peer.clone()),
             told: AtomicBool::new(false),
         });
         payloads.insert(peer.name.clone(), Arc::clone(&state));
@@ -273,7 +272,7 @@ impl StationLink {
                 }
             };
             let ended = receive::receive(&shared, &state, &peer, up).await;
-            let ours = lock(&state.connection).stable_id() == peer.connection.stable_id();
+            let ours = lock(&state.peer).connection.stable_id() == peer.connection.stable_id();
             if ours {
                 lock(&state.status).connected = false;
                 state.told.store(false, Ordering::Relaxed);
