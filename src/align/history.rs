@@ -46,7 +46,10 @@ pub struct History<M, S> {
 /// How much later than heard a stamp may lie: the fits behind stamps are that good, ms.
 const FUTURE_TOLERANCE_MS: f64 = 20.0;
 
-impl<M: Default, S: Default> History<M, S> {
+/// Entries made at once when none is to spare: the number in use then settles early.
+const BATCH: usize = 8;
+
+impl<M: Default, S: Default + Clone> History<M, S> {
     /// An empty history that starts from `base`, true at `t_base`. It reaches `span` back from the
     /// newest `t_recv` and holds at most `capacity` measurements.
     pub fn new(span: Span, capacity: usize, base: S, t_base: MonoTime) -> Self {
@@ -77,6 +80,11 @@ impl<M: Default, S: Default> History<M, S> {
     /// Puts a measurement in its place and gives its index; `fill` writes it into a recycled value.
     /// Everything from that index on has to be fused again, starting from [`Self::before`].
     pub fn insert(&mut self, stamp: Stamp, fill: impl FnOnce(&mut M)) -> usize {
+        if self.spare.is_empty() {
+            // States like the base, so that writing into them allocates no more.
+            let more = || Entry { stamp: Stamp::default(), value: M::default(), after: self.base.clone() };
+            self.spare.extend(std::iter::repeat_with(more).take(BATCH));
+        }
         let mut entry = self.spare.pop().unwrap_or_default();
         entry.stamp = stamp;
         fill(&mut entry.value);

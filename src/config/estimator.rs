@@ -31,7 +31,7 @@ pub struct EstimatorConfig {
     pub smoother_lag_ms: f64,
     /// A target not seen for this long is lost, seconds.
     pub lost_after_s: f64,
-    /// Whether motion intensities, tilt noise and heading noise are fitted in flight.
+    /// Whether intensities of motion and the noise of pixels, tilt and heading are fitted in flight.
     pub learn: bool,
     /// Time over which they are fitted, seconds.
     pub learn_s: f64,
@@ -41,8 +41,7 @@ pub struct EstimatorConfig {
     pub rejections_to_restart: u32,
     /// Ground features used at once.
     pub features: usize,
-    /// Factor on the pixel sigma of ground features: hovering, a filter that believes them in full
-    /// becomes overconfident.
+    /// Factor on the pixel sigma that the detector tells of ground features.
     pub feature_sigma_factor: f64,
     /// One-sigma added to every marker pixel for what the detector cannot know (lens, exposure time), px.
     pub marker_noise_px: f64,
@@ -71,7 +70,7 @@ impl Default for EstimatorConfig {
             smoother_lag_ms: 500.0,
             lost_after_s: 8.0,
             learn: true,
-            learn_s: 1.5,
+            learn_s: 1.0,
             gate_probability: 0.999,
             rejections_to_restart: 5,
             features: 8,

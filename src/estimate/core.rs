@@ -15,13 +15,28 @@ use super::update::{Measurement, Outcome, Workspace};
 const LEARN_INTERVAL_MS: f64 = 400.0;
 
 /// A measurement of any source, in a form that is recycled.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub(super) struct AnyMeasurement {
     pub(super) kind: Kind,
     pub(super) gnss: GnssEpoch,
     pub(super) attitude: AttitudeSample,
     pub(super) frame: FrameObservations,
 }
+
+impl Default for AnyMeasurement {
+    /// With room for a frame, whatever it is first used for.
+    fn default() -> Self {
+        let frame = FrameObservations {
+            frame: 0,
+            markers: Vec::with_capacity(ROOM),
+            features: Vec::with_capacity(ROOM),
+        };
+        Self { kind: Kind::Nothing, gnss: GnssEpoch::default(), attitude: AttitudeSample::default(), frame }
+    }
+}
+
+/// Markers or features of a frame that fit without allocating.
+const ROOM: usize = 16;
 
 /// Which part of an [`AnyMeasurement`] counts.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
@@ -67,6 +82,8 @@ impl Core {
             thrust_var: e.thrust_mps2.powi(2),
             tilt_var: config.compass.tilt_noise_deg.to_radians().powi(2),
             heading_var: config.compass.heading_noise_deg.to_radians().powi(2),
+            marker_factor: vec![1.0; config.target.len()],
+            feature_factor: 1.0,
             t_target: MonoTime::default(),
         };
         let lag_frames = (e.smoother_lag_ms * 1e-3 * config.camera.fps).ceil() as usize;

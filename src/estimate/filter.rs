@@ -41,6 +41,8 @@ pub struct Estimator {
     history: History<AnyMeasurement, State>,
     /// Compass readings heard before there was a state.
     compass: VecDeque<Stamped<AttitudeSample>>,
+    /// Room to look ahead in.
+    ahead: State,
     lag: Span,
     /// What the next start continues from.
     warm: Option<WarmFilter>,
@@ -50,6 +52,8 @@ pub struct Estimator {
 
 /// Without any measurement for so long the state is worth nothing.
 const SILENCE: Span = Span::from_ns(60_000_000_000);
+/// Farther ahead than this a frame is not foreseen, s.
+const FORESIGHT_S: f64 = 2.0;
 /// Compass readings this old still start the filter, if there are enough of them.
 const COMPASS_AGE: Span = Span::from_ns(3_000_000_000);
 /// Readings kept to start from, and the fewest that outvote a wrong one.
@@ -66,6 +70,7 @@ impl Estimator {
         let core = Core::new(config, site);
         let span = Span::from_ms(config.estimator.history_ms);
         Self {
+            ahead: State::default(),
             history: History::new(span, CAPACITY, core.state.clone(), MonoTime::default()),
             core,
             compass: VecDeque::with_capacity(READINGS + 1),
@@ -168,15 +173,15 @@ impl Estimator {
         self.tell_smoothed_until(None, out);
     }
 
-    /// What a frame exposed at `t` should show.
-    pub fn predict(&self, t: MonoTime) -> FramePrediction {
+    /// What a frame exposed at `t` should show, into a recycled value.
+    pub fn predict(&mut self, t: MonoTime, expected: &mut FramePrediction) {
+        expected.clear();
         let ahead = t - self.core.state.t;
-        if !self.core.state.alive || ahead.s() > 2.0 {
-            return FramePrediction { search: true, ..FramePrediction::default() };
+        if self.core.state.alive && ahead.s() <= FORESIGHT_S {
+            self.ahead.copy_present(&self.core.state);
+            self.ahead.propagate(t, &self.core.models);
+            self.ahead.expect(&self.core.models, expected);
         }
-        let mut state = self.core.state.without_copies();
-        state.propagate(t, &self.core.models);
-        state.expect(&self.core.models)
     }
 
     /// How much older GPS is than configured, as learnt so far, seconds.
@@ -192,7 +197,7 @@ impl Estimator {
             l.target_q.iter().map(|q| format!("{:.3}/{:.3}", q[0].sqrt(), q[1].sqrt())).collect();
         format!(
             "heading bias {:.2}±{:.2} deg, tilt gain {:.2}±{:.2}, tilt bias {:.2},{:.2}±{:.2} deg, delay {:.0}±{:.0} ms, \
-             sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} force {:.2}/{:.2} targets {}",
+             sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} force {:.2}/{:.2} targets {} pixels {:.2?} {:.2}",
             own.heading_bias.to_degrees(),
             sigma(super::state::at::HEADING_BIAS).to_degrees(),
             own.tilt_gain,
@@ -208,7 +213,9 @@ impl Estimator {
             l.yaw_rate_q.sqrt(),
             l.side_force_var.sqrt(),
             l.thrust_var.sqrt(),
-            targets.join(" ")
+            targets.join(" "),
+            l.marker_factor,
+            l.feature_factor
         )
     }
 

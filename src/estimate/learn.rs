@@ -27,6 +27,9 @@ pub(super) struct Learnt {
     pub(super) tilt_var: f64,
     /// Variance of a heading reading, rad².
     pub(super) heading_var: f64,
+    /// Factors on the variance of each target's marker pixels, and of ground features.
+    pub(super) marker_factor: Vec<f64>,
+    pub(super) feature_factor: f64,
     /// When the targets' intensities were last fitted.
     pub(super) t_target: MonoTime,
 }
@@ -55,6 +58,8 @@ impl Learnt {
         self.thrust_var = other.thrust_var;
         self.tilt_var = other.tilt_var;
         self.heading_var = other.heading_var;
+        self.marker_factor.clone_from(&other.marker_factor);
+        self.feature_factor = other.feature_factor;
         self.t_target = other.t_target;
     }
 }
@@ -135,6 +140,10 @@ impl State {
         }
         let spread = increment(echo, row, var, column, 1.0);
         let square = (target.mean[3 + k] - echo.mean[row]).powi(2) + spread;
+        // How much of an increment the measurements tell: where it is little, plain expectation
+        // maximisation creeps.
+        let told = (1.0 - spread / (q * age_s)).clamp(LEAST_TOLD, 1.0);
+        let gain = (gain / told).min(0.5);
         blend(&mut self.learnt.target_q[i][k], square / age_s, gain, learning.start.target_q[i][k]);
     }
 }
@@ -181,6 +190,9 @@ const REST_S: f64 = 0.5;
 const RESTING: f64 = 2.5;
 pub(super) const MOVING: f64 = 20.0;
 
+/// Share of an increment that measurements tell, at the least, as the fit's step takes it.
+const LEAST_TOLD: f64 = 0.1;
+
 /// Shortest increment looked at, s.
 const SHORTEST_S: f64 = 0.1;
 
@@ -211,3 +223,14 @@ pub(super) fn blend_noise(
         *value = (*value + gain * (sample - *value)).clamp(limits.0, limits.1);
     }
 }
+
+/// Moves a factor on a measurement's noise toward what its misfit (one where the noise is right) shows.
+pub(super) fn blend_factor(value: &mut f64, misfit: f64, samples: f64) {
+    if misfit.is_finite() {
+        *value = (*value * (1.0 + (misfit - 1.0) / samples)).clamp(FACTORS.0, FACTORS.1);
+    }
+}
+
+/// Limits of a factor on the variance of pixels: below half the sigma assumed, what is left out of the model
+/// (stamps, lens, bending of the model) counts for more than noise.
+const FACTORS: (f64, f64) = (0.25, 25.0);

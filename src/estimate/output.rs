@@ -74,11 +74,7 @@ impl State {
     }
 
     /// What a frame taken about now should show.
-    pub(super) fn expect(&self, models: &Models) -> FramePrediction {
-        let mut expected = FramePrediction { search: true, ..FramePrediction::default() };
-        if !self.alive {
-            return expected;
-        }
+    pub(super) fn expect(&self, models: &Models, expected: &mut FramePrediction) {
         let camera = self.own.position + self.own.ned_from_body * models.camera_at;
         let height = models.ground.down_m(camera.x, camera.y) - camera.z;
         let height_sigma = self.cov.at(at::POSITION + 2, at::POSITION + 2).max(0.0).sqrt();
@@ -112,7 +108,6 @@ impl State {
                 }
             }
         }
-        expected
     }
 
     /// One-sigma of a marker's pixel (larger axis): `√λ(H P Hᵀ)`.

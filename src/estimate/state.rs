@@ -213,33 +213,24 @@ impl State {
 
     /// Copies without allocating where the sizes match.
     pub(super) fn copy_from(&mut self, other: &Self) {
+        self.copy_present(other);
+        self.echoes.resize_with(other.echoes.len(), Echo::default);
+        for (mine, theirs) in self.echoes.iter_mut().zip(&other.echoes) {
+            mine.copy_from(theirs);
+        }
+        self.probe.copy_from(&other.probe);
+        self.rejections = other.rejections;
+    }
+
+    /// Copies all but the delayed copies, to look ahead with; without allocating where the sizes match.
+    pub(super) fn copy_present(&mut self, other: &Self) {
         self.t = other.t;
         self.alive = other.alive;
         self.own = other.own;
         self.targets.clone_from(&other.targets);
         self.features.clone_from(&other.features);
         self.cov.copy_from(&other.cov);
-        self.echoes.resize_with(other.echoes.len(), Echo::default);
-        for (mine, theirs) in self.echoes.iter_mut().zip(&other.echoes) {
-            mine.copy_from(theirs);
-        }
-        self.probe.copy_from(&other.probe);
         self.learnt.copy_from(&other.learnt);
-        self.rejections = other.rejections;
-    }
-
-    /// A copy without the delayed copies, to look ahead with.
-    pub(super) fn without_copies(&self) -> Self {
-        Self {
-            t: self.t,
-            alive: self.alive,
-            own: self.own,
-            targets: self.targets.clone(),
-            features: self.features.clone(),
-            cov: self.cov.clone(),
-            learnt: self.learnt.clone(),
-            ..Self::default()
-        }
     }
 
     /// Length of the error state.

@@ -77,6 +77,9 @@ pub(super) struct Outcome {
     pub(super) ratio: f64,
     /// Variance of each component's innovation as predicted.
     pub(super) innovation_var: [f64; MAX_MEASURED],
+    /// Posterior expectation of the squared error over the noise assumed, a component: one on average
+    /// where that noise is the true one, `E[(z − h)ᵀ R⁻¹ (z − h) | data] / m`.
+    pub(super) misfit: f64,
 }
 
 /// Room for the arithmetic, made once.
@@ -102,6 +105,7 @@ impl Workspace {
             disposition: Disposition::Invalid,
             ratio: f64::NAN,
             innovation_var: [0.0; MAX_MEASURED],
+            misfit: f64::NAN,
         };
         if !z.is_finite() {
             return outcome;
@@ -125,6 +129,7 @@ impl Workspace {
         forward(&s, m, &mut white);
         let squared: f64 = white[..m].iter().map(|x| x * x).sum();
         outcome.ratio = gate.map_or(0.0, |g| squared / g);
+        outcome.misfit = misfit(&s, &z.noise, m, &white);
         outcome.disposition = Disposition::Fused;
         if !(outcome.ratio <= REFUSE_RATIO) {
             outcome.disposition = Disposition::GateRejected;
@@ -220,4 +225,36 @@ impl Workspace {
             }
         }
     }
+}
+
+/// `(νᵀ S⁻¹ R S⁻¹ ν + m − tr(S⁻¹ R)) / m` from `S = L Lᵀ` and the whitened innovation `L⁻¹ ν`.
+fn misfit(l: &Small, noise: &Small, m: usize, white: &[f64; MAX_MEASURED]) -> f64 {
+    let mut inverse = [[0.0; MAX_MEASURED]; MAX_MEASURED];
+    for k in 0..m {
+        // Column k of L⁻¹ as a row: only entries from k on differ from zero.
+        inverse[k][k] = 1.0;
+        for i in k..m {
+            for j in k..i {
+                inverse[k][i] -= l[i][j] * inverse[k][j];
+            }
+            inverse[k][i] /= l[i][i];
+        }
+    }
+    let dot = |a: &[f64; MAX_MEASURED], b: &[f64; MAX_MEASURED]| -> f64 {
+        a[..m].iter().zip(&b[..m]).map(|(a, b)| a * b).sum()
+    };
+    let mut weighed = [0.0; MAX_MEASURED];
+    for (k, weighed) in weighed[..m].iter_mut().enumerate() {
+        *weighed = dot(&inverse[k], white);
+    }
+    let (mut square, mut trace) = (0.0, 0.0);
+    for i in 0..m {
+        for j in 0..m {
+            if noise[i][j] != 0.0 {
+                square += weighed[i] * noise[i][j] * weighed[j];
+                trace += dot(&inverse[i], &inverse[j]) * noise[i][j];
+            }
+        }
+    }
+    (square + m as f64 - trace) / m as f64
 }

@@ -7,6 +7,7 @@ use crate::geo::{locate, skew, wrap_angle};
 use crate::msg::{Disposition, FeatureTrack, FrameObservations, FusionSource, MarkerDetection, TrackStatus};
 
 use super::core::Core;
+use super::learn::blend_factor;
 use super::models::Models;
 use super::state::{Own, State, Target, at};
 use super::track::{FRAMES_TO_START, started, started_again};
@@ -114,7 +115,8 @@ impl Core {
         let start = self.state.target_at(index);
         let mean = self.state.targets[index].mean;
         let model = &self.models.targets[index].markers[marker];
-        let floor = Matrix2::identity() * (self.models.marker_var_px2 + self.curvature_px2());
+        let curvature = self.curvature_px2();
+        let factor = self.state.learnt.marker_factor[index];
         let points: &[Vector3<f64>] = match (&model.corners, &seen.corners_px) {
             (Some(corners), Some(_)) => corners,
             _ => std::slice::from_ref(&model.center),
@@ -133,7 +135,9 @@ impl Core {
                 (4, Some(corners)) => (corners[i], seen.corner_cov_px2[i]),
                 _ => (seen.center_px, seen.center_cov_px2),
             };
-            set_point(&mut self.z, i, &(px - view.px), &view, position, attitude, &(covariance + floor));
+            let known = covariance + Matrix2::identity() * self.models.marker_var_px2;
+            let noise = known * factor + Matrix2::identity() * curvature;
+            set_point(&mut self.z, i, &(px - view.px), &view, position, attitude, &noise);
             for (k, d) in derivatives.iter().enumerate() {
                 let d = view.d_point * d;
                 self.z.set(2 * i, pose + k, d.x);
@@ -141,7 +145,12 @@ impl Core {
             }
         }
         if gated {
-            return self.fuse_gated(FusionSource::Marker).ratio <= 1.0;
+            let settled = curvature < LITTLE_CURVATURE * self.z.noise[0][0];
+            let outcome = self.fuse_gated(FusionSource::Marker);
+            if self.learning.on && settled && outcome.ratio < LEARN_RATIO {
+                blend_factor(&mut self.state.learnt.marker_factor[index], outcome.misfit, MARKER_SAMPLES);
+            }
+            return outcome.ratio <= 1.0;
         }
         let outcome = self.fuse(None);
         outcome.disposition == Disposition::Fused
@@ -235,7 +244,8 @@ impl Core {
         let attitude = self.z.columns(at::ATTITUDE, 3);
         let place = self.z.columns(start, 2);
         let known = track.sigma_px.powi(2) * self.models.feature_factor2;
-        let noise = Matrix2::identity() * (known + self.curvature_px2());
+        let curvature = self.curvature_px2();
+        let noise = Matrix2::identity() * (known * self.state.learnt.feature_factor + curvature);
         set_point(&mut self.z, 0, &(track.px - view.px), &view, position, attitude, &noise);
         for (k, d) in [Vector3::new(1.0, 0.0, slope_n), Vector3::new(0.0, 1.0, slope_e)].iter().enumerate() {
             let d = view.d_point * d;
@@ -246,7 +256,11 @@ impl Core {
             self.fuse(None);
             return;
         }
-        if self.fuse_gated(FusionSource::Feature).ratio > 1.0 {
+        let outcome = self.fuse_gated(FusionSource::Feature);
+        if self.learning.on && curvature < LITTLE_CURVATURE * noise[(0, 0)] && outcome.ratio < LEARN_RATIO {
+            blend_factor(&mut self.state.learnt.feature_factor, outcome.misfit, FEATURE_SAMPLES);
+        }
+        if outcome.ratio > 1.0 {
             self.state.features[slot].rejected += 1;
             if self.state.features[slot].rejected >= 2 {
                 self.drop_feature(slot);
@@ -256,6 +270,14 @@ impl Core {
         }
     }
 }
+
+/// Noise of pixels is fitted where tilt is known: what the linear model leaves out is this part of it.
+const LITTLE_CURVATURE: f64 = 0.2;
+/// Farther outside the gate than this a measurement teaches nothing of the noise of good ones.
+const LEARN_RATIO: f64 = 4.0;
+/// Sightings the fitted noise remembers: some seconds of one vehicle's tags, of eight features.
+const MARKER_SAMPLES: f64 = 100.0;
+const FEATURE_SAMPLES: f64 = 400.0;
 
 /// Heading quite unknown, one sigma of a uniform circle, rad.
 const UNKNOWN_HEADING: f64 = 1.8;

@@ -30,3 +30,13 @@ pub struct FramePrediction {
     /// Circles (centre, radius, pixels) that vehicles cover: no ground features there.
     pub occupied: Vec<(Vector2<f64>, f64)>,
 }
+
+impl FramePrediction {
+    /// Expects nothing: the whole frame is to be searched. Keeps its room.
+    pub fn clear(&mut self) {
+        self.markers.clear();
+        self.occupied.clear();
+        self.search = true;
+        self.size_range_px = None;
+    }
+}

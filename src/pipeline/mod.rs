@@ -22,8 +22,8 @@ use crate::detect::FrameDetector;
 use crate::estimate::{Estimator, EstimatorOutput, PaperEstimator};
 use crate::geo::{Geodetic, Tile};
 use crate::msg::{
-    AttitudeSample, Event, EventBody, FrameObservations, FramePayload, GnssEpoch, MarkerDetection, MarkerId,
-    Source, Stamped, TargetEstimate, TrackStatus, WarmFilter, WarmSite, WarmState,
+    AttitudeSample, Event, EventBody, FrameObservations, FramePayload, FramePrediction, GnssEpoch,
+    MarkerDetection, MarkerId, Source, Stamped, TargetEstimate, TrackStatus, WarmFilter, WarmSite, WarmState,
 };
 use crate::time::{MonoTime, Span};
 use lines::{CompassLine, GpsLine};
@@ -38,6 +38,7 @@ pub struct Pipeline {
     compass: CompassLine,
     detector: FrameDetector,
     observations: FrameObservations,
+    prediction: FramePrediction,
     finder: SiteFinder,
     estimators: Option<Estimators>,
     /// An earlier run's filter, until there is one to continue it.
@@ -72,6 +73,7 @@ impl Pipeline {
             compass: CompassLine::new(config),
             detector: FrameDetector::new(config),
             observations: FrameObservations::default(),
+            prediction: FramePrediction::default(),
             finder: SiteFinder::new(terrain),
             estimators: None,
             warm: None,
@@ -243,9 +245,12 @@ impl Pipeline {
         match decoded.and_then(|d| frame::check_size(&d, width, height).map(|()| d)) {
             Ok(decoded) => {
                 self.monitor.heard(Source::Camera, t, out);
-                let prediction = self.estimators.as_ref().map(|e| e.joint.predict(t_valid));
+                let prediction = self.estimators.as_mut().map(|e| {
+                    e.joint.predict(t_valid, &mut self.prediction);
+                    &self.prediction
+                });
                 let rgb = decoded.rgb.as_ref();
-                self.detector.process(decoded.gray.view(), rgb, prediction.as_ref(), &mut self.observations);
+                self.detector.process(decoded.gray.view(), rgb, prediction, &mut self.observations);
                 self.note_seen();
                 out.push(Output::Detections {
                     frame: payload.index,

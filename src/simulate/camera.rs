@@ -121,14 +121,17 @@ impl World {
         for (px, corner) in corners_px.iter_mut().zip(corners_in_vehicle(config)) {
             *px = project(&corner)?;
         }
-        let t_s = self.seconds(t);
-        let covered = scenario
-            .camera
-            .hidden
-            .iter()
-            .any(|h| h.target == target && h.marker == marker && (h.from_s..h.to_s).contains(&t_s));
-        let visible = !covered && corners_px.iter().all(|px| self.in_frame(px, 0.0));
+        let visible = self.covered_share(target, marker, t) <= 0.0
+            && corners_px.iter().all(|px| self.in_frame(px, 0.0));
         Some(MarkerTruth { target, marker, visible, center_px, corners_px })
+    }
+
+    /// How much of a marker something lies on at host time `t`: 0 for none of it, 1 for all.
+    pub(super) fn covered_share(&self, target: usize, marker: usize, t: MonoTime) -> f64 {
+        let t_s = self.seconds(t);
+        let hidden = self.scenario().camera.hidden.iter();
+        let now = hidden.filter(|h| h.target == target && h.marker == marker);
+        now.filter(|h| (h.from_s..h.to_s).contains(&t_s)).map(|h| h.share).fold(0.0, f64::max)
     }
 
     /// Pixel of a point in NED; `None` where it is not in front of the lens.

@@ -38,7 +38,7 @@ impl Compass {
         let drawn_ms = stream.uniform(-1.0, 1.0) * sim.latency_spread_ms;
         let bias_deg = sim.bias_offset_deg + sim.bias_sigma_deg * stream.normal();
         let phase_s = stream.uniform(0.0, 1.0 / sim.rate_hz);
-        let latency = Span::from_ms(scenario.config.compass.latency_ms + drawn_ms);
+        let latency = Span::from_ms(scenario.config.compass.latency_ms + sim.latency_offset_ms + drawn_ms);
         Self { stream, latency, bias: bias_deg.to_radians(), count: 0, phase_s }
     }
 

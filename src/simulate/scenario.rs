@@ -229,6 +229,8 @@ pub struct CompassSim {
     pub dip_deg: Option<f64>,
     /// The true latency lies this far around the configured one, ms (uniform, one draw a flight).
     pub latency_spread_ms: f64,
+    /// Added to the latency on top, ms.
+    pub latency_offset_ms: f64,
     /// Jitter of the arrival, ms one-sigma.
     pub jitter_ms: f64,
     /// From and to, seconds: silent.
@@ -302,6 +304,8 @@ pub struct HiddenMarker {
     pub from_s: f64,
     /// To, seconds.
     pub to_s: f64,
+    /// Share of it that is covered, from its right: 1 is all of it.
+    pub share: f64,
 }
 
 impl Default for Clock {
@@ -364,6 +368,7 @@ impl Default for CompassSim {
             tilt_gain: 1.0,
             dip_deg: None,
             latency_spread_ms: 4.0,
+            latency_offset_ms: 0.0,
             jitter_ms: 0.7,
             outages_s: Vec::new(),
             flagged: 0.0,

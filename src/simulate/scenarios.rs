@@ -108,7 +108,7 @@ position_m = [0.0, 0.0, -0.4]
 "#;
 
 /// Every named scenario: name, what it is for.
-const NAMES: [(&str, &str); 22] = [
+const NAMES: [(&str, &str); 29] = [
     ("hover10", "hover 10 m over a parked vehicle, the condition of the paper's error analysis"),
     ("follow", "follow a driving vehicle at 15 m"),
     ("hover20", "hover at 20 m over a vehicle driving figures of eight"),
@@ -130,6 +130,16 @@ const NAMES: [(&str, &str); 22] = [
     ("hidden-marker", "follow; one of the two tags is covered from 15 s to 30 s"),
     ("discs", "follow at 10 m a vehicle with two discs instead of tags"),
     ("static-survey", "hover at 12 m over a tag on the ground to be surveyed"),
+    (
+        "half-hidden",
+        "follow; one of the two tags is half covered from 12 s to 30 s, the other wholly from 35 s to 40 s",
+    ),
+    ("half-hidden-discs", "the same with two discs instead of tags, at 10 m"),
+    ("motion-blur", "follow a fast vehicle restlessly with exposures of 15 ms"),
+    ("low", "follow at 5 m"),
+    ("high", "follow at 25 m"),
+    ("outliers", "follow; 3 of 100 markers are tens of pixels off"),
+    ("wrong-latencies", "follow; GPS and compass 20 ms later than configured"),
     ("two-vehicles", "hover at 20 m over a car and a rover"),
 ];
 
@@ -227,7 +237,14 @@ impl Scenario {
                 (self.helicopter.position_gain, self.helicopter.velocity_gain) = (1.0, 1.7);
                 (self.helicopter.path, 12.0)
             }
-            "discs" => (self.helicopter.path, 10.0),
+            "motion-blur" => {
+                vehicle.speed = SpeedPlan::Cruise { mean_mps: 3.0, wander_mps: 0.6 };
+                self.helicopter.agitation_mps2 = 0.8;
+                (self.helicopter.path, 12.0)
+            }
+            "low" => (self.helicopter.path, 5.0),
+            "high" => (self.helicopter.path, 25.0),
+            "discs" | "half-hidden-discs" => (self.helicopter.path, 10.0),
             _ => (self.helicopter.path, 15.0),
         };
         (self.helicopter.path, self.helicopter.height_m) = (path, height_m);
@@ -246,7 +263,19 @@ impl Scenario {
                 self.helicopter.agitation_mps2 = 0.8;
             }
             "hidden-marker" => {
-                self.camera.hidden = vec![HiddenMarker { target: 0, marker: 1, from_s: 15.0, to_s: 30.0 }];
+                self.camera.hidden = vec![covered(1, 15.0, 30.0, 1.0)];
+            }
+            "half-hidden" | "half-hidden-discs" => {
+                self.camera.hidden = vec![covered(1, 12.0, 30.0, 0.5), covered(0, 35.0, 40.0, 1.0)];
+                if name == "half-hidden-discs" {
+                    self.config.target = vec![target(DISCS)];
+                }
+            }
+            "motion-blur" => self.scene.exposure_ms = 15.0,
+            "outliers" => self.camera.marker_outlier = 0.03,
+            "wrong-latencies" => {
+                (self.gps.latency_offset_ms, self.gps.latency_spread_ms) = (20.0, 0.0);
+                (self.compass.latency_offset_ms, self.compass.latency_spread_ms) = (20.0, 0.0);
             }
             "discs" => self.config.target = vec![target(DISCS)],
             "static-survey" => self.config.target = vec![target(SURVEY_POINT)],
@@ -308,6 +337,10 @@ impl Scenario {
         self.config.target.get(target).is_some_and(|t| t.model != TargetModel::Static)
             && self.vehicles.get(target).is_some_and(|v| v.speed != SpeedPlan::Parked)
     }
+}
+
+fn covered(marker: usize, from_s: f64, to_s: f64, share: f64) -> HiddenMarker {
+    HiddenMarker { target: 0, marker, from_s, to_s, share }
 }
 
 fn target(text: &str) -> TargetConfig {

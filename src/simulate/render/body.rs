@@ -12,6 +12,11 @@ const BODY: f32 = 70.0;
 const LIGHT_BODY: f32 = 160.0;
 const WINDSCREEN: f32 = 26.0;
 const SIDES: f32 = 44.0;
+/// And of what lies on a marker.
+const COVER: f32 = 96.0;
+
+/// Markers of one vehicle that may be covered.
+const COVERABLE: usize = 8;
 
 /// What a ray meets.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -102,8 +107,10 @@ impl Body {
     }
 
     /// The nearest surface along a ray, in the vehicle frame.
-    pub(super) fn hit(&self, origin: &Vector3<f32>, direction: &Vector3<f32>) -> Option<Hit> {
-        let plates = self.plates.iter().filter_map(|plate| plate.hit(origin, direction));
+    pub(super) fn hit(&self, placed: &Placed, direction: &Vector3<f32>) -> Option<Hit> {
+        let origin = &placed.origin;
+        let covered = placed.covered.iter().copied().chain(std::iter::repeat(0.0));
+        let plates = self.plates.iter().zip(covered).filter_map(|(p, c)| p.hit(origin, direction, c));
         let nearest = plates.chain(self.hull_hit(origin, direction)).min_by(|a, b| a.0.total_cmp(&b.0));
         nearest.map(|(at, level)| Hit::Surface { level, at })
     }
@@ -175,8 +182,8 @@ impl Plate {
         }
     }
 
-    /// Distance and grey level where a ray meets the plate.
-    fn hit(&self, origin: &Vector3<f32>, direction: &Vector3<f32>) -> Option<(f32, f32)> {
+    /// Distance and grey level where a ray meets the plate, or what covers this share of it.
+    fn hit(&self, origin: &Vector3<f32>, direction: &Vector3<f32>, covered: f32) -> Option<(f32, f32)> {
         let at = (self.centre.z - origin.z) / direction.z;
         if !(at > 0.0) {
             return None;
@@ -185,6 +192,11 @@ impl Plate {
             (origin.x + at * direction.x - self.centre.x, origin.y + at * direction.y - self.centre.y);
         let top = self.top.0 * dx + self.top.1 * dy;
         let right = self.top.0 * dy - self.top.1 * dx;
+        let reach = self.half * self.reach();
+        if covered > 0.0 && top.abs() < reach && right.abs() < reach && right > reach * (1.0 - 2.0 * covered)
+        {
+            return Some((at, COVER));
+        }
         match &self.face {
             Face::Disc(level) => (dx * dx + dy * dy <= self.half * self.half).then_some((at, *level)),
             Face::Tag(pattern) => {
@@ -208,4 +220,6 @@ pub(super) struct Placed {
     pub(super) origin: Vector3<f32>,
     /// Toward the sun, in the vehicle frame.
     pub(super) sun: Vector3<f32>,
+    /// Shares of its markers that are covered.
+    pub(super) covered: [f32; COVERABLE],
 }

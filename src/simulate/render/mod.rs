@@ -155,6 +155,7 @@ impl Renderer {
                     vehicle_from_camera: (vehicle_from_ned * pose.ned_from_camera.matrix()).cast(),
                     origin: (vehicle_from_ned * (pose.position_ned_m - foot)).cast(),
                     sun: (vehicle_from_ned * sun).cast(),
+                    covered: std::array::from_fn(|marker| self.world.covered_share(target, marker, t) as f32),
                 }
             })
             .collect();
@@ -272,7 +273,7 @@ impl Renderer {
         let mut shadow = false;
         for (body, placed) in self.bodies.iter().zip(&moment.placed) {
             let direction = placed.vehicle_from_camera * ray;
-            match body.hit(&placed.origin, &direction) {
+            match body.hit(placed, &direction) {
                 Some(Hit::Surface { level, at }) if nearest.is_none_or(|(best, _)| at < best) => {
                     nearest = Some((at, Hit::Surface { level, at }));
                 }
