@@ -5,13 +5,14 @@ CARGO ?= cargo
 VENV  ?= target/venv
 DEMO  ?= demo
 
-.PHONY: help setup setup-python build demo test test-python check lint docs clean deb hil hil-long
+.PHONY: help setup setup-python build demo test test-python check lint docs bench load clean deb hil hil-long
 
 help:
 	@echo "make demo     build, simulate a flight, replay it, compare with the truth, write a report page"
 	@echo "make test     every test"
 	@echo "make check    format, lints, documentation, shipped configurations, licences"
 	@echo "make bench    the benchmarks under benches/"
+	@echo "make load     five minutes of raw frames at full pace: latency, processor time, memory, losses"
 	@echo "make deb      a Debian package in target/debian"
 	@echo "make hil      the virtual payload computer: install, boot, fly, compare (as root)"
 	@echo "make hil-long the same with every scenario"
@@ -54,6 +55,11 @@ docs: setup
 
 bench: setup
 	$(CARGO) bench --locked
+
+# Latency and load of the daemon. Figures mean something on an idle machine only; the load is printed.
+load: build
+	$(CARGO) build --release --locked --example daemon_load
+	target/release/examples/daemon_load
 
 # The package: binary, unit, configuration, rules, manual and completions out of the command line.
 deb: build

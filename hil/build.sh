@@ -18,7 +18,7 @@ fi
 base="$out/base-$suite-$(echo "$packages" | sha256sum | cut -c1-8).tar"
 if [ ! -f "$base" ]; then
     echo "== Debian $suite"
-    mmdebstrap --quiet --variant=minbase --include="$packages" "$suite" "$base.part"
+    mmdebstrap --quiet --format=tar --variant=minbase --include="$packages" "$suite" "$base.part"
     mv "$base.part" "$base"
 fi
 

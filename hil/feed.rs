@@ -1,5 +1,5 @@
 //! Feeds a capture into the bench's lines at its own pace: serial bytes and grey frames, each into a
-//! Unix socket of the emulator.
+//! Unix socket of the emulator. At its end it begins again, as if the receiver had been restarted.
 //!
 //! `hil_feed CAPTURE GPS_SOCKET COMPASS_SOCKET FRAMES_SOCKET`
 //!
@@ -11,7 +11,7 @@ use std::io::Write;
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::process::ExitCode;
-use std::sync::mpsc::{Receiver, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Duration;
 
 use windhover::io::capture::CaptureReader;
@@ -43,6 +43,22 @@ fn feed(capture: &str, gps: &str, compass: &str, frames: &str) -> Result<(), Box
     let (sender, receiver) = sync_channel::<(u32, GrayImage)>(1);
     let camera = UnixStream::connect(frames)?;
     let writer = std::thread::spawn(move || write_frames(&receiver, camera));
+    loop {
+        play(capture, clock, &mut gps, &mut compass, &sender)?;
+        if writer.is_finished() {
+            return Err("the camera's line went away".into());
+        }
+    }
+}
+
+/// Plays the capture once.
+fn play(
+    capture: &str,
+    clock: HostClock,
+    gps: &mut UnixStream,
+    compass: &mut UnixStream,
+    frames: &SyncSender<(u32, GrayImage)>,
+) -> Result<(), Box<dyn std::error::Error>> {
     let began = clock.now();
     println!("start {}", began.ns());
     let mut first = None;
@@ -58,14 +74,12 @@ fn feed(capture: &str, gps: &str, compass: &str, frames: &str) -> Result<(), Box
             EventBody::CompassBytes(bytes) => compass.write_all(&bytes)?,
             EventBody::Frame(frame) => {
                 if let Some(image) = numbered(&frame) {
-                    let _ = sender.try_send((frame.index, image));
+                    let _ = frames.try_send((frame.index, image));
                 }
             }
             _ => {}
         }
     }
-    drop(sender);
-    let _ = writer.join();
     Ok(())
 }
 

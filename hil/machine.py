@@ -53,7 +53,7 @@ class Machine:
         channels = []
         for index, name in enumerate(("gps", "compass")):
             channels += ["-chardev", f"socket,id={name},path={self.socket_path(name)},server=on,wait=off"]
-            # PCI, so that the driver can let go of one and take it back: Debian counts four ports, so they become /dev/ttyS1 and /dev/ttyS2.
+            # PCI, so that the driver can let go of one and take it back; they become /dev/ttyS1 and /dev/ttyS2.
             channels += ["-device", f"pci-serial,chardev={name},addr={SERIAL_SLOTS[name]}"]
         for name in ("frames", "control"):
             channels += ["-chardev", f"socket,id={name},path={self.socket_path(name)},server=on,wait=off"]

@@ -12,7 +12,8 @@ use super::card::CardOrders;
 use super::config_file;
 use super::devices::Surroundings;
 use super::events::{self, Event as OperatorEvent};
-use super::health::{self, Figures, Latencies};
+use super::health::{self, Figures};
+use super::latencies::Latencies;
 use super::outlets::Outlets;
 use super::supervise::Heart;
 
@@ -116,6 +117,14 @@ impl Brain<'_> {
     fn finish(&mut self) {
         self.pipeline.finish(&mut self.outputs);
         self.pass_on(self.around.clock.now());
+        if let Some(all) = self.latencies.of_flight() {
+            self.around.log.tell_with(OperatorEvent::Latencies, "", "", |line| {
+                line.count("frames", all.frames)
+                    .figure("p50_ms", all.p50.ms(), 2)
+                    .figure("p99_ms", all.p99.ms(), 2)
+                    .figure("max_ms", all.longest.ms(), 2)
+            });
+        }
     }
 
     /// Passes on what followed from what was heard at `t`.

@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::config::{Config, Part};
+use crate::io::clock::HostClock;
 use crate::io::device::Stop;
 use crate::io::store::{Recording, Store, StoreHandle, StoreNotice, StoreStatus};
 use crate::time::Span;
@@ -51,12 +52,28 @@ const ROUND: Duration = Duration::from_millis(50);
 /// Longest the flight is kept open for a pipeline that does not end.
 const LAST_WORD: Span = Span::from_ns(1_000_000_000);
 
+/// Starts the store into the slot before there is a pipeline, so that a flight begins with the first
+/// thing heard; `None` where nothing is to be kept.
+pub fn open(config: &Config, clock: HostClock, slot: &Slot) -> Option<Opened> {
+    // A configuration that was checked can be written.
+    let text = config.to_toml().unwrap_or_default();
+    let (store, notices) = config.store.enabled.then(|| Store::start(config, text, clock))?;
+    slot.set(Some(store.handle()));
+    Some(Opened { store, notices })
+}
+
+/// A store that was started, and what it has to tell.
+pub struct Opened {
+    store: Store,
+    notices: Receiver<StoreNotice>,
+}
+
 /// Keeps the store running until the pipeline has said its last word after the end was asked for.
 pub fn run(
     config: &Config,
     around: &Surroundings,
     board: &Board,
-    slot: &Slot,
+    (slot, mut opened): (&Slot, Option<Opened>),
     orders: &CardOrders,
     heart: &Heart,
 ) {
@@ -70,11 +87,7 @@ pub fn run(
         }
         return;
     }
-    // A configuration that was checked can be written.
-    let text = config.to_toml().unwrap_or_default();
-    loop {
-        let (store, notices) = Store::start(config, text.clone(), around.clock);
-        slot.set(Some(store.handle()));
+    while let Some(Opened { store, notices }) = opened.take().or_else(|| open(config, around.clock, slot)) {
         let ended = attend(&store, &notices, around, board, orders, heart);
         slot.set(None);
         store.stop();

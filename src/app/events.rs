@@ -23,6 +23,8 @@ pub enum Event {
     Stopping,
     /// The end.
     Stopped,
+    /// From exposure to estimate, over the whole flight; at its end.
+    Latencies,
     /// A device is open.
     DeviceUp,
     /// A device does not deliver; it is tried again.
@@ -88,6 +90,7 @@ impl Event {
             Self::NotReady => row("not_ready", Warn, 30),
             Self::Stopping => row("stopping", Info, 0),
             Self::Stopped => row("stopped", Info, 0),
+            Self::Latencies => row("latencies", Info, 0),
             Self::DeviceUp => row("device_up", Info, 0),
             Self::DeviceDown => row("device_down", Warn, 30),
             Self::Device(note) => device_row(note),
@@ -209,6 +212,7 @@ mod tests {
             Event::NotReady,
             Event::Stopping,
             Event::Stopped,
+            Event::Latencies,
             Event::DeviceUp,
             Event::DeviceDown,
             Event::FlightClosed,

@@ -137,51 +137,9 @@ fn of_daemon(mut line: Line, figures: &Figures) -> Line {
     figure(line, "mem_mb", figures.memory_mb, 0)
 }
 
-/// Latencies of the last frames.
-#[derive(Debug, Default)]
-pub struct Latencies {
-    recent: std::collections::VecDeque<Span>,
-}
-
-/// Ten seconds at thirty frames a second.
-const LATENCIES_KEPT: usize = 300;
-
-impl Latencies {
-    /// Takes one in.
-    pub fn push(&mut self, latency: Span) {
-        if self.recent.len() == LATENCIES_KEPT {
-            self.recent.pop_front();
-        }
-        self.recent.push_back(latency);
-    }
-
-    /// The smallest latency that `share` (0 to 1) of the frames kept.
-    pub fn quantile(&self, share: f64) -> Option<Span> {
-        let mut sorted: Vec<Span> = self.recent.iter().copied().collect();
-        sorted.sort_unstable();
-        let rank = (share * sorted.len() as f64).ceil() as usize;
-        sorted.get(rank.max(1) - 1).copied()
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn quantiles_are_ranks() {
-        let mut latencies = Latencies::default();
-        assert_eq!(latencies.quantile(0.5), None);
-        for ms in 1..=100 {
-            latencies.push(Span::from_ms(f64::from(ms)));
-        }
-        assert_eq!(latencies.quantile(0.5), Some(Span::from_ms(50.0)));
-        assert_eq!(latencies.quantile(0.99), Some(Span::from_ms(99.0)));
-        for _ in 0..LATENCIES_KEPT {
-            latencies.push(Span::from_ms(5.0));
-        }
-        assert_eq!(latencies.quantile(1.0), Some(Span::from_ms(5.0)));
-    }
 
     #[test]
     fn a_silent_source_is_a_warning() {

@@ -14,6 +14,7 @@ pub mod ground;
 pub mod health;
 pub mod import;
 pub mod inbox;
+pub mod latencies;
 pub mod log;
 pub mod outlets;
 pub mod presence;

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use crate::config::Config;
 
 /// Keys that change in flight. A table's name stands for all its keys.
-const CHANGEABLE: [&str; 7] = [
+const CHANGEABLE: [&str; 8] = [
     "log.level",
     "daemon.answer_within_s",
     "daemon.optional",
@@ -13,6 +13,7 @@ const CHANGEABLE: [&str; 7] = [
     "power.on_mains_off",
     "power.hot_c",
     "power.voltage_file",
+    "power.going_file",
 ];
 
 /// Keys that differ between two configurations.
@@ -55,6 +56,7 @@ pub fn merged(running: &Config, read: &Config) -> Config {
     merged.power.on_mains_off = read.power.on_mains_off;
     merged.power.hot_c = read.power.hot_c;
     merged.power.voltage_file.clone_from(&read.power.voltage_file);
+    merged.power.going_file.clone_from(&read.power.going_file);
     merged
 }
 

@@ -92,7 +92,10 @@ pub fn start(config: &Config, clock: HostClock, log: &Log) -> std::io::Result<Gr
     {
         let (config, around, board) = (config.clone(), around.clone(), board.clone());
         let (slot, orders) = (slot.clone(), orders.clone());
-        tasks.spawn(STORE, move |heart| card::run(&config, &around, &board, &slot, &orders, &heart))?;
+        let opened = card::open(&config, clock, &slot);
+        tasks.spawn(STORE, move |heart| {
+            card::run(&config, &around, &board, (&slot, opened), &orders, &heart);
+        })?;
     }
     {
         let (config, around, board) = (config.clone(), around.clone(), board.clone());

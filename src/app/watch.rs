@@ -132,10 +132,14 @@ impl Watch {
         }
         self.graph.orders.power_going.store(state == PowerState::Going, Ordering::Release);
         if state != std::mem::replace(&mut self.power_state, state) {
-            let volts = reading.voltage_v.map_or_else(|| "mains off".into(), |v| format!("{v:.2} V"));
+            let what = match reading.voltage_v {
+                _ if reading.line_set => "the line that tells of it is set".to_owned(),
+                Some(volts) => format!("{volts:.2} V"),
+                None => "mains off".to_owned(),
+            };
             match state {
-                PowerState::Going => log.tell(Event::PowerGoing, "", format!("{volts}: closing the segment")),
-                PowerState::Good => log.tell(Event::PowerBack, "", volts),
+                PowerState::Going => log.tell(Event::PowerGoing, "", format!("{what}: closing the segment")),
+                PowerState::Good => log.tell(Event::PowerBack, "", what),
             }
         }
         self.status();
@@ -195,6 +199,8 @@ impl Watch {
 
 fn power(config: &Config) -> (PowerReader, PowerWatch) {
     let power = &config.power;
-    let reader = PowerReader::new(Path::new(&power.sysfs), power.voltage_file.as_ref().map(PathBuf::from));
+    let path = |file: &Option<String>| file.as_ref().map(PathBuf::from);
+    let reader =
+        PowerReader::new(Path::new(&power.sysfs), path(&power.voltage_file), path(&power.going_file));
     (reader, PowerWatch::new(power.low_voltage_v, power.on_mains_off))
 }

@@ -64,6 +64,10 @@ pub struct PowerConfig {
     /// microvolts); none: the lowest of all batteries the kernel knows.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub voltage_file: Option<String>,
+    /// A file that tells at once that power is going: it is there and holds something else than 0. The
+    /// value of a GPIO line in sysfs, or the flag a UPS program sets (POWERDOWNFLAG of NUT).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub going_file: Option<String>,
     /// Temperature above which the health line is a warning, degrees Celsius.
     pub hot_c: f64,
     /// Where sysfs is.
@@ -76,6 +80,7 @@ impl Default for PowerConfig {
             low_voltage_v: None,
             on_mains_off: false,
             voltage_file: None,
+            going_file: None,
             hot_c: 85.0,
             sysfs: "/sys".into(),
         }

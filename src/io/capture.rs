@@ -11,7 +11,7 @@ use prost::Message as _;
 use super::mcap_read::{self, McapReader, RawMessage, ReadError};
 use super::mcap_write::{CONFIG_ATTACHMENT, McapWriter, WriteError};
 use super::proto::{foxglove, host_time, windhover};
-use super::records::{self, topic};
+use super::records::{self, FRAME_NUMBER_KEY, IN_SEQUENCE, topic};
 use crate::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
 use crate::time::{MonoTime, Span};
 
@@ -120,8 +120,9 @@ impl CaptureReader {
             }
             topic::CAMERA_IMAGE => {
                 // A frame that does not even decode as a message still counts as one.
-                let index = self.frames;
-                self.frames = self.frames.saturating_add(1);
+                let numbered = raw.channel.metadata.get(FRAME_NUMBER_KEY).is_some_and(|v| v == IN_SEQUENCE);
+                let index = if numbered { raw.sequence } else { self.frames };
+                self.frames = index.saturating_add(1);
                 Some(EventBody::Frame(frame(raw, index)?))
             }
             topic::SOURCE_EVENT => source_event(&windhover::SourceEvent::decode(&raw.data[..])?),

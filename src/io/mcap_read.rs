@@ -4,7 +4,7 @@
 //! that fails its checksum is skipped, a cut file ends at its last whole record, and each is told as
 //! a warning.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -53,6 +53,8 @@ pub struct ChannelInfo {
     pub schema_encoding: String,
     /// The schema.
     pub schema_data: Vec<u8>,
+    /// What else its writer said of it.
+    pub metadata: BTreeMap<String, String>,
 }
 
 /// A message of a recording.
@@ -64,6 +66,8 @@ pub struct RawMessage {
     pub log_time: MonoTime,
     /// When it was true or sent, host time.
     pub publish_time: MonoTime,
+    /// Its sequence number, as its writer understood it.
+    pub sequence: u32,
     /// The bytes.
     pub data: Vec<u8>,
 }
@@ -277,6 +281,7 @@ impl OpenFile {
                     schema_name,
                     schema_encoding,
                     schema_data,
+                    metadata: channel.metadata,
                 };
                 self.channels.insert(channel.id, Arc::new(info));
             }
@@ -286,6 +291,7 @@ impl OpenFile {
                         channel: Arc::clone(channel),
                         log_time: host_time(header.log_time),
                         publish_time: host_time(header.publish_time),
+                        sequence: header.sequence,
                         data: data.into_owned(),
                     });
                 }

@@ -83,15 +83,20 @@ impl<W: Write + Seek> McapWriter<W> {
             schema_name: record.schema.name().into(),
             schema_encoding: "protobuf".into(),
             schema_data: record.schema.descriptor(),
+            metadata: BTreeMap::new(),
         })?;
-        self.write_message(channel, record.log_time, record.publish_time, &record.data)
+        let sequence = self.sequence;
+        self.sequence = sequence.wrapping_add(1);
+        let header = header(channel, sequence, record.log_time, record.publish_time);
+        self.write_message(&header, record.log_time, &record.data)
     }
 
-    /// Writes a message of another recording as it is.
+    /// Writes a message of another recording as it is, with its sequence number and its channel's metadata.
     pub fn copy(&mut self, message: &super::mcap_read::RawMessage) -> Result<(), WriteError> {
         let key = (message.channel.topic.as_str(), message.channel.schema_name.as_str());
         let channel = self.channel(key, || (*message.channel).clone())?;
-        self.write_message(channel, message.log_time, message.publish_time, &message.data)
+        let header = header(channel, message.sequence, message.log_time, message.publish_time);
+        self.write_message(&header, message.log_time, &message.data)
     }
 
     fn channel(&mut self, key: (&str, &str), info: impl FnOnce() -> ChannelInfo) -> Result<u16, WriteError> {
@@ -105,16 +110,15 @@ impl<W: Write + Seek> McapWriter<W> {
         } else {
             self.writer.add_schema(&info.schema_name, &info.schema_encoding, &info.schema_data)?
         };
-        let id = self.writer.add_channel(schema, &info.topic, &info.message_encoding, &BTreeMap::new())?;
+        let id = self.writer.add_channel(schema, &info.topic, &info.message_encoding, &info.metadata)?;
         self.channels.insert(owned, id);
         Ok(id)
     }
 
     fn write_message(
         &mut self,
-        channel_id: u16,
+        header: &MessageHeader,
         log_time: MonoTime,
-        publish_time: MonoTime,
         data: &[u8],
     ) -> Result<(), WriteError> {
         let began = *self.chunk_began.get_or_insert(log_time);
@@ -122,14 +126,7 @@ impl<W: Write + Seek> McapWriter<W> {
             self.flush()?;
             self.chunk_began = Some(log_time);
         }
-        let header = MessageHeader {
-            channel_id,
-            sequence: self.sequence,
-            log_time: unsigned(log_time),
-            publish_time: unsigned(publish_time),
-        };
-        self.sequence = self.sequence.wrapping_add(1);
-        Ok(self.writer.write_to_known_channel(&header, data)?)
+        Ok(self.writer.write_to_known_channel(header, data)?)
     }
 
     /// Ends the chunk and hands everything to the output.
@@ -142,6 +139,10 @@ impl<W: Write + Seek> McapWriter<W> {
         self.writer.finish()?;
         Ok(self.writer.into_inner())
     }
+}
+
+fn header(channel_id: u16, sequence: u32, log_time: MonoTime, publish_time: MonoTime) -> MessageHeader {
+    MessageHeader { channel_id, sequence, log_time: unsigned(log_time), publish_time: unsigned(publish_time) }
 }
 
 /// MCAP times are unsigned; before zero is zero.

@@ -11,8 +11,10 @@ pub struct PowerReading {
     pub voltage_v: Option<f64>,
     /// Charge of the weakest battery, percent.
     pub charge_percent: Option<f64>,
-    /// Whether a mains or external supply is there and off line.
+    /// Whether a mains or external supply is there and off line, or a UPS lives on its battery.
     pub mains_off: bool,
+    /// Whether the line or flag that tells of power going is set.
+    pub line_set: bool,
 }
 
 /// Reads sysfs below a root (`/sys`; tests give a folder that looks like it).
@@ -20,14 +22,15 @@ pub struct PowerReading {
 pub struct PowerReader {
     root: PathBuf,
     voltage_file: Option<PathBuf>,
+    going_file: Option<PathBuf>,
 }
 
 impl PowerReader {
     /// A reader below `root`. `voltage_file`, where given, is read for the supply voltage instead of
     /// everything found: a file that holds millivolts (hwmon `in*_input`) or microvolts
-    /// (power_supply `voltage_now`).
-    pub fn new(root: &Path, voltage_file: Option<PathBuf>) -> Self {
-        Self { root: root.to_owned(), voltage_file }
+    /// (power_supply `voltage_now`). `going_file`: a GPIO line's value or a UPS program's flag.
+    pub fn new(root: &Path, voltage_file: Option<PathBuf>, going_file: Option<PathBuf>) -> Self {
+        Self { root: root.to_owned(), voltage_file, going_file }
     }
 
     /// One reading; costs a few file reads of sysfs.
@@ -38,6 +41,7 @@ impl PowerReader {
         if let Some(file) = &self.voltage_file {
             reading.voltage_v = voltage(file);
         }
+        reading.line_set = self.going_file.as_deref().and_then(text).is_some_and(|value| value != "0");
         reading
     }
 
@@ -60,6 +64,9 @@ impl PowerReader {
             if kind == "Mains" || kind == "USB" {
                 reading.mains_off |= number(&supply.join("online")) == Some(0.0);
                 continue;
+            }
+            if kind == "UPS" {
+                reading.mains_off |= text(&supply.join("status")).as_deref() == Some("Discharging");
             }
             if number(&supply.join("present")) == Some(0.0) {
                 continue;
@@ -103,7 +110,8 @@ fn number(file: &Path) -> Option<f64> {
     text(file)?.parse().ok().filter(|figure: &f64| figure.is_finite())
 }
 
-/// Decides when power is going: a voltage under its threshold for a while, or mains off where asked.
+/// Decides when power is going: a voltage under its threshold for a while, mains off where asked, or at
+/// once where a line says so.
 #[derive(Clone, Debug)]
 pub struct PowerWatch {
     low_voltage_v: Option<f64>,
@@ -144,6 +152,9 @@ impl PowerWatch {
         } else {
             self.low_for = 0;
         }
+        if reading.line_set {
+            return PowerState::Going;
+        }
         if self.low_for >= LOW_READINGS { PowerState::Going } else { PowerState::Good }
     }
 }
@@ -161,7 +172,7 @@ mod tests {
     #[test]
     fn sysfs_is_read_and_absence_is_none() {
         let root = tempfile::tempdir().expect("a folder");
-        let reader = PowerReader::new(root.path(), None);
+        let reader = PowerReader::new(root.path(), None, None);
         assert_eq!(reader.read(), PowerReading::default());
 
         write(root.path(), "class/hwmon/hwmon0/temp1_input", "41500\n");
@@ -178,8 +189,30 @@ mod tests {
         assert!(reading.mains_off);
 
         write(root.path(), "class/hwmon/hwmon0/in1_input", "12100\n");
-        let named = PowerReader::new(root.path(), Some(root.path().join("class/hwmon/hwmon0/in1_input")));
+        let chip = root.path().join("class/hwmon/hwmon0/in1_input");
+        let named = PowerReader::new(root.path(), Some(chip), None);
         assert_eq!(named.read().voltage_v, Some(12.1));
+    }
+
+    #[test]
+    fn a_line_that_is_set_and_a_ups_on_battery_are_seen() {
+        let root = tempfile::tempdir().expect("a folder");
+        let flag = root.path().join("gpio17/value");
+        let reader = PowerReader::new(root.path(), None, Some(flag));
+        let mut watch = PowerWatch::new(None, true);
+        assert_eq!(watch.judge(&reader.read()), PowerState::Good, "no such file: no power going");
+        write(root.path(), "gpio17/value", "0\n");
+        assert_eq!(watch.judge(&reader.read()), PowerState::Good);
+        write(root.path(), "gpio17/value", "1\n");
+        assert_eq!(watch.judge(&reader.read()), PowerState::Going, "at once");
+        write(root.path(), "gpio17/value", "0\n");
+        assert_eq!(watch.judge(&reader.read()), PowerState::Good);
+
+        write(root.path(), "class/power_supply/ups0/type", "UPS\n");
+        write(root.path(), "class/power_supply/ups0/status", "Charging\n");
+        assert!(!reader.read().mains_off);
+        write(root.path(), "class/power_supply/ups0/status", "Discharging\n");
+        assert!(reader.read().mains_off);
     }
 
     #[test]

@@ -13,8 +13,14 @@ use std::time::Duration;
 use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use tempfile::TempDir;
+use windhover::io::capture::CaptureReader;
 use windhover::io::clock::HostClock;
+use windhover::msg::{Event, EventBody};
 use windhover::time::Span;
+
+/// Longest a test waits for anything: what a machine with all its processors taken needs many times over.
+/// Nothing is asserted of how long things take.
+const PATIENCE: Span = Span::from_ns(120_000_000_000);
 
 /// A serial line by a stable name: its near end is a link that can be taken away and put back.
 pub struct Line {
@@ -102,6 +108,16 @@ fn epoch(n: u32) -> String {
     rmc + &gga
 }
 
+/// Numbers of the frames of a recording; none where there is nothing to read yet.
+pub fn frames(recording: &Path) -> Vec<u32> {
+    let events = CaptureReader::open(recording).into_iter().flatten().filter_map(|item| item.event);
+    let number = |event: Event| match event.body {
+        EventBody::Frame(frame) => Some(frame.index),
+        _ => None,
+    };
+    events.filter_map(number).collect()
+}
+
 /// A flight computer's worth of files: configuration, lines, card, recorded camera.
 pub struct Bench {
     pub folder: TempDir,
@@ -110,7 +126,7 @@ pub struct Bench {
 impl Bench {
     pub fn new() -> Self {
         let bench = Self { folder: tempfile::tempdir().expect("a folder") };
-        bench.write_camera(600, 0.1);
+        bench.write_camera(6_000, 0.1);
         std::fs::create_dir(bench.path("card")).expect("created");
         bench.configure(|text| text);
         bench
@@ -152,6 +168,12 @@ impl Bench {
         let mut flights: Vec<PathBuf> = entries.map(|entry| entry.expect("an entry").path()).collect();
         flights.sort();
         flights
+    }
+
+    /// Numbers of the frames on the card in flight `number`, so far.
+    pub fn frames_of(&self, number: usize) -> Vec<u32> {
+        let flights = if self.path("card/FLIGHTS").is_dir() { self.flights() } else { Vec::new() };
+        flights.get(number).map_or_else(Vec::new, |flight| frames(flight))
     }
 
     /// Runs another command of the program to its end; what it wrote to standard output.
@@ -196,22 +218,31 @@ impl Daemon {
     }
 
     /// The first line after `skip` lines that holds all of `words`, and how many lines came before
-    /// the one after it; fails after `seconds`.
-    pub fn wait_from(&self, skip: usize, words: &[&str], seconds: f64) -> (String, usize) {
-        let limit = self.clock.now() + Span::from_s(seconds);
+    /// the one after it.
+    pub fn wait_from(&self, skip: usize, words: &[&str]) -> (String, usize) {
+        let limit = self.clock.now() + PATIENCE;
         loop {
             let log = self.log();
             let found = log.lines().enumerate().skip(skip).find(|(_, l)| words.iter().all(|w| l.contains(w)));
             if let Some((number, line)) = found {
                 return (line.to_owned(), number + 1);
             }
-            assert!(self.clock.now() < limit, "no line with {words:?} in {seconds} s; the log:\n{log}");
+            assert!(self.clock.now() < limit, "no line with {words:?}; the log:\n{log}");
             std::thread::sleep(Duration::from_millis(20));
         }
     }
 
-    pub fn wait(&self, words: &[&str], seconds: f64) -> (String, usize) {
-        self.wait_from(0, words, seconds)
+    pub fn wait(&self, words: &[&str]) -> (String, usize) {
+        self.wait_from(0, words)
+    }
+
+    /// Waits until `done` says so.
+    pub fn wait_until(&self, what: &str, mut done: impl FnMut() -> bool) {
+        let limit = self.clock.now() + PATIENCE;
+        while !done() {
+            assert!(self.clock.now() < limit, "not in time: {what}; the log:\n{}", self.log());
+            std::thread::sleep(Duration::from_millis(100));
+        }
     }
 
     pub fn signal(&self, signal: Signal) {
@@ -225,14 +256,14 @@ impl Daemon {
         self.child.wait().expect("a child");
     }
 
-    /// Waits for the end; how it ended and how long it took.
-    pub fn ended(mut self, seconds: f64) -> (ExitStatus, Span) {
-        let began = self.clock.now();
+    /// Waits for the end; how it ended.
+    pub fn ended(mut self) -> ExitStatus {
+        let limit = self.clock.now() + PATIENCE;
         loop {
             if let Some(status) = self.child.try_wait().expect("a child") {
-                return (status, self.clock.now() - began);
+                return status;
             }
-            assert!(self.clock.now() - began < Span::from_s(seconds), "still runs; the log:\n{}", self.log());
+            assert!(self.clock.now() < limit, "still runs; the log:\n{}", self.log());
             std::thread::sleep(Duration::from_millis(5));
         }
     }

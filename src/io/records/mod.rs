@@ -13,6 +13,14 @@ use std::borrow::Cow;
 
 use crate::time::MonoTime;
 
+/// Channel metadata key that says where a frame's number is: with value [`IN_SEQUENCE`] it is the
+/// message's sequence number. Frames that were not kept leave a gap then, and a replay numbers the rest
+/// as the flight did. Without it frames are counted as they come.
+pub const FRAME_NUMBER_KEY: &str = "windhover.frame_number";
+
+/// See [`FRAME_NUMBER_KEY`].
+pub const IN_SEQUENCE: &str = "sequence";
+
 /// One message to be kept or sent.
 #[derive(Clone, Debug)]
 pub struct Record {

@@ -39,6 +39,7 @@ impl Channels {
                 schema: record.schema.descriptor(),
                 message_encoding: "protobuf".into(),
                 backfill,
+                frame_numbers: record.topic == records::topic::CAMERA_IMAGE,
             })
         };
         Arc::clone(self.0.entry(key).or_insert_with(make))

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use mcap::records::Channel;
 
 use super::format;
+use crate::io::records::{FRAME_NUMBER_KEY, IN_SEQUENCE};
 
 /// Channel metadata key of records that are also queued for the ground station.
 pub const BACKFILL_KEY: &str = "windhover.backfill";
@@ -31,6 +32,8 @@ pub struct ChannelDef {
     pub message_encoding: String,
     /// Whether its records get sequence numbers and wait in the back-fill queue.
     pub backfill: bool,
+    /// Whether a message's sequence number is the number of its camera frame.
+    pub frame_numbers: bool,
 }
 
 impl ChannelDef {
@@ -43,6 +46,7 @@ impl ChannelDef {
             schema: Vec::new(),
             message_encoding: "json".into(),
             backfill: false,
+            frame_numbers: false,
         })
     }
 }
@@ -65,7 +69,8 @@ pub struct RawRecord {
     pub log_ns: u64,
     /// When it was true, host time, ns; `log_ns` where nothing else is known.
     pub publish_ns: u64,
-    /// Position in its stream; given by the store on back-fill channels.
+    /// Position in its stream; its number in the
+    /// run on back-fill channels, the frame's on those of frames.
     pub sequence: u32,
     /// The message.
     pub data: Arc<[u8]>,
@@ -103,8 +108,13 @@ impl Definitions {
         }
         let schema_id = self.schema_number(def);
         let id = self.channels.keys().next_back().map_or(1, |last| last + 1);
-        let metadata =
-            if def.backfill { BTreeMap::from([(BACKFILL_KEY.into(), "1".into())]) } else { BTreeMap::new() };
+        let mut metadata = BTreeMap::new();
+        if def.backfill {
+            metadata.insert(BACKFILL_KEY.into(), "1".into());
+        }
+        if def.frame_numbers {
+            metadata.insert(FRAME_NUMBER_KEY.into(), IN_SEQUENCE.into());
+        }
         let channel = Channel {
             id,
             schema_id,

@@ -22,6 +22,7 @@ fn channel(topic: &str) -> Arc<ChannelDef> {
         schema: vec![7; 600],
         message_encoding: "protobuf".into(),
         backfill: false,
+        frame_numbers: false,
     })
 }
 

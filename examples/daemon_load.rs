@@ -1,0 +1,240 @@
+//! What the daemon costs and how soon it answers, with raw frames at full size and pace.
+//!
+//! `make load`, or `cargo run --release --example daemon_load -- [--seconds S] [--dir DIR]`
+//!
+//! Simulates a flight once (raw grey, 1280×1024, 30 frames/s), plays it over and over into
+//! `windhover run` - frames from memory of the file system, serial lines over pseudo-terminals - with
+//! recording on, and prints exposure to estimate, processor time by task, memory and losses. At each
+//! repetition the receiver's time jumps back: the daemon tells that, and works on.
+
+use std::fs::{self, File};
+use std::io::Write;
+use std::os::fd::OwnedFd;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use clap::Parser;
+use rustix::process::{Pid, Signal, kill_process};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use windhover::app::replay::config_of;
+use windhover::io::capture::CaptureReader;
+use windhover::msg::EventBody;
+use windhover::time::Span;
+
+#[derive(Parser)]
+struct Args {
+    /// How long
+    #[arg(long, default_value_t = 300)]
+    seconds: u64,
+    /// Length of the flight that is repeated, seconds
+    #[arg(long, default_value_t = 20)]
+    flight_s: u64,
+    /// Where flight, frames, card and log go
+    #[arg(long, default_value = "target/load")]
+    dir: PathBuf,
+    /// The daemon
+    #[arg(long, default_value = "target/release/windhover")]
+    windhover: PathBuf,
+}
+
+type Result<T> = std::result::Result<T, Box<dyn std::error::Error>>;
+
+const FPS: f64 = 30.0;
+
+fn main() -> Result<()> {
+    let args = Args::parse();
+    fs::create_dir_all(&args.dir)?;
+    let dir = args.dir.canonicalize()?;
+    let flight = dir.join(format!("flight-{}.mcap", args.flight_s));
+    if !flight.exists() {
+        simulate(&args, &flight)?;
+    }
+    let bytes = unpack(&flight, &dir.join("camera"))?;
+    let card = dir.join("card");
+    let _ = fs::remove_dir_all(&card);
+    fs::create_dir(&card)?;
+    let (gps, compass) = (line()?, line()?);
+    let config = dir.join("windhover.toml");
+    fs::write(&config, configuration(&flight, &dir, &gps.1, &compass.1)?)?;
+
+    let log = dir.join("log");
+    let mut daemon = Command::new(&args.windhover)
+        .args(["run", "--config"])
+        .arg(&config)
+        .stdin(Stdio::null())
+        .stderr(File::create(&log)?)
+        .spawn()?;
+    let feeder = Feeder::start(bytes, args.flight_s, gps.0, compass.0);
+    let memory = watch(&mut daemon, args.seconds)?;
+    let tasks = tasks(daemon.id())?;
+    kill_process(Pid::from_raw(daemon.id().cast_signed()).ok_or("no process")?, Signal::TERM)?;
+    daemon.wait()?;
+    feeder.stop();
+    report(&fs::read_to_string(&log)?, args.seconds, &memory, &tasks)
+}
+
+fn simulate(args: &Args, flight: &Path) -> Result<()> {
+    let status = Command::new(&args.windhover)
+        .arg("simulate")
+        .arg(flight)
+        .args(["--lossless", "--fps", &FPS.to_string(), "--duration", &args.flight_s.to_string()])
+        .status()?;
+    status.success().then_some(()).ok_or_else(|| "the flight could not be simulated".into())
+}
+
+/// Bytes of a line, and when they came.
+type Bytes = Vec<(Span, bool, Vec<u8>)>;
+
+/// Puts the frames into a folder that the recorded camera plays; the bytes of both lines.
+fn unpack(flight: &Path, camera: &Path) -> Result<Bytes> {
+    fs::create_dir_all(camera)?;
+    let (mut list, mut bytes, mut first) = ("time_s,file\n".to_owned(), Vec::new(), None);
+    for event in CaptureReader::open(flight)?.filter_map(|item| item.event) {
+        let since = event.t_recv - *first.get_or_insert(event.t_recv);
+        match event.body {
+            EventBody::GnssBytes(data) => bytes.push((since, true, data)),
+            EventBody::CompassBytes(data) => bytes.push((since, false, data)),
+            EventBody::Frame(frame) => {
+                let name = format!("{:05}.pgm", frame.index);
+                let head = format!("P5\n{} {}\n255\n", frame.width, frame.height);
+                fs::write(camera.join(&name), [head.as_bytes(), &frame.data].concat())?;
+                list += &format!("{:.6},{name}\n", (since + (frame.t_exposure - event.t_recv)).s());
+            }
+            _ => {}
+        }
+    }
+    fs::write(camera.join("times.csv"), list)?;
+    Ok(bytes)
+}
+
+/// A pseudo-terminal: its far end, and the path of its near end.
+fn line() -> Result<(File, String)> {
+    let far: OwnedFd = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)?;
+    grantpt(&far)?;
+    unlockpt(&far)?;
+    let near = ptsname(&far, Vec::new())?.into_string()?;
+    Ok((File::from(far), near))
+}
+
+fn configuration(flight: &Path, dir: &Path, gps: &str, compass: &str) -> Result<String> {
+    let mut config = config_of(flight)?;
+    config.gps.device = gps.into();
+    config.compass.device = compass.into();
+    config.camera.device = format!("capture-loop:{}", dir.join("camera").display());
+    config.store.enabled = true;
+    config.store.path = dir.join("card").display().to_string();
+    config.store.require_mount = false;
+    Ok(config.to_toml()?)
+}
+
+/// Feeds both lines at the real pace, again and again.
+struct Feeder {
+    stop: Arc<AtomicBool>,
+    thread: JoinHandle<()>,
+}
+
+impl Feeder {
+    fn start(bytes: Bytes, flight_s: u64, mut gps: File, mut compass: File) -> Self {
+        let stop = Arc::new(AtomicBool::new(false));
+        let asked = Arc::clone(&stop);
+        let thread = std::thread::spawn(move || {
+            let began = Instant::now();
+            for round in 0.. {
+                for (since, is_gps, data) in &bytes {
+                    let due =
+                        Duration::from_secs(round * flight_s) + Duration::from_secs_f64(since.s().max(0.0));
+                    std::thread::sleep(due.saturating_sub(began.elapsed()));
+                    if asked.load(Ordering::Acquire) {
+                        return;
+                    }
+                    // Bytes for a line that nobody reads are lost, as on a real one.
+                    let _ = if *is_gps { &mut gps } else { &mut compass }.write_all(data);
+                }
+            }
+        });
+        Self { stop, thread }
+    }
+
+    fn stop(self) {
+        self.stop.store(true, Ordering::Release);
+        let _ = self.thread.join();
+    }
+}
+
+/// Resident memory in megabytes, once a second for so long.
+fn watch(daemon: &mut Child, seconds: u64) -> Result<Vec<f64>> {
+    let mut memory = Vec::new();
+    let began = Instant::now();
+    while began.elapsed() < Duration::from_secs(seconds) {
+        std::thread::sleep(Duration::from_secs(1));
+        if let Some(status) = daemon.try_wait()? {
+            return Err(format!("the daemon ended: {status}").into());
+        }
+        let status = fs::read_to_string(format!("/proc/{}/status", daemon.id()))?;
+        let resident = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+        let kb = resident.and_then(|text| text.trim().trim_end_matches(" kB").parse::<f64>().ok());
+        memory.extend(kb.map(|kb| kb * 1024.0 / 1e6));
+    }
+    Ok(memory)
+}
+
+/// Processor time of every thread, seconds.
+fn tasks(pid: u32) -> Result<Vec<(String, f64)>> {
+    let mut tasks = Vec::new();
+    for entry in fs::read_dir(format!("/proc/{pid}/task"))? {
+        let folder = entry?.path();
+        let name = fs::read_to_string(folder.join("comm"))?.trim().to_owned();
+        // Time on a processor, nanoseconds: the first field.
+        let schedule = fs::read_to_string(folder.join("schedstat"))?;
+        let ns: f64 = schedule.split_whitespace().next().unwrap_or("0").parse()?;
+        tasks.push((name, ns / 1e9));
+    }
+    tasks.sort_by(|a, b| b.1.total_cmp(&a.1));
+    Ok(tasks)
+}
+
+fn field<'a>(line: &'a str, name: &str) -> &'a str {
+    let found = line.split_whitespace().find_map(|word| word.strip_prefix(name)?.strip_prefix('='));
+    found.unwrap_or("none")
+}
+
+fn report(log: &str, seconds: u64, memory: &[f64], tasks: &[(String, f64)]) -> Result<()> {
+    let last = |event: &str| {
+        let words = format!("event={event}");
+        log.lines().rev().find(|line| line.split_whitespace().any(|word| word == words)).unwrap_or_default()
+    };
+    let (latencies, health) = (last("latencies"), last("health"));
+    println!(
+        "exposure to estimate, ms: p50 {}, p99 {}, max {} over {} frames",
+        field(latencies, "p50_ms"),
+        field(latencies, "p99_ms"),
+        field(latencies, "max_ms"),
+        field(latencies, "frames")
+    );
+    println!(
+        "dropped before the pipeline: {}; not recorded: {}",
+        field(health, "dropped"),
+        field(health, "card_dropped")
+    );
+    let all: f64 = tasks.iter().map(|task| task.1).sum();
+    println!("processor, share of one core: {:.1} %", all / seconds as f64 * 100.0);
+    for (name, used) in tasks.iter().filter(|task| task.1 > 0.0005 * seconds as f64) {
+        println!("  {name:15} {:5.1} %", used / seconds as f64 * 100.0);
+    }
+    let settled = memory.get(memory.len() / 4).copied().unwrap_or_default();
+    let end = memory.last().copied().unwrap_or_default();
+    let most = memory.iter().copied().fold(0.0, f64::max);
+    println!("resident, MB: {settled:.0} after a quarter, {end:.0} at the end, {most:.0} at most");
+    let load = fs::read_to_string("/proc/loadavg")?;
+    println!(
+        "load of the machine: {}on {} processors",
+        load.split(' ').take(3).map(|l| format!("{l} ")).collect::<String>(),
+        std::thread::available_parallelism()?
+    );
+    println!("last health: {health}");
+    Ok(())
+}
