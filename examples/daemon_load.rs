@@ -4,8 +4,8 @@
 //!
 //! Simulates a flight once (raw grey, 1280×1024, 30 frames/s), plays it over and over into
 //! `windhover run` - frames from memory of the file system, serial lines over pseudo-terminals - with
-//! recording on, and prints exposure to estimate, processor time by task, memory and losses. At each
-//! repetition the receiver's time jumps back: the daemon tells that, and works on.
+//! recording on, and prints exposure to estimate, processor time by task, memory and losses. The flight
+//! hovers over a parked vehicle, so that its end fits its beginning; only the receiver's time jumps back.
 
 use std::fs::{self, File};
 use std::io::Write;
@@ -31,7 +31,7 @@ struct Args {
     #[arg(long, default_value_t = 300)]
     seconds: u64,
     /// Length of the flight that is repeated, seconds
-    #[arg(long, default_value_t = 20)]
+    #[arg(long, default_value_t = 12)]
     flight_s: u64,
     /// Where flight, frames, card and log go
     #[arg(long, default_value = "target/load")]
@@ -81,7 +81,15 @@ fn simulate(args: &Args, flight: &Path) -> Result<()> {
     let status = Command::new(&args.windhover)
         .arg("simulate")
         .arg(flight)
-        .args(["--lossless", "--fps", &FPS.to_string(), "--duration", &args.flight_s.to_string()])
+        .args([
+            "--scenario",
+            "hover10",
+            "--lossless",
+            "--fps",
+            &FPS.to_string(),
+            "--duration",
+            &args.flight_s.to_string(),
+        ])
         .status()?;
     status.success().then_some(()).ok_or_else(|| "the flight could not be simulated".into())
 }
