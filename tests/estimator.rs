@@ -211,7 +211,7 @@ fn outages_are_survived() {
         let flight = fly(name, 45.0, 2, |_| {});
         let out = flight.outputs();
         let s = score(&estimates(&out), &flight.world, 6.0);
-        assert!(s.nees < 8.0 && s.coverage > 0.9, "{name}: {s:?}");
+        assert!(s.nees < 6.0 && s.coverage > 0.9, "{name}: {s:?}");
         let last = *estimates(&out).last().expect("frames");
         assert!(last.status != TrackStatus::Lost || name == "leave-and-return", "{name}: {last:?}");
         assert!(!out.iter().any(|o| matches!(o, EstimatorOutput::Reset { .. })), "{name}");

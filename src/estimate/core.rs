@@ -72,10 +72,7 @@ impl Core {
         let models = Models::new(config, site);
         let e = &config.estimator;
         let start = Learnt {
-            target_q: vec![
-                [e.target_speed_walk.powi(2), e.target_yaw_rate_walk.powi(2)];
-                config.target.len()
-            ],
+            target_q: vec![models.target_walks; config.target.len()],
             tilt_rate_q: e.tilt_rate_walk.powi(2),
             yaw_rate_q: e.yaw_rate_walk.powi(2),
             side_force_var: e.side_force_mps2.powi(2),

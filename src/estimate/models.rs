@@ -76,6 +76,8 @@ pub(super) struct Models {
     pub(super) heading_bias_var: f64,
     pub(super) tau: Taus,
     pub(super) walk: Walks,
+    /// Intensities of a target's speed and yaw rate walks as configured.
+    pub(super) target_walks: [f64; 2],
     pub(super) targets: Vec<TargetModels>,
     pub(super) marker_var_px2: f64,
     pub(super) feature_factor2: f64,
@@ -125,6 +127,7 @@ impl Models {
                 gps_delay_q: GPS_DELAY_WALK.powi(2),
                 slip_q: estimator.target_slip_walk.powi(2),
             },
+            target_walks: [estimator.target_speed_walk.powi(2), estimator.target_yaw_rate_walk.powi(2)],
             targets: config.target.iter().enumerate().map(|(i, t)| target_models(i, t)).collect(),
             marker_var_px2: estimator.marker_noise_px.powi(2),
             feature_factor2: estimator.feature_sigma_factor.powi(2),

@@ -15,6 +15,9 @@ use super::matrix::Grid;
 use super::models::Models;
 use super::state::{GRAVITY, State, at};
 
+/// Time out of sight after which what was learnt of a vehicle's driving fades, s.
+const FORGET_S: f64 = 1.0;
+
 /// Longest step, seconds: the linearisation holds over it.
 const MAX_STEP_S: f64 = 0.05;
 
@@ -188,10 +191,22 @@ impl State {
         add_walk(p, s + 2, s + 4, yaw_rate_q, dt);
     }
 
+    /// How target `i` walks at present: as it was learnt to while it is seen. What was learnt holds for
+    /// about a second of driving, and out of sight it may do again whatever is configured.
+    fn present_walks(&self, i: usize, models: &Models) -> [f64; 2] {
+        let away_s = (self.t - self.targets[i].last_seen).s();
+        let learnt = self.learnt.target_q[i];
+        if away_s < super::track::BLINK_S {
+            return learnt;
+        }
+        let forgotten = 1.0 - (-away_s / FORGET_S).exp();
+        std::array::from_fn(|k| learnt[k] + forgotten * (models.target_walks[k] - learnt[k]).max(0.0))
+    }
+
     /// Intensities of target `i`'s speed and yaw rate walks. A car turns only as it rolls: its yaw
     /// rate walk is bounded by what its tightest turn allows at the present speed.
     pub(super) fn target_intensity(&self, i: usize, models: &Models) -> (f64, f64) {
-        let [speed_q, yaw_rate_q] = self.learnt.target_q[i];
+        let [speed_q, yaw_rate_q] = self.present_walks(i, models);
         let Some(curvature) = models.targets[i].max_curvature else { return (speed_q, yaw_rate_q) };
         let s = self.target_at(i);
         let speed2 = self.targets[i].mean[3].powi(2) + self.cov.at(s + 3, s + 3);
