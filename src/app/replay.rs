@@ -95,7 +95,8 @@ pub fn replay(
     let (sender, receiver) = sync_channel(AHEAD);
     thread::scope(|scope| {
         scope.spawn(move || read_ahead(reader, want_rgb, &sender));
-        run.all(&receiver, out, watch)
+        // By value: a flight that cannot be written ends the reader too, which waits for room.
+        run.all(receiver, out, watch)
     })?;
     if run.summary.events == 0 {
         return Err(ReplayError::Nothing { path: recording.to_owned() });
@@ -167,7 +168,7 @@ impl<'a> Run<'a> {
 
     fn all(
         &mut self,
-        receiver: &Receiver<Ahead>,
+        receiver: Receiver<Ahead>,
         out: Option<&Path>,
         watch: &mut dyn FnMut(Step<'_>),
     ) -> Result<(), ReplayError> {

@@ -31,7 +31,7 @@ pub enum BoardError {
         wanted: usize,
     },
     /// A grid of another size.
-    #[error("the board seen has {columns}x{rows} inner corners")]
+    #[error("the board seen has {columns}x{rows} inner corners: is --board right?")]
     OtherSize {
         /// Columns seen.
         columns: usize,
@@ -151,7 +151,7 @@ fn judge(grid: &Grid, columns: usize, rows: usize, corners: usize) -> Result<(),
     }
     let larger = wide.max(tall) > columns.max(rows) || wide.min(tall) > columns.min(rows);
     if larger {
-        return Err(BoardError::OtherSize { columns: wide, rows: tall });
+        return Err(BoardError::OtherSize { columns: wide.max(tall), rows: wide.min(tall) });
     }
     Err(BoardError::Partial { columns: wide, rows: tall, found: grid.len(), wanted: columns * rows })
 }

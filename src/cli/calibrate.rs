@@ -3,10 +3,14 @@
 mod board;
 mod boresight;
 mod intrinsics;
+mod target;
 
 use super::CliResult;
 
 /// Calibrate the camera and how it is mounted.
+///
+/// First the lens, from photographs of a printed board; then, from a flight over a tag at rest, how
+/// camera and compass sit on the aircraft and how late each sensor is.
 #[derive(clap::Args, Debug)]
 pub(super) struct Args {
     #[command(subcommand)]
@@ -15,11 +19,8 @@ pub(super) struct Args {
 
 #[derive(clap::Subcommand, Debug)]
 enum What {
-    /// Draw a chessboard to print
     Board(board::Args),
-    /// The lens, from photographs of a printed board
     Intrinsics(intrinsics::Args),
-    /// How camera and compass are mounted and timed, from flights over markers at rest
     Boresight(boresight::Args),
 }
 

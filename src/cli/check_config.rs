@@ -7,6 +7,10 @@ use crate::app::config_file;
 
 /// Say what is wrong with a configuration, or print the effective one with every default filled in.
 #[derive(clap::Args, Debug)]
+#[command(after_help = "Example:
+  windhover check-config /etc/windhover/windhover.toml && echo it flies
+
+Errors name the line or the key; the exit code is then 78.")]
 pub(super) struct Args {
     /// Configuration file
     file: PathBuf,

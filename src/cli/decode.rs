@@ -14,6 +14,10 @@ use crate::time::{MonoTime, NS_PER_S, UtcTime};
 
 /// Decode a raw serial log: what the receiver or compass said, and what was refused.
 #[derive(clap::Args, Debug)]
+#[command(after_help = "Examples:
+  windhover decode gps gps.log
+  windhover decode compass compass.log --format tcm2 --json
+  stty -F /dev/ttyS0 38400 raw && timeout 10 cat /dev/ttyS0 > gps.log   # to record such a log")]
 pub(super) struct Args {
     #[command(subcommand)]
     device: Device,

@@ -12,6 +12,10 @@ use crate::msg::{GrayImage, MarkerDetection, MarkerId};
 
 /// Find markers in images.
 #[derive(clap::Args, Debug)]
+#[command(after_help = "Examples:
+  windhover detect photo.png
+  windhover detect --family 25h9 --min-px 12 --json *.jpg   # corners: top-left, top-right, bottom-right,
+                                                            # bottom-left of the tag as printed")]
 pub(super) struct Args {
     /// Images: PNG, JPEG, BMP, PNM or TIFF
     #[arg(required = true, value_name = "IMAGE")]

@@ -11,6 +11,9 @@ use crate::io::link::tls::KeyFiles;
 
 /// Receive from payloads: keep their flights, show them on a web page, feed other programs.
 #[derive(clap::Args, Debug)]
+#[command(after_help = "Example:
+  windhover keys authority && windhover keys payload bird && windhover keys station hut
+  windhover ground --certificate keys/station-hut.pem --connect 10.0.0.2:4433")]
 pub(super) struct Args {
     /// Payload to call; may be given several times
     #[arg(long, value_name = "HOST:PORT")]

@@ -25,7 +25,19 @@ use clap::{Parser, Subcommand};
 
 /// Watches a ground vehicle from a small helicopter: where it is, where it points, how it moves.
 #[derive(Parser, Debug)]
-#[command(name = "windhover", version, max_term_width = 100, propagate_version = true)]
+#[command(
+    name = "windhover",
+    version,
+    max_term_width = 100,
+    propagate_version = true,
+    after_help = "Begin without hardware:
+  windhover simulate flight.mcap --duration 20            a flight, with its truth beside it
+  windhover replay flight.mcap --out result.mcap          the pipeline that flies, over it
+  windhover report result.mcap --truth flight.truth.csv   a page about it: report.html
+
+`windhover COMMAND --help` tells of each command, with examples. Exit codes: 0 done, 1 failed,
+2 wrong usage, 78 bad configuration."
+)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -33,36 +45,22 @@ pub struct Cli {
 
 #[derive(Subcommand, Debug)]
 enum Command {
-    /// Calibrate the camera and how it is mounted
     Calibrate(calibrate::Args),
-    /// Run a recorded capture or flight through the pipeline that flies
     Replay(replay::Args),
-    /// Make a capture of recordings you already have
     Import(import::Args),
-    /// Write the outputs of a flight for other tools
     Export(export::Args),
     /// Write manual pages and shell completions
     #[command(hide = true)]
     Generate(generate::Args),
-    /// Run the daemon: read the sensors, estimate, record, send
     Run(run::Args),
-    /// Say what is wrong with a configuration, or print the effective one
     CheckConfig(check_config::Args),
-    /// Decode a raw serial log of a GPS receiver or a compass
     Decode(decode::Args),
-    /// Receive from payloads: keep their flights, show them on a web page, feed other programs
     Ground(ground::Args),
-    /// Make the certificates with which payloads and ground stations know each other
     Keys(keys::Args),
-    /// Predict how well the ground is located from here: the paper's error analysis
     Montecarlo(montecarlo::Args),
-    /// Write a page about a flight
     Report(report::Args),
-    /// See and tend the flights on the data card
     Store(store::Args),
-    /// Find markers in images
     Detect(detect::Args),
-    /// Make a capture of a simulated flight, with the truth beside it
     Simulate(simulate::Args),
 }
 

@@ -22,6 +22,10 @@ const SHIPPED: &str = include_str!("../../config/windhover.toml");
 /// Pose, pixel and error sigmas are the section `[montecarlo]` of the configuration; by default the
 /// paper's: the camera level, 10 m above ground, GPS 3 m (95 %), tilt 0.2 degrees.
 #[derive(clap::Args, Debug)]
+#[command(after_help = "Examples:
+  windhover montecarlo                                          # the paper's camera and condition
+  windhover montecarlo --config windhover.toml --samples 1000000 --plot predicted.svg
+  windhover montecarlo --flight flight.mcap --truth flight.truth.csv --plot compared.svg")]
 pub(super) struct Args {
     /// Configuration with camera, mount and `[montecarlo]`; the paper's camera where absent
     #[arg(long, value_name = "FILE")]

@@ -10,6 +10,10 @@ use crate::app::truth::Truth;
 /// Write a page about a flight: map, states with their bands, measurements, sensors, frames; errors
 /// where truth is given.
 #[derive(clap::Args, Debug)]
+#[command(after_help = "Examples:
+  windhover report flight.mcap                              # report.html, one file, for any browser
+  windhover report flight.mcap --truth flight.truth.csv --out flight.html
+  windhover report FLIGHTS/20261118T150405Z                 # a flight on the card")]
 pub(super) struct Args {
     /// Flight: a file, or a directory of segments
     flight: PathBuf,

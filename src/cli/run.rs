@@ -8,6 +8,9 @@ use crate::app::run::{self, RunError};
 /// Run the daemon: read the sensors, estimate, record, send, until SIGTERM. SIGHUP reads the
 /// configuration again.
 #[derive(clap::Args, Debug)]
+#[command(after_help = "Examples:
+  windhover check-config windhover.toml && windhover run --config windhover.toml
+  systemctl start windhover                    # as the package installs it")]
 pub(super) struct Args {
     /// Configuration file
     #[arg(long, value_name = "FILE", default_value = "/etc/windhover/windhover.toml")]

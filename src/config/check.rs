@@ -5,12 +5,14 @@ use super::{Config, GroundConfig, MarkerConfig, MarkerKind, TargetConfig, Target
 /// What is wrong with a configuration.
 #[derive(Clone, PartialEq, Debug, thiserror::Error)]
 pub enum ConfigError {
-    /// Not TOML, an unknown key, or a value of the wrong kind. The text carries line and column.
+    /// Not TOML, an unknown key, or a value of the wrong kind. The text carries the line.
     #[error("{0}")]
     Syntax(String),
     /// A value that cannot be.
-    #[error("{key}: {reason}")]
+    #[error("{}{key}: {reason}", line.map_or(String::new(), |n| format!("line {n}, ")))]
     Value {
+        /// Where it stands, from 1; `None` where a default or several places may be meant.
+        line: Option<usize>,
         /// The key, with its table.
         key: String,
         /// What is wrong and what to do.
@@ -22,13 +24,56 @@ pub enum ConfigError {
 }
 
 impl ConfigError {
-    pub(super) fn syntax(error: &toml::de::Error) -> Self {
-        Self::Syntax(error.to_string().trim_end().to_owned())
+    pub(super) fn syntax(error: &toml::de::Error, text: &str) -> Self {
+        let words = error.message().trim_end().replace('\n', "; ");
+        let Some(before) = error.span().and_then(|span| text.get(..span.start)) else {
+            return Self::Syntax(words);
+        };
+        let line = 1 + before.matches('\n').count();
+        // The line itself shows what is meant; a missing key has none of its own.
+        let written = text.lines().nth(line - 1).unwrap_or_default().trim();
+        if words.starts_with("missing field") || written.is_empty() {
+            Self::Syntax(format!("line {line}: {words}"))
+        } else {
+            Self::Syntax(format!("line {line}, `{written}`: {words}"))
+        }
+    }
+
+    /// The same with the line at which the key stands, where it stands at one only.
+    pub(super) fn at_line(self, text: &str) -> Self {
+        match self {
+            Self::Value { key, reason, line: None } => {
+                let line = line_of(&key, text);
+                Self::Value { key, reason, line }
+            }
+            other => other,
+        }
     }
 }
 
 pub(super) fn refuse(key: impl Into<String>, reason: impl Into<String>) -> Result<(), ConfigError> {
-    Err(ConfigError::Value { key: key.into(), reason: reason.into() })
+    Err(ConfigError::Value { line: None, key: key.into(), reason: reason.into() })
+}
+
+/// The line of a dotted key in a text of tables; `None` where no line or several would fit.
+fn line_of(key: &str, text: &str) -> Option<usize> {
+    let plain = key.split('[').next().unwrap_or(key);
+    let (table, name) = plain.rsplit_once('.').unwrap_or(("", plain));
+    let mut current = String::new();
+    let mut found = None;
+    for (k, line) in text.lines().enumerate() {
+        let line = line.trim();
+        if line.starts_with('[') {
+            let inside = line.trim_start_matches('[').split(']').next().unwrap_or_default();
+            current = inside.trim().to_owned();
+            continue;
+        }
+        let is_key = line.split_once('=').is_some_and(|(left, _)| left.trim() == name);
+        if current == table && is_key && found.replace(k + 1).is_some() {
+            return None;
+        }
+    }
+    found
 }
 
 /// A figure must be finite and within bounds.
@@ -135,6 +180,9 @@ impl Config {
     fn check_sensors(&self) -> Result<(), ConfigError> {
         baud("gps.baud", self.gps.baud)?;
         baud("compass.baud", self.compass.baud)?;
+        if self.gps.device == self.compass.device {
+            refuse("compass.device", format!("{} is the GPS receiver's line too", self.compass.device))?;
+        }
         for (key, device) in [
             ("gps.device", &self.gps.device),
             ("compass.device", &self.compass.device),

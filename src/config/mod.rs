@@ -75,10 +75,10 @@ pub struct Config {
 }
 
 impl Config {
-    /// Parses and checks a configuration. The error names line, column and key where it can.
+    /// Parses and checks a configuration. The error names line and key where it can.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
-        let config: Self = toml::from_str(text).map_err(|e| ConfigError::syntax(&e))?;
-        config.check()?;
+        let config: Self = toml::from_str(text).map_err(|e| ConfigError::syntax(&e, text))?;
+        config.check().map_err(|e| e.at_line(text))?;
         Ok(config)
     }
 

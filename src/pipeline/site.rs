@@ -43,10 +43,10 @@ impl SiteFinder {
     /// Takes a fix; the site when it is settled.
     pub(super) fn offer(&mut self, epoch: &GnssEpoch, config: &Config) -> Option<SettledSite> {
         let at = position(epoch)?;
+        let first = *self.first.get_or_insert(at);
         if let Some(warm) = self.warm.take().filter(|warm| agrees(warm, &at, config)) {
             return Some(self.settled(warm, None, config));
         }
-        let first = *self.first.get_or_insert(at);
         self.seen += 1;
         let geoid_m = epoch.geoid_m.unwrap_or(0.0);
         let elevation_msl_m = self
@@ -80,13 +80,17 @@ impl SiteFinder {
         let [lat_deg, lon_deg, height_m] = warm.datum;
         let datum = Geodetic { lat_deg, lon_deg, height_m };
         let frame = LocalFrame::new(datum);
-        let tile = self.tile_at(self.first.unwrap_or(datum));
+        let first = self.first.unwrap_or(datum);
+        let tile = self.tile_at(first);
         let ground_notice = (tile.is_none() && config.ground.terrain.is_some()).then(|| {
             "no terrain tile covers the first fix (it could not be read, or is of another place): level ground at that fix's height instead".to_owned()
         });
         let ground = match tile {
             Some(tile) => Ground::Terrain(Arc::new(Terrain::new(tile, &frame, warm.geoid_m))),
-            None => Ground::Flat { down_m: datum.height_m - warm.ground_height_m },
+            // Far from the datum its tangent plane stands above the curve of the Earth.
+            None => {
+                Ground::Flat { down_m: frame.ned(Geodetic { height_m: warm.ground_height_m, ..first }).z }
+            }
         };
         let site = Site { frame, ground, declination_rad: warm.declination_rad };
         SettledSite { site, warm, declination_notice, ground_notice }
@@ -147,4 +151,33 @@ fn position(epoch: &GnssEpoch) -> Option<Geodetic> {
 fn median(values: &mut [f64]) -> f64 {
     values.sort_by(f64::total_cmp);
     values[values.len() / 2]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn level_ground_lies_under_the_first_fix_however_far_the_datum_is() {
+        // Given a datum 10 km away, where the tangent plane stands 8 m above the ground.
+        let text = include_str!("../../config/windhover.toml");
+        let mut config = Config::parse(text).expect("the shipped configuration");
+        config.datum = Some(crate::config::Datum { lat_deg: 30.0, lon_deg: -85.5, height_m: 20.0 });
+        config.ground = crate::config::GroundConfig { elevation_msl_m: Some(33.0), ..config.ground };
+        let epoch = GnssEpoch {
+            fix: FixKind::ThreeD,
+            lat_deg: Some(30.07),
+            lon_deg: Some(-85.57),
+            alt_msl_m: Some(43.0),
+            geoid_m: Some(-27.0),
+            ..GnssEpoch::default()
+        };
+        // When the site is settled by the first fix.
+        let settled = SiteFinder::new(None).offer(&epoch, &config).expect("a declination is given");
+        // Then the ground under it is at its elevation.
+        let (frame, at) = (settled.site.frame, Geodetic { lat_deg: 30.07, lon_deg: -85.57, height_m: 6.0 });
+        let ned = frame.ned(at);
+        assert!((settled.site.ground.down_m(ned.x, ned.y) - ned.z).abs() < 1e-6);
+        assert!(ned.z > 20.0, "the plane of the datum would be {:.1} m off", ned.z - 14.0);
+    }
 }

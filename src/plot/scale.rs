@@ -13,15 +13,22 @@ pub struct Scale {
     pub to: f64,
 }
 
+/// Fewer values than this on an axis are hard to read between.
+const LEAST_TICKS: f64 = 3.0;
+
 impl Scale {
     /// Picture coordinate of a data value.
     pub fn at(&self, value: f64) -> f64 {
         self.from + (value - self.low) / (self.high - self.low) * (self.to - self.from)
     }
 
-    /// Round values (1, 2 or 5 times a power of ten apart) inside the scale, about `wanted` of them.
+    /// Round values (1, 2 or 5 times a power of ten apart) inside the scale, about `wanted` of them and
+    /// never so few that they tell no scale.
     pub fn ticks(&self, wanted: usize) -> Vec<f64> {
-        let step = round_step((self.high - self.low) / wanted.max(1) as f64);
+        let raw = (self.high - self.low) / wanted.max(1) as f64;
+        let inside = |step: f64| (self.high / step).floor() - (self.low / step).ceil() + 1.0;
+        let step = Some(round_step(raw)).filter(|s| inside(*s) >= LEAST_TICKS);
+        let step = step.unwrap_or_else(|| round_step(0.5 * raw));
         if !(step > 0.0) || !step.is_finite() {
             return Vec::new();
         }
@@ -75,6 +82,8 @@ mod tests {
     fn ticks_are_round_and_inside() {
         let scale = Scale { low: -0.37, high: 2.1, from: 0.0, to: 100.0 };
         assert_eq!(scale.ticks(5), vec![0.0, 0.5, 1.0, 1.5, 2.0]);
+        let low = Scale { low: -0.49, high: 0.47, from: 0.0, to: 100.0 };
+        assert_eq!(low.ticks(3), vec![-0.4, -0.2, 0.0, 0.2, 0.4]);
         assert_eq!(Scale::label(-0.5, 0.5), "\u{2212}0.5");
         assert_eq!(Scale::label(20.0, 20.0), "20");
     }

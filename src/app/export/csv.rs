@@ -97,7 +97,10 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
         rows += table.close(&mut exported.files)?;
     }
     if rows == 0 {
-        exported.files.clear();
+        // Tables of nothing would look like a flight in which nothing was seen.
+        for file in exported.files.drain(..) {
+            std::fs::remove_file(&file).map_err(|source| write_error(&file, source))?;
+        }
     }
     Ok(exported)
 }

@@ -54,6 +54,7 @@ pub struct Exported {
 /// Writes a flight's outputs into the directory `out`.
 pub fn export(flight: &Path, format: Format, out: &Path) -> Result<Exported, ExportError> {
     let reader = McapReader::open(flight)?;
+    let is_new = !out.exists();
     std::fs::create_dir_all(out).map_err(|source| write_error(out, source))?;
     let exported = match format {
         Format::Csv => csv::export(reader, out)?,
@@ -61,6 +62,9 @@ pub fn export(flight: &Path, format: Format, out: &Path) -> Result<Exported, Exp
         Format::Kml => kml::export(reader, out)?,
     };
     if exported.files.is_empty() {
+        if is_new {
+            std::fs::remove_dir(out).map_err(|source| write_error(out, source))?;
+        }
         return Err(ExportError::NoOutputs { path: flight.to_owned() });
     }
     Ok(exported)

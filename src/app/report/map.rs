@@ -16,7 +16,7 @@ const SCALE_95: f64 = 2.447_746_8;
 
 /// The section; nothing where no position is known.
 pub(super) fn section(context: &Context<'_>) -> Option<Section> {
-    let mut chart = Chart::new("", 820.0, 600.0).labels("east (m)", "north (m)").equal();
+    let mut chart = Chart::new("", 640.0, 500.0).labels("east (m)", "north (m)").equal();
     let flight = context.flight;
     let fixes = fixes(context);
     let own: Vec<[f64; 2]> = flight.ownship.iter().map(|o| [o.east_m, o.north_m]).collect();

@@ -25,14 +25,14 @@ nav{position:sticky;top:0;z-index:1;background:var(--ground);border-bottom:1px s
 nav div{max-width:1180px;margin:0 auto;padding:8px 20px;display:flex;gap:4px 18px;overflow-x:auto;white-space:nowrap}\
 nav a{color:var(--soft);text-decoration:none;font-size:.9rem}nav a:hover{color:var(--text)}\
 section{padding:26px 0 8px;scroll-margin-top:36px}section+section{border-top:1px solid var(--rule)}\
-.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(150px,1fr));gap:10px;margin:14px 0}\
+.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(140px,1fr));gap:10px;margin:14px 0}\
 .tile{background:var(--panel);border:1px solid var(--rule);border-radius:8px;padding:10px 14px}\
-.tile b{display:block;font-size:1.35rem;font-weight:650;line-height:1.25;font-variant-numeric:tabular-nums}\
+.tile b{display:block;white-space:nowrap;font-size:1.25rem;font-weight:650;line-height:1.25;font-variant-numeric:tabular-nums}\
 .tile span{color:var(--soft);font-size:.85rem}\
 .grid{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,470px),1fr));gap:14px}\
 figure{margin:0;background:var(--panel);border:1px solid var(--rule);border-radius:8px;padding:8px;overflow-x:auto}\
-figure svg{min-width:430px}figcaption{color:var(--soft);font-size:.85rem;padding:6px 4px 0}\
-.wide{margin-bottom:14px}.scroll{overflow-x:auto}\
+figure svg{min-width:310px}.wide svg{min-width:520px}figcaption{color:var(--soft);font-size:.85rem;padding:6px 4px 0}\
+.wide{margin-bottom:14px;max-width:900px}.scroll{overflow-x:auto}\
 table{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums;margin:8px 0 14px}\
 th,td{text-align:right;padding:4px 12px 4px 0;border-bottom:1px solid var(--grid);white-space:nowrap}\
 th{color:var(--soft);font-weight:500}th:first-child,td:first-child{text-align:left}td.words{text-align:left;white-space:normal}\

@@ -3,46 +3,94 @@
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
-use super::intrinsics::{Board, positive};
+use super::target::{Board, Target, TargetArgs};
+use crate::calibrate::TagGrid;
 use crate::cli::{CliError, CliResult};
+use crate::detect::tag_pattern;
 
-/// Draw a chessboard to print, as SVG in real size.
+/// Draw a calibration target to print, as SVG in real size: a chessboard, or a grid of tags.
+///
+/// Print at 100 %, measure with a ruler, and glue the sheet to something flat and stiff.
 #[derive(clap::Args, Debug)]
+#[command(after_help = "Examples:
+  windhover calibrate board --board 9x6 --square-m 0.025
+  windhover calibrate board --board 6x4 --tag-m 0.035 --gap-m 0.01 --out tags.svg")]
 pub(super) struct Args {
-    /// Inner corners: columns x rows (9x6 is a board of 10x7 squares)
-    #[arg(long, value_name = "CxR")]
-    board: Board,
-    /// Edge of one square, metres
-    #[arg(long, value_name = "METRES", value_parser = positive)]
-    square_m: f64,
+    #[command(flatten)]
+    target: TargetArgs,
     /// The drawing
     #[arg(long, value_name = "FILE.svg", default_value = "board.svg")]
     out: PathBuf,
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
-    std::fs::write(&args.out, draw(args.board, args.square_m))
+    let drawing = match args.target.target()? {
+        Target::Chessboard { board, square_m } => chessboard(board, square_m),
+        Target::Tags(grid) => tags(&grid)?,
+    };
+    std::fs::write(&args.out, drawing)
         .map_err(|e| CliError::failed(format!("cannot write {}: {e}", args.out.display())))?;
     println!("{}", args.out.display());
     Ok(())
 }
 
 /// The board with a white margin of one square, in millimetres.
-fn draw(board: Board, square_m: f64) -> String {
+fn chessboard(board: Board, square_m: f64) -> String {
     let (columns, rows) = (board.columns + 1, board.rows + 1);
     let edge = square_m * 1e3;
-    let (width, height) = ((columns + 2) as f64 * edge, (rows + 2) as f64 * edge);
     let mut squares = String::new();
     for k in (0..columns * rows).filter(|k| (k % columns + k / columns).is_multiple_of(2)) {
         let (x, y) = ((k % columns + 1) as f64 * edge, (k / columns + 1) as f64 * edge);
         let _ = write!(squares, "M{x} {y}h{edge}v{edge}h-{edge}z");
     }
+    let words =
+        format!("{}x{} inner corners, squares of {edge} mm: print at 100 %", board.columns, board.rows);
+    sheet(((columns + 2) as f64 * edge, (rows + 2) as f64 * edge), edge, &squares, &words)
+}
+
+/// The grid with a white margin of half a tag, in millimetres.
+fn tags(grid: &TagGrid) -> Result<String, CliError> {
+    let (edge, gap) = (grid.tag_m * 1e3, grid.gap_m * 1e3);
+    let first = tag_pattern(grid.family, 0);
+    let cell = edge / first.border as f64;
+    let ring = (first.side() - first.border) as f64 / 2.0 * cell;
+    if gap < 2.0 * ring {
+        return Err(CliError::usage(format!(
+            "tags of {} need {:.1} mm between them, so that each keeps its own edge: give --gap-m {:.4} or more",
+            grid.family.name(),
+            2.0 * ring,
+            2e-3 * ring
+        )));
+    }
+    let margin = edge / 2.0 + ring;
+    let mut cells = String::new();
+    for number in 0..grid.columns * grid.rows {
+        let pattern = tag_pattern(grid.family, number as u32);
+        let corner = |n: usize| margin + n as f64 * (edge + gap) - ring;
+        let (left, top) = (corner(number % grid.columns), corner(number / grid.columns));
+        let side = pattern.side();
+        for k in (0..side * side).filter(|k| !pattern.white(k % side, k / side)) {
+            let (x, y) = (left + (k % side) as f64 * cell, top + (k / side) as f64 * cell);
+            let _ = write!(cells, "M{x:.4} {y:.4}h{cell:.4}v{cell:.4}h-{cell:.4}z");
+        }
+    }
+    let span = |n: usize| 2.0 * margin + n as f64 * (edge + gap) - gap;
+    let words = format!(
+        "{}x{} tags of {}, edge {edge} mm, gap {gap} mm: print at 100 %",
+        grid.columns,
+        grid.rows,
+        grid.family.name()
+    );
+    Ok(sheet((span(grid.columns), span(grid.rows)), margin, &cells, &words))
+}
+
+/// A sheet of this size in millimetres with black squares and a line of text in its lower margin.
+fn sheet((width, height): (f64, f64), margin: f64, squares: &str, words: &str) -> String {
     format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}mm\" height=\"{height}mm\" viewBox=\"0 0 {width} {height}\">\
-         <rect width=\"{width}\" height=\"{height}\" fill=\"#fff\"/><path fill=\"#000\" d=\"{squares}\"/>\
-         <text x=\"{edge}\" y=\"{}\" font-family=\"sans-serif\" font-size=\"4\">{}x{} inner corners, squares of {edge} mm: print at 100 %</text></svg>\n",
-        height - 0.4 * edge,
-        board.columns,
-        board.rows
+         <rect width=\"{width}\" height=\"{height}\" fill=\"#fff\"/>\
+         <path fill=\"#000\" shape-rendering=\"crispEdges\" d=\"{squares}\"/>\
+         <text x=\"{margin}\" y=\"{}\" font-family=\"sans-serif\" font-size=\"4\">{words}</text></svg>\n",
+        height - 0.4 * margin
     )
 }

@@ -19,6 +19,11 @@ use crate::msg::MarkerId;
 /// Flights must hold what the pipeline saw: replay a bare capture first. Markers are those of static
 /// targets of the configuration, or all where no target is static. Uncertainties are one sigma.
 #[derive(clap::Args, Debug)]
+#[command(after_help = "Examples:
+  windhover calibrate boresight flight.mcap
+  windhover calibrate boresight a.mcap b.mcap --surveyed 7:30.069604785,-85.575391587,6.0
+
+What the flights did not tell is marked so, with what to fly to tell it.")]
 pub(super) struct Args {
     /// Flights: files, or directories of segments
     #[arg(required = true, value_name = "FLIGHT")]

@@ -1,11 +1,11 @@
 //! `windhover calibrate intrinsics`
 
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 
 use nalgebra::Vector2;
 use serde_json::json;
 
+use super::target::{Board, Target, TargetArgs, positive};
 use crate::calibrate::intrinsics::{Intrinsics, PARAMETERS, Wanted, calibrate};
 use crate::calibrate::{
     PlaneView, WINDOW_PX, coverage_advice, coverage_svg, find_corners, per_view_svg, residuals_svg,
@@ -14,22 +14,24 @@ use crate::cli::{CliError, CliResult};
 use crate::msg::GrayImage;
 use crate::plot;
 
-/// Calibrate the lens from photographs of a printed chessboard.
+/// Calibrate the lens from photographs of a printed chessboard or grid of tags.
 ///
 /// Corners are found without help, whichever way the board is turned. Photographs that cannot be
 /// used are named with the reason. Uncertainties are one sigma (MATLAB's toolbox prints three).
+/// At the end stands the block for the configuration. Take 15 to 30 photographs, the board tilted
+/// by 20 to 45 degrees in different directions and near every edge of the image.
 #[derive(clap::Args, Debug)]
+#[command(after_help = "Examples:
+  windhover calibrate intrinsics photos/*.png --board 9x6 --square-m 0.025 --plots plots
+  windhover calibrate intrinsics photos/*.png --board 6x4 --tag-m 0.035 --gap-m 0.01
+  windhover calibrate intrinsics photos/*.png --board 9x6 --square-m 0.025 --json")]
 pub(super) struct Args {
     /// Photographs of the board, all of the same size, taken with the same focus
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
-    /// Inner corners of the board: columns x rows (a board of 10x7 squares has 9x6)
-    #[arg(long, value_name = "CxR")]
-    board: Board,
-    /// Edge of one square, metres
-    #[arg(long, value_name = "METRES", value_parser = positive)]
-    square_m: f64,
-    /// Half the window in which a corner is placed, pixels; never more than half-way to the next
+    #[command(flatten)]
+    target: TargetArgs,
+    /// Half the window in which a chessboard's corner is placed, pixels; never more than half-way to the next
     /// corner. The default is what OpenCV's calibration uses; smaller suits small or slanted squares
     #[arg(long, value_name = "PX", value_parser = positive, default_value_t = WINDOW_PX)]
     window: f64,
@@ -45,32 +47,6 @@ pub(super) struct Args {
     /// One JSON object on standard output
     #[arg(long)]
     json: bool,
-}
-
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Board {
-    pub(super) columns: usize,
-    pub(super) rows: usize,
-}
-
-impl FromStr for Board {
-    type Err = String;
-    fn from_str(text: &str) -> Result<Self, String> {
-        let (columns, rows) = text.split_once(['x', 'X']).ok_or("write it as 9x6")?;
-        let count = |t: &str| t.trim().parse().map_err(|_| format!("{t:?} is not a number; write it as 9x6"));
-        let board = Self { columns: count(columns)?, rows: count(rows)? };
-        let fits = |n: usize| (3..=200).contains(&n);
-        if fits(board.columns) && fits(board.rows) {
-            Ok(board)
-        } else {
-            Err("a board has 3 to 200 inner corners each way".into())
-        }
-    }
-}
-
-pub(super) fn positive(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| format!("{text:?} is not a number"))?;
-    if value > 0.0 && value.is_finite() { Ok(value) } else { Err("must be above zero".into()) }
 }
 
 /// A photograph and what was found on it.
@@ -104,6 +80,7 @@ pub(super) fn run(args: &Args) -> CliResult {
 }
 
 fn look_at(args: &Args) -> Result<(Vec<Photo>, (usize, usize)), CliError> {
+    let target = args.target.target()?;
     let mut size = None;
     let mut photos = Vec::with_capacity(args.images.len());
     for path in &args.images {
@@ -117,7 +94,7 @@ fn look_at(args: &Args) -> Result<(Vec<Photo>, (usize, usize)), CliError> {
         };
         let first = *size.get_or_insert((image.width, image.height));
         let found = if first == (image.width, image.height) {
-            corners_of(&image, args)
+            corners_of(&image, target, args.window)
         } else {
             Err(format!(
                 "is {}x{} pixels; the first image is {}x{}",
@@ -145,10 +122,13 @@ fn read(path: &Path) -> Result<GrayImage, String> {
     GrayImage::from_vec(width, height, image.into_raw()).ok_or_else(|| "has an impossible size".into())
 }
 
-fn corners_of(image: &GrayImage, args: &Args) -> Result<PlaneView, String> {
-    let Board { columns, rows } = args.board;
-    let corners = find_corners(image.view(), columns, rows, args.window).map_err(|e| e.to_string())?;
-    let at = |k: usize| Vector2::new((k % columns) as f64, (k / columns) as f64) * args.square_m;
+fn corners_of(image: &GrayImage, target: Target, window_px: f64) -> Result<PlaneView, String> {
+    let (Board { columns, rows }, square_m) = match target {
+        Target::Chessboard { board, square_m } => (board, square_m),
+        Target::Tags(grid) => return grid.find(image.view()).map_err(|e| e.to_string()),
+    };
+    let corners = find_corners(image.view(), columns, rows, window_px).map_err(|e| e.to_string())?;
+    let at = |k: usize| Vector2::new((k % columns) as f64, (k / columns) as f64) * square_m;
     let (plane_m, px) = corners.iter().enumerate().filter_map(|(k, c)| Some((at(k), (*c)?))).unzip();
     Ok(PlaneView { plane_m, px })
 }

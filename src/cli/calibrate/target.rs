@@ -1,0 +1,91 @@
+//! What was photographed: a chessboard or a grid of tags, as arguments.
+
+use std::str::FromStr;
+
+use crate::calibrate::TagGrid;
+use crate::cli::CliError;
+use crate::config::TagFamily;
+
+/// The calibration target.
+#[derive(clap::Args, Clone, Copy, Debug)]
+pub(super) struct TargetArgs {
+    /// Inner corners of a chessboard, columns x rows (10x7 squares have 9x6); with --tag-m, tags
+    #[arg(long, value_name = "CxR")]
+    board: Board,
+    /// A chessboard: edge of one square, metres
+    #[arg(long, value_name = "METRES", value_parser = positive, required_unless_present = "tag_m")]
+    square_m: Option<f64>,
+    /// A grid of tags numbered from 0 row by row: edge of a tag's black square, metres
+    #[arg(long, value_name = "METRES", value_parser = positive, conflicts_with = "square_m", requires = "gap_m")]
+    tag_m: Option<f64>,
+    /// White between one tag's black square and the next one's, metres
+    #[arg(long, value_name = "METRES", value_parser = positive, requires = "tag_m")]
+    gap_m: Option<f64>,
+    /// Family of the tags
+    #[arg(long, value_name = "FAMILY", default_value = "36h11", value_parser = family, requires = "tag_m")]
+    family: TagFamily,
+}
+
+/// The same, sorted out.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Target {
+    /// A chessboard.
+    Chessboard {
+        /// Its inner corners.
+        board: Board,
+        /// Edge of a square, metres.
+        square_m: f64,
+    },
+    /// A grid of tags.
+    Tags(TagGrid),
+}
+
+impl TargetArgs {
+    pub(super) fn target(&self) -> Result<Target, CliError> {
+        let Board { columns, rows } = self.board;
+        match (self.square_m, self.tag_m, self.gap_m) {
+            (Some(square_m), None, _) => Ok(Target::Chessboard { board: self.board, square_m }),
+            (None, Some(tag_m), Some(gap_m)) => {
+                if columns * rows > self.family.codes() {
+                    let (name, most) = (self.family.name(), self.family.codes());
+                    return Err(CliError::usage(format!("{columns}x{rows} tags: {name} has {most} only")));
+                }
+                Ok(Target::Tags(TagGrid { family: self.family, columns, rows, tag_m, gap_m }))
+            }
+            _ => Err(CliError::usage("give --square-m for a chessboard, or --tag-m and --gap-m for tags")),
+        }
+    }
+}
+
+/// Columns and rows.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Board {
+    pub(super) columns: usize,
+    pub(super) rows: usize,
+}
+
+impl FromStr for Board {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (columns, rows) = text.split_once(['x', 'X']).ok_or("write it as 9x6")?;
+        let count = |t: &str| t.trim().parse().map_err(|_| format!("{t:?} is not a number; write it as 9x6"));
+        let board = Self { columns: count(columns)?, rows: count(rows)? };
+        let fits = |n: usize| (3..=200).contains(&n);
+        if fits(board.columns) && fits(board.rows) {
+            Ok(board)
+        } else {
+            Err("a board has 3 to 200 inner corners, or tags, each way".into())
+        }
+    }
+}
+
+pub(super) fn positive(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| format!("{text:?} is not a number"))?;
+    if value > 0.0 && value.is_finite() { Ok(value) } else { Err("must be above zero".into()) }
+}
+
+fn family(name: &str) -> Result<TagFamily, String> {
+    let known = || TagFamily::ALL.map(TagFamily::name).join(", ");
+    let found = TagFamily::ALL.into_iter().find(|f| f.name() == name);
+    found.ok_or_else(|| format!("no such family; there are {}", known()))
+}
