@@ -127,7 +127,7 @@ fn values_that_cannot_be_are_refused_with_line_and_key() {
     for (from, to, key) in cases {
         assert!(shipped.contains(from), "{from}");
         let text = shipped.replacen(from, to, 1);
-        let line = 1 + text.lines().position(|l| l.trim_start().starts_with(to)).expect("it stands there");
+        let line = 1 + shipped.lines().position(|l| l.starts_with(from)).expect("it stands there");
         std::fs::write(dir.path().join("c.toml"), &text).expect("writable");
         let run = windhover(&["check-config", "c.toml"], dir.path());
         assert_eq!(run.status.code(), Some(78), "{to}");

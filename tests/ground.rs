@@ -130,9 +130,10 @@ fn on_a_slope(name: &str, runs: u64) -> [[f64; 4]; 2] {
 
 #[test]
 fn terrain_keeps_a_vehicle_on_a_slope_accurate() {
-    let [terrain, level] = on_a_slope("follow", 2);
+    let [terrain, level] = on_a_slope("follow", 4);
     println!("terrain {terrain:?}, level {level:?}");
-    assert!(terrain[0] < level[0] && terrain[2] < 0.8 * level[2], "{terrain:?} {level:?}");
+    assert!(terrain[0] < level[0] && terrain[1] < 0.9 * level[1], "{terrain:?} {level:?}");
+    assert!(terrain[3] < level[3], "{terrain:?} {level:?}");
     assert!(terrain[3] < 4.5, "the covariances stay honest: {terrain:?}");
 }
 
@@ -145,7 +146,7 @@ fn slope_table() {
         println!(
             "{name}: position m, heading deg, speed m/s, NEES: terrain {terrain:.3?}, level {level:.3?}"
         );
-        assert!(terrain[2] < level[2]);
+        assert!(terrain[1] < level[1] && terrain[3] < level[3]);
     }
 }
 

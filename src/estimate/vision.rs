@@ -72,9 +72,11 @@ impl Core {
         let count = markers.iter().filter(mine).count();
         let t = self.state.t;
         let target = &self.state.targets[index];
-        let away = target.held && t - target.last_seen > self.lost_after;
+        // A marker at rest is where it was, however long nobody looked.
+        let rests = self.models.targets[index].model == TargetModel::Static;
+        let lost_after = (!rests).then_some(self.lost_after);
+        let away = target.held && lost_after.is_some_and(|limit| t - target.last_seen > limit);
         if count == 0 {
-            let lost_after = self.lost_after;
             self.state.targets[index].unseen(t, lost_after);
             return;
         }
@@ -369,14 +371,15 @@ fn next_feature(state: &State, models: &Models, tracks: &[FeatureTrack]) -> Opti
 }
 
 impl Target {
-    /// What became of a track in a frame that does not show it.
-    fn unseen(&mut self, t: crate::time::MonoTime, lost_after: crate::time::Span) {
+    /// What became of a track in a frame that does not show it; without `lost_after` it is never lost.
+    fn unseen(&mut self, t: crate::time::MonoTime, lost_after: Option<crate::time::Span>) {
         if !self.held {
             self.status = TrackStatus::Lost;
             return;
         }
         let away = t - self.last_seen;
-        if away > lost_after || (self.status == TrackStatus::Acquiring && away.s() > super::track::DOUBTFUL_S)
+        if lost_after.is_some_and(|limit| away > limit)
+            || (self.status == TrackStatus::Acquiring && away.s() > super::track::DOUBTFUL_S)
         {
             self.status = TrackStatus::Lost;
         } else if away.s() > super::track::BLINK_S && self.status == TrackStatus::Tracking {
