@@ -2,10 +2,11 @@
 
 use std::path::Path;
 use std::process::Command;
+use std::sync::LazyLock;
 
 use nalgebra::{Rotation3, Vector2, Vector3};
 use windhover::config::TagFamily;
-use windhover::detect::tag_pattern;
+use windhover::detect::{TagPattern, tag_pattern};
 use windhover::geo::{CameraModel, ned_from_body_321};
 
 const DOC: &str = include_str!("../docs/calibration.md");
@@ -73,6 +74,9 @@ fn chessboard(at: Vector2<f64>) -> Option<bool> {
     Some(inside && (c.floor() + r.floor()) as i64 % 2 == 0)
 }
 
+static PATTERNS: LazyLock<Vec<TagPattern>> =
+    LazyLock::new(|| (0..24).map(|id| tag_pattern(TagFamily::Tag36h11, id)).collect());
+
 /// 6 x 4 tags of 30 mm, 10 mm between them, the first one's corner at the origin.
 fn tags(at: Vector2<f64>) -> Option<bool> {
     let (c, r) = ((at.x / 0.04).floor(), (at.y / 0.04).floor());
@@ -82,7 +86,7 @@ fn tags(at: Vector2<f64>) -> Option<bool> {
     if !(0.0..6.0).contains(&c) || !(0.0..4.0).contains(&r) {
         return Some(false);
     }
-    let pattern = tag_pattern(TagFamily::Tag36h11, (r * 6.0 + c) as u32);
+    let pattern = &PATTERNS[(r * 6.0 + c) as usize];
     let cell = (at - Vector2::new(c, r) * 0.04) * (pattern.border as f64 / 0.03);
     let side = pattern.border as f64;
     let on_border = cell.x < side && cell.y < side;

@@ -112,16 +112,21 @@ fn misfit_px(view: &PlaneView) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::LazyLock;
+
     use nalgebra::Vector3;
 
     use super::*;
     use crate::calibrate::intrinsics::{Wanted, calibrate};
-    use crate::detect::tag_pattern;
+    use crate::detect::{TagPattern, tag_pattern};
     use crate::geo::{CameraModel, ned_from_body_321};
     use crate::msg::GrayImage;
 
     const GRID: TagGrid =
         TagGrid { family: TagFamily::Tag36h11, columns: 5, rows: 4, tag_m: 0.04, gap_m: 0.012 };
+
+    static PATTERNS: LazyLock<Vec<TagPattern>> =
+        LazyLock::new(|| (0..20).map(|id| tag_pattern(GRID.family, id)).collect());
 
     fn camera() -> CameraModel {
         let distortion = [-0.2, 0.05, 0.0005, -0.0005, 0.0];
@@ -136,7 +141,7 @@ mod tests {
             return false;
         }
         let row = if from_below { GRID.rows - 1 - r as usize } else { r as usize };
-        let pattern = tag_pattern(GRID.family, (row * GRID.columns + c as usize) as u32);
+        let pattern = &PATTERNS[row * GRID.columns + c as usize];
         let inside = (at - Vector2::new(c, r) * pitch) / GRID.tag_m * pattern.border as f64;
         let pad = (pattern.side() - pattern.border) as f64 / 2.0;
         let cell = inside.add_scalar(pad);
