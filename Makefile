@@ -5,11 +5,12 @@ CARGO ?= cargo
 VENV  ?= target/venv
 DEMO  ?= demo
 
-.PHONY: help setup setup-python build demo test test-python check lint docs bench load clean deb hil hil-long
+.PHONY: help setup setup-python build demo test test-python test-web check lint docs bench load clean deb hil hil-long
 
 help:
 	@echo "make demo     build, simulate a flight, replay it, compare with the truth, write a report page"
 	@echo "make test     every test"
+	@echo "make test-web the station's page in headless Chromium (half a minute)"
 	@echo "make check    format, lints, documentation, shipped configurations, licences"
 	@echo "make bench    the benchmarks under benches/"
 	@echo "make load     five minutes of raw frames at full pace: latency, processor time, memory, losses"
@@ -41,6 +42,12 @@ test: setup-python
 test-python: setup-python
 	$(CARGO) build --locked
 	$(VENV)/bin/python -m unittest discover -s tests/python -p 'test_*.py' -v
+
+# The station's page in headless Chromium, fed by a running payload; pictures in target/web.
+test-web: setup-python
+	@sh tests/setup/packages.sh chromium
+	$(CARGO) build --locked
+	$(VENV)/bin/python -m unittest discover -s tests/web -p 'test_*.py' -v
 
 check: lint docs
 	for file in config/*.toml; do target/debug/windhover check-config $$file > /dev/null || exit 1; done

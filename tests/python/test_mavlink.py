@@ -1,0 +1,104 @@
+"""What a running daemon sends as MAVLink, received by pymavlink: the messages, signing, wrong keys."""
+
+import math
+import os
+import pathlib
+import tempfile
+import time
+import unittest
+
+os.environ["MAVLINK20"] = "1"
+
+from pymavlink import mavutil  # noqa: E402
+from pymavlink.dialects.v20 import common  # noqa: E402
+
+import rig  # noqa: E402
+
+KEY = bytes(range(32))
+KINDS = {"HEARTBEAT", "GLOBAL_POSITION_INT", "ATTITUDE", "FOLLOW_TARGET"}
+
+
+def receiver(port, key=None):
+    link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=255, dialect="common")
+    link.robust_parsing = True
+    if key is not None:
+        # The simulated flight's time, not today's, is what signatures carry.
+        link.setup_signing(key, sign_outgoing=True, initial_timestamp=1)
+    return link
+
+
+def receive(link, kinds, seconds):
+    """The latest message of each kind, until all are there or the time is over; and what was no message."""
+    latest, bad, end = {}, 0, time.monotonic() + seconds
+    while time.monotonic() < end and set(latest) < kinds:
+        message = link.recv_match(blocking=True, timeout=1)
+        if message is None:
+            continue
+        if message.get_type() == "BAD_DATA":
+            bad += 1
+        else:
+            latest[message.get_type()] = message
+    return latest, bad
+
+
+class Mavlink(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.flight = rig.Flight()
+
+    @classmethod
+    def tearDownClass(cls):
+        cls.flight.close()
+
+    def fly(self, port, more=""):
+        daemon = rig.Daemon(
+            self.flight, f'[mavlink]\nenabled = true\nsend_to = ["127.0.0.1:{port}"]\nsystem_id = 77\n{more}'
+        )
+        self.addCleanup(daemon.stop)
+        return daemon
+
+    def test_the_vehicle_appears_under_its_own_system_id(self):
+        port = rig.free_port()
+        link = receiver(port)
+        self.addCleanup(link.close)
+        self.fly(port)
+        latest, bad = receive(link, KINDS, 90)
+        self.assertEqual((set(latest), bad), (KINDS, 0))
+        for message in latest.values():
+            self.assertEqual((message.get_srcSystem(), message.get_srcComponent()), (77, 1))
+            self.assertEqual(message.get_msgbuf()[0], 0xFD, "MAVLink 2")
+        self.assertEqual(latest["HEARTBEAT"].type, common.MAV_TYPE_GROUND_ROVER)
+        # Position, follow target and attitude tell the same vehicle.
+        position, follow, attitude = (latest[k] for k in ("GLOBAL_POSITION_INT", "FOLLOW_TARGET", "ATTITUDE"))
+        for a, b in ((position.lat, follow.lat), (position.lon, follow.lon)):
+            self.assertLess(abs(a - b), 5_000, "within 50 m, at different times")
+        self.assertAlmostEqual(position.alt / 1e3, 33.0, places=2, msg="level ground, above mean sea level")
+        self.assertAlmostEqual(follow.alt, 33.0, places=2)
+        self.assertTrue(follow.est_capabilities & 0b11 == 0b11, "position and velocity")
+        self.assertLess(math.hypot(position.vx, position.vy), 2_000, "no faster than 20 m/s")
+        self.assertTrue(-math.pi <= attitude.yaw <= math.pi)
+
+    def test_signed_messages_are_believed_with_the_key_only(self):
+        with tempfile.TemporaryDirectory() as folder:
+            secret = pathlib.Path(folder) / "mavlink.hex"
+            secret.write_text(KEY.hex() + "\n")
+            secret.chmod(0o600)
+            port = rig.free_port()
+            link = receiver(port, KEY)
+            self.addCleanup(link.close)
+            self.fly(port, f'signing_key = "{secret}"\n')
+            latest, bad = receive(link, KINDS, 90)
+            self.assertEqual((set(latest), bad), (KINDS, 0))
+            for message in latest.values():
+                self.assertTrue(message.get_signed())
+            # The very bytes that one receiver takes, another with a wrong key refuses.
+            for key, taken in ((KEY, True), (bytes(32), False)):
+                parser = common.MAVLink(None)
+                parser.robust_parsing = True
+                parser.signing.secret_key = key
+                kinds = {m.get_type() for m in parser.parse_buffer(bytes(latest["HEARTBEAT"].get_msgbuf())) or []}
+                self.assertEqual(kinds, {"HEARTBEAT"} if taken else {"BAD_DATA"})
+
+
+if __name__ == "__main__":
+    unittest.main()

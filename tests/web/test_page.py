@@ -1,0 +1,110 @@
+"""The station's page in headless Chromium, fed by a running payload: it loads, moves, survives a cut.
+
+`make test-web` runs it and leaves its pictures in target/web.
+"""
+
+import pathlib
+import socket
+import subprocess
+import sys
+import tempfile
+import unittest
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "tests/python"))
+
+import rig  # noqa: E402
+from browser import Browser  # noqa: E402
+from relay import Relay  # noqa: E402
+
+PICTURES = ROOT / "target/web"
+
+
+class Page(unittest.TestCase):
+    def setUp(self):
+        # Given: a payload that flies, a radio that can be cut, a station with its page.
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        at = pathlib.Path(folder.name)
+        keys = at / "keys"
+        rig.windhover("keys", "authority", "--dir", keys)
+        rig.windhover("keys", "payload", "alpha", "--dir", keys)
+        rig.windhover("keys", "station", "base", "--dir", keys)
+        flight = rig.Flight()
+        self.addCleanup(flight.close)
+        port, web = rig.free_port(), rig.free_port(socket.SOCK_STREAM)
+        daemon = rig.Daemon(
+            flight,
+            f'[link]\nenabled = true\nlisten = "127.0.0.1:{port}"\nauthority = "{keys}/authority.pem"\n'
+            f'certificate = "{keys}/payload-alpha.pem"\nkey = "{keys}/payload-alpha.key"\n',
+        )
+        self.addCleanup(daemon.stop)
+        self.relay = Relay(port)
+        self.addCleanup(self.relay.stop)
+        station = subprocess.Popen(
+            [
+                rig.BINARY, "ground", "--connect", f"127.0.0.1:{self.relay.port}",
+                "--authority", keys / "authority.pem", "--certificate", keys / "station-base.pem",
+                "--out", at / "ground", "--web", f"127.0.0.1:{web}",
+            ],
+            stdout=subprocess.DEVNULL,
+        )
+        self.addCleanup(station.wait)
+        self.addCleanup(station.terminate)
+        self.browser = Browser()
+        self.addCleanup(self.browser.close)
+        self.url = f"http://127.0.0.1:{web}/"
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        rig.until(lambda: self.listens(web), 30, lambda: "the station serves no page")
+
+    @staticmethod
+    def listens(port):
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", port)) == 0
+
+    def becomes(self, name, test, seconds=60):
+        say = lambda: f"{name} is {self.browser.text(name)!r}; {self.browser.errors}"  # noqa: E731
+        return rig.until(lambda: test(self.browser.text(name)) and self.browser.text(name), seconds, say)
+
+    def test_it_loads_moves_and_survives_a_cut(self):
+        browser = self.browser
+        browser.size(1280, 900)
+        browser.open(self.url)
+        # Then: it is live, the vehicle is tracked, its picture and its plots are there.
+        self.becomes("server", lambda text: text == "live")
+        self.becomes("target-status", lambda text: text == "tracking", 120)
+        self.becomes("camera-note", lambda text: "marker" in text)
+        self.becomes("sensors", lambda text: "camera" in text and "satellites" in text)
+        # And: it moves.
+        before = self.becomes("coordinates", lambda text: "," in text)
+        trail = browser.ask("fleet.get('alpha').targets.get('ugv').trail.length")
+        self.becomes("coordinates", lambda text: text not in ("", before))
+        more = lambda: browser.ask("fleet.get('alpha').targets.get('ugv').trail.length") > trail + 50  # noqa: E731
+        rig.until(more, 60, lambda: "the trail does not grow")
+        browser.photograph(PICTURES / "desktop.png")
+        browser.size(390, 844, phone=True)
+        rig.until(lambda: browser.ask("innerWidth") == 390, 10, lambda: "no phone")
+        self.assertLessEqual(browser.ask("document.documentElement.scrollWidth"), 390, "nothing sticks out")
+        browser.ask("draw.last = 0, dirty = true")
+        rig.until(lambda: browser.ask("!dirty"), 10, lambda: "it does not draw")
+        browser.photograph(PICTURES / "phone.png")
+        browser.size(1280, 900)
+        # When: the radio is cut, then the page says that what it shows is old.
+        self.relay.cut = True
+        self.becomes("target-status", lambda text: text == "no news", 20)
+        self.becomes("map-note", lambda text: "silent" in text or "not connected" in text, 20)
+        browser.photograph(PICTURES / "cut.png")
+        # When: it is back, then so are the estimates, and what was missed fills in.
+        self.relay.cut = False
+        self.becomes("target-status", lambda text: text in ("tracking", "coasting"), 30)
+        # What goes by back-fill only is always a moment behind.
+        few = lambda: browser.ask("fleet.get('alpha').link.missing") < 10  # noqa: E731
+        rig.until(few, 60, lambda: self.browser.text("link"))
+        gaps = lambda: browser.ask("fleet.get('alpha').targets.get('ugv').trail.filter(p => p.gap).length")  # noqa: E731
+        rig.until(lambda: gaps() == 0, 60, lambda: f"{gaps()} gaps in the trail")
+        browser.photograph(PICTURES / "after.png")
+        self.assertEqual(browser.errors, [])
+
+
+if __name__ == "__main__":
+    unittest.main()
