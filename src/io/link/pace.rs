@@ -25,6 +25,10 @@ const SILENCE: Duration = Duration::from_millis(600);
 /// How long the least round-trip time is remembered: twice this at most.
 const BASE_MEMORY: Duration = Duration::from_secs(30);
 
+/// Over how long losses are weighed against what arrived: a slow path carries a packet or two between two
+/// looks, and one lost packet does not make a path lossy.
+const LOSS_MEMORY_S: f64 = 2.0;
+
 /// A token bucket that may go into debt.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Bucket {
@@ -66,6 +70,9 @@ pub struct Governor {
     updated: Instant,
     heard: Instant,
     delivered: f64,
+    /// Bytes lost and acknowledged lately, fading away over [`LOSS_MEMORY_S`].
+    lost: f64,
+    acked: f64,
     base: [Option<Duration>; 2],
     base_turned: Instant,
     queue: Duration,
@@ -81,6 +88,8 @@ impl Governor {
             updated: now,
             heard: now,
             delivered: RATE_AT_START,
+            lost: 0.0,
+            acked: 0.0,
             base: [None; 2],
             base_turned: now,
             queue: Duration::ZERO,
@@ -116,6 +125,9 @@ impl Governor {
         let passed = now.saturating_duration_since(self.updated).as_secs_f64().clamp(1e-3, 1.0);
         self.updated = now;
         let limited = std::mem::take(&mut self.limited);
+        let kept = (-passed / LOSS_MEMORY_S).exp();
+        self.lost = self.lost * kept + noted.lost as f64;
+        self.acked = self.acked * kept + noted.acked as f64;
         if noted.acked == 0 {
             if !self.cut && now.saturating_duration_since(self.heard) > SILENCE + self.queue {
                 self.cut = true;
@@ -131,7 +143,7 @@ impl Governor {
         if let Some(rtt) = noted.least_rtt {
             self.learn_queue(rtt, now);
         }
-        let lossy = noted.lost > noted.acked;
+        let lossy = self.lost > self.acked;
         if self.queue > QUEUE_LIMIT || lossy {
             self.set_rate(self.bucket.rate.min(self.delivered) * if lossy { 1.0 } else { 0.85 });
         } else if limited && self.queue < QUEUE_EMPTY {
@@ -213,6 +225,33 @@ mod tests {
         assert!(worst < 130.0, "{worst} ms of standing delay");
         let (rate, _) = run(1e6, 20.0, 60, start);
         assert!(rate > 4e5, "{rate} bytes/s on a path of 1e6");
+    }
+
+    #[test]
+    fn a_third_of_the_packets_lost_does_not_throttle_a_path() {
+        use rand::{Rng as _, SeedableRng as _};
+        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(1);
+        let start = Instant::now();
+        let mut governor = Governor::new(start);
+        let rtt = Some(Duration::from_millis(5));
+        let mut early = 0.0;
+        for tick in 1..=600 {
+            let now = at(start, tick * 100);
+            let mut noted = Noted { least_rtt: rtt, ..Noted::default() };
+            let mut budget = governor.rate() * 0.1;
+            while budget > 0.0 && governor.delay(now).is_zero() {
+                governor.charge(240.0);
+                budget -= 240.0;
+                let fate = if random.random_bool(0.3) { &mut noted.lost } else { &mut noted.acked };
+                *fate += 240;
+            }
+            // The next millisecond it would have liked to send more.
+            governor.delay(now);
+            governor.update(noted, now);
+            early = if tick == 50 { governor.rate() } else { early };
+        }
+        assert!(early > RATE_AT_START / 2.0, "{early} bytes/s after 5 s");
+        assert!(governor.rate() > 2.0 * RATE_AT_START, "{} bytes/s after a minute", governor.rate());
     }
 
     #[test]
