@@ -1,10 +1,10 @@
 //! The wireless link over an impaired relay: nothing missing, nothing twice, nobody else gets in.
 
-mod goodbye;
 mod refused;
 mod relay;
 mod station;
 mod team;
+mod trouble;
 
 use std::sync::Arc;
 use std::time::Duration;

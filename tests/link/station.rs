@@ -141,3 +141,52 @@ async fn a_page_beyond_loopback_asks_for_its_token() {
     stop.send_replace(true);
     running.await.expect("no panic").expect("no error");
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn bytes_that_are_no_request_leave_the_page_as_it_was() {
+    use rand::{Rng as _, SeedableRng as _};
+    let keys = Keys::new();
+    let web = free_port();
+    let settings = GroundSettings {
+        link: station_settings(keys.files(Role::Station, "base"), Some(([127, 0, 0, 1], 9).into())),
+        out: keys.path().join("out"),
+        web: Some(web),
+        token: None,
+        tiles: Some(keys.path().join("tiles")),
+        nmea: None,
+        terminal: false,
+    };
+    let stop = tokio::sync::watch::Sender::new(false);
+    let running = tokio::spawn(ground::run(settings, stop.subscribe()));
+    let local = "Host: 127.0.0.1\r\n";
+    assert!(eventually(web, "/", local, "<title>").await);
+    let seed = 20_261_125;
+    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    let paths = ["/", "/live", "/thumbnail/", "/tiles/", "/vehicles.geojson", "/network.kml?token="];
+    for round in 0..300 {
+        // Noise as it is, as a path, as a header, as a WebSocket's frames.
+        let noise: Vec<u8> = (0..random.random_range(0..200)).map(|_| random.random()).collect();
+        let path = paths[random.random_range(0..paths.len())].as_bytes();
+        let upgrade = b"Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
+                        Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n";
+        let host = local.as_bytes();
+        let request = match round % 4 {
+            0 => noise,
+            1 => [b"GET ", path, &noise, b" HTTP/1.1\r\n", host, b"\r\n"].concat(),
+            2 => [b"GET ", path, b" HTTP/1.1\r\nCookie: windhover=", &noise, b"\r\n", host, b"\r\n"].concat(),
+            _ => [b"GET /live HTTP/1.1\r\n", host, upgrade, &noise].concat(),
+        };
+        let mut stream = TcpStream::connect(web).await.expect("the page's port");
+        // The station may close before it has read everything.
+        let _ = stream.write_all(&request).await;
+        let _ = stream.shutdown().await;
+        let mut answer = [0; 12];
+        if let Ok(Ok(read)) = tokio::time::timeout(PATIENCE, stream.read(&mut answer)).await {
+            let answer = &answer[..read];
+            assert!(!answer.starts_with(b"HTTP/1.1 5"), "seed {seed}, round {round}: an error of ours");
+        }
+    }
+    assert!(ask(web, "/", local).await.contains("<title>windhover</title>"));
+    stop.send_replace(true);
+    running.await.expect("no panic").expect("no error");
+}

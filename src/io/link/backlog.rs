@@ -18,14 +18,25 @@ pub struct Extent {
     pub end: u32,
 }
 
+/// The numbers asked for up to `end` could not be read just now, which is not to say that they are gone.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Unread {
+    /// One more than the last number concerned.
+    pub end: u32,
+}
+
+/// What was read: records by number, ascending.
+pub type Found = Result<Vec<(u32, Arc<Record>)>, Unread>;
+
 /// Where records are read again: memory, or the store's queue on the card.
 pub trait Backlog: Send + Sync {
     /// The runs it holds anything of, oldest first.
     fn extents(&self) -> Vec<Extent>;
 
     /// Records `first..end` of a run that it holds, ascending, at most about `max_bytes` of them (but one
-    /// at least, where there is one). Numbers it does not hold are left out. May block on the card.
-    fn read(&self, run: u32, first: u32, end: u32, max_bytes: usize) -> Vec<(u32, Arc<Record>)>;
+    /// at least, where there is one). Numbers before the last one found, or before `end` when none is,
+    /// that are left out no longer exist. May block on the card.
+    fn read(&self, run: u32, first: u32, end: u32, max_bytes: usize) -> Found;
 
     /// A station has every number below `through` of a run on its disk.
     fn acknowledge(&self, station: &str, run: u32, through: u32);
@@ -110,10 +121,10 @@ impl Backlog for MemoryBacklog {
         vec![Extent { run: self.run, flight: self.flight.clone(), first: held.first, end }]
     }
 
-    fn read(&self, run: u32, first: u32, end: u32, max_bytes: usize) -> Vec<(u32, Arc<Record>)> {
+    fn read(&self, run: u32, first: u32, end: u32, max_bytes: usize) -> Found {
         let held = self.held();
         if run != self.run {
-            return Vec::new();
+            return Ok(Vec::new());
         }
         let from = first.max(held.first);
         let to = end.min(held.first + held.records.len() as u32);
@@ -126,7 +137,7 @@ impl Backlog for MemoryBacklog {
             }
             found.push((number, Arc::clone(record)));
         }
-        found
+        Ok(found)
     }
 
     fn acknowledge(&self, _station: &str, _run: u32, _through: u32) {
@@ -158,11 +169,11 @@ mod tests {
         }
         assert_eq!(backlog.extents(), [Extent { run: 9, flight: "boot-1".into(), first: 15, end: 25 }]);
         let numbers = |first, end, max| -> Vec<u32> {
-            backlog.read(9, first, end, max).into_iter().map(|(n, _)| n).collect()
+            backlog.read(9, first, end, max).expect("memory").into_iter().map(|(n, _)| n).collect()
         };
         assert_eq!(numbers(10, 18, usize::MAX), [15, 16, 17]);
         assert_eq!(numbers(20, 99, 1), [20], "one at least");
-        assert!(backlog.read(8, 0, 99, usize::MAX).is_empty(), "another run");
+        assert_eq!(backlog.read(8, 0, 99, usize::MAX).expect("memory").len(), 0, "another run");
         assert_eq!(backlog.get(24).map(|r| r.log_time.ns()), Some(24));
     }
 

@@ -3,12 +3,16 @@
 //! `docs/link.md` describes the message format and what is guaranteed.
 
 mod backlog;
-mod endpoint;
+mod dial;
+mod door;
+mod events;
 mod inbox;
 pub mod keys;
 mod live;
 mod pace;
 mod payload;
+mod peer;
+mod quic;
 mod ranges;
 mod receive;
 mod sense;
@@ -17,10 +21,10 @@ mod station;
 mod store_backlog;
 mod thumbnail;
 pub mod tls;
-mod wire;
+pub mod wire;
 
-pub use backlog::{Backlog, Extent, MemoryBacklog};
-pub use endpoint::{Door, Events, LinkError, LinkEvent, Peer};
+pub use backlog::{Backlog, Extent, Found, MemoryBacklog, Unread};
+pub use events::{LinkError, LinkEvent};
 pub use inbox::{Inbox, Progress};
 pub use live::{Class, downlink_class};
 pub use payload::{LinkHandle, LinkStatus, PayloadLink, PayloadSettings, StationStatus};

@@ -2,18 +2,20 @@
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 
-use super::backlog::{Backlog, Extent, MemoryBacklog};
-use super::endpoint::{Door, Events, LinkError, LinkEvent, Peer};
+use super::backlog::{Backlog, Extent, Found, MemoryBacklog, Unread};
+use super::door::Door;
+use super::events::{Events, LinkError, LinkEvent};
 use super::keys::Role;
 use super::live::downlink_class;
 use super::pace::Bucket;
+use super::peer::Peer;
 use super::session;
 use super::thumbnail::Picture;
 use super::tls::KeyFiles;
@@ -78,6 +80,8 @@ pub struct StationStatus {
     pub thinned: u64,
     /// Records sent again.
     pub backfilled: u64,
+    /// Times that the card could not be read for it.
+    pub unread: u64,
     /// Records it asked for that are still to be sent.
     pub wanted: u64,
 }
@@ -113,7 +117,7 @@ pub(super) struct Shared {
     pub(super) picture: watch::Sender<Option<Arc<Picture>>>,
     end: watch::Sender<u32>,
     stations: Mutex<BTreeMap<String, Connected>>,
-    refused: AtomicU64,
+    events: Events,
 }
 
 impl Shared {
@@ -142,25 +146,20 @@ impl Shared {
         all
     }
 
-    /// Reads records again, from memory where they are there, else from the card.
-    pub(super) async fn read(
-        self: &Arc<Self>,
-        run: u32,
-        first: u32,
-        end: u32,
-        max_bytes: usize,
-    ) -> Vec<(u32, Arc<Record>)> {
-        let recent = self.recent.read(run, first, end, max_bytes);
+    /// Reads records again, from memory where they are there, else from the card. Numbers left out are
+    /// gone for good.
+    pub(super) async fn read(self: &Arc<Self>, run: u32, first: u32, end: u32, max_bytes: usize) -> Found {
+        let recent = self.recent.read(run, first, end, max_bytes)?;
         let covered = recent.first().is_some_and(|(number, _)| *number == first);
         match &self.deep {
             Some(deep) if !covered => {
                 let deep = Arc::clone(deep);
                 let end = recent.first().map_or(end, |(number, _)| *number);
                 let read = move || deep.read(run, first, end, max_bytes);
-                let found = tokio::task::spawn_blocking(read).await.unwrap_or_default();
-                if found.is_empty() { recent } else { found }
+                let found = tokio::task::spawn_blocking(read).await.unwrap_or(Err(Unread { end }))?;
+                Ok(if found.is_empty() { recent } else { found })
             }
-            _ => recent,
+            _ => Ok(recent),
         }
     }
 
@@ -203,7 +202,7 @@ impl LinkHandle {
     pub fn status(&self) -> LinkStatus {
         LinkStatus {
             stations: self.shared.stations().values().map(|c| c.status.clone()).collect(),
-            refused: self.shared.refused.load(Ordering::Relaxed),
+            refused: self.shared.events.refusals(),
             records: self.shared.recent.end(),
             backlog_bytes: self.shared.recent.bytes(),
         }
@@ -216,7 +215,6 @@ pub struct PayloadLink {
     dial: Vec<String>,
     shared: Arc<Shared>,
     arrivals: mpsc::Receiver<Peer>,
-    events: Events,
 }
 
 impl PayloadLink {
@@ -230,8 +228,7 @@ impl PayloadLink {
     ) -> Result<(Self, LinkHandle, mpsc::Receiver<LinkEvent>), LinkError> {
         let (event_sender, event_receiver) = mpsc::channel(256);
         let events = Events::new(event_sender);
-        let (sender, arrivals) = mpsc::channel(16);
-        let door = Door::open(Role::Payload, &settings.files, settings.listen, events.clone(), sender)?;
+        let (door, arrivals) = Door::open(Role::Payload, &settings.files, settings.listen, events.clone())?;
         let shared = Arc::new(Shared {
             recent: MemoryBacklog::new(run, flight, settings.backlog_bytes),
             deep,
@@ -241,10 +238,10 @@ impl PayloadLink {
             picture: watch::Sender::new(None),
             end: watch::Sender::new(0),
             stations: Mutex::default(),
-            refused: AtomicU64::new(0),
+            events,
         });
         let handle = LinkHandle { shared: Arc::clone(&shared) };
-        let link = Self { door, dial: settings.dial.clone(), shared, arrivals, events };
+        let link = Self { door, dial: settings.dial.clone(), shared, arrivals };
         Ok((link, handle, event_receiver))
     }
 
@@ -254,68 +251,52 @@ impl PayloadLink {
     }
 
     /// Serves stations until `stop` says so (or its sender is gone).
-    pub async fn run(mut self, mut stop: watch::Receiver<bool>) {
-        let mut tasks = tokio::task::JoinSet::new();
-        tasks.spawn(self.door.clone().listen());
-        tasks.spawn(self.door.clone().watch_keys());
-        for address in self.dial.drain(..) {
-            tasks.spawn(self.door.clone().dial(address));
-        }
-        loop {
-            self.shared.refused.store(self.events.refusals(), Ordering::Relaxed);
-            tokio::select! {
-                peer = self.arrivals.recv() => {
-                    let Some(peer) = peer else { break };
-                    self.welcome(peer, &mut tasks);
-                }
-                _ = stop.wait_for(|stop| *stop) => break,
-                () = tokio::time::sleep(Duration::from_secs(1)) => {}
-            }
-            while tasks.try_join_next().is_some() {}
-        }
-        self.door.shut().await;
+    pub async fn run(self, stop: watch::Receiver<bool>) {
+        let shared = self.shared;
+        self.door.run(self.dial, self.arrivals, stop, |peer| welcome(&shared, peer)).await;
     }
+}
 
-    /// Starts a session; an older one of the same station ends.
-    fn welcome(&self, peer: Peer, tasks: &mut tokio::task::JoinSet<()>) {
-        let status = StationStatus {
-            name: peer.name.clone(),
-            hears_us: true,
-            rtt_ms: peer.connection.rtt().as_secs_f64() * 1e3,
-            rate_kbps: 0.0,
-            live: 0,
-            thinned: 0,
-            backfilled: 0,
-            wanted: 0,
-        };
-        let told = {
-            let mut stations = self.shared.stations();
-            let old = stations.remove(&peer.name);
-            let open = old.as_ref().filter(|old| old.peer.connection.close_reason().is_none());
-            let told = open.map_or_else(Arc::default, |old| Arc::clone(&old.told));
-            if let Some(old) = old {
-                old.peer.supersede();
+/// A session; an older one of the same station ends.
+fn welcome(shared: &Arc<Shared>, peer: Peer) -> impl Future<Output = ()> + Send + use<> {
+    let status = StationStatus {
+        name: peer.name.clone(),
+        hears_us: true,
+        rtt_ms: peer.connection.rtt().as_secs_f64() * 1e3,
+        rate_kbps: 0.0,
+        live: 0,
+        thinned: 0,
+        backfilled: 0,
+        unread: 0,
+        wanted: 0,
+    };
+    let told = {
+        let mut stations = shared.stations();
+        let old = stations.remove(&peer.name);
+        let open = old.as_ref().filter(|old| old.peer.connection.close_reason().is_none());
+        let told = open.map_or_else(Arc::default, |old| Arc::clone(&old.told));
+        if let Some(old) = old {
+            old.peer.supersede();
+        }
+        let connected = Connected { peer: peer.clone(), status, told: Arc::clone(&told) };
+        stations.insert(peer.name.clone(), connected);
+        told
+    };
+    let shared = Arc::clone(shared);
+    async move {
+        let up = || {
+            if !told.swap(true, Ordering::Relaxed) {
+                let address = peer.address();
+                shared.events.tell(LinkEvent::Up { peer: peer.name.clone(), address });
             }
-            let connected = Connected { peer: peer.clone(), status, told: Arc::clone(&told) };
-            stations.insert(peer.name.clone(), connected);
-            told
         };
-        let (shared, events) = (Arc::clone(&self.shared), self.events.clone());
-        tasks.spawn(async move {
-            let up = || {
-                if !told.swap(true, Ordering::Relaxed) {
-                    let address = peer.connection.remote_address();
-                    events.tell(LinkEvent::Up { peer: peer.name.clone(), address });
-                }
-            };
-            let ended = session::serve(&shared, &peer, up).await;
-            let mut stations = shared.stations();
-            let id = peer.connection.stable_id();
-            let ours = stations.get(&peer.name).is_some_and(|c| c.peer.connection.stable_id() == id);
-            if ours {
-                stations.remove(&peer.name);
-                events.ended(&peer, ended);
-            }
-        });
+        let ended = session::serve(&shared, &peer, up).await;
+        let mut stations = shared.stations();
+        let id = peer.connection.stable_id();
+        let ours = stations.get(&peer.name).is_some_and(|c| c.peer.connection.stable_id() == id);
+        if ours {
+            stations.remove(&peer.name);
+            shared.events.ended(&peer, ended);
+        }
     }
 }

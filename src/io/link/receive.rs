@@ -8,7 +8,7 @@ use prost::Message as _;
 use quinn::{Connection, RecvStream, SendStream, VarInt};
 use tokio::time::Instant;
 
-use super::endpoint::{Ended, Peer};
+use super::peer::{Ended, Peer};
 use super::station::{Arrival, Channel, FromPayload, PayloadState, Shared, lock};
 use super::wire::{self, MINOR, Reader, THUMBNAIL_LIMIT, WireError};
 use crate::io::proto::{

@@ -2,16 +2,18 @@
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::{Notify, mpsc, watch};
 use tokio::time::Instant;
 
-use super::endpoint::{Door, Events, LinkError, LinkEvent, Peer};
+use super::door::Door;
+use super::events::{Events, LinkError, LinkEvent};
 use super::inbox::{Inbox, Progress};
 use super::keys::Role;
+use super::peer::Peer;
 use super::ranges::RangeSet;
 use super::receive;
 use super::tls::KeyFiles;
@@ -126,7 +128,7 @@ pub(super) struct Shared {
     pub(super) recall: Recall,
     pub(super) records: mpsc::Sender<FromPayload>,
     pub(super) thumbnails: bool,
-    refusals: AtomicU64,
+    events: Events,
 }
 
 /// Gives the link what it must know of the disk, and tells how it does.
@@ -150,10 +152,11 @@ impl StationHandle {
         let states: Vec<_> = lock(&self.shared.payloads).values().cloned().collect();
         let of = |state: Arc<PayloadState>| {
             let mut status = lock(&state.status).clone();
-            let connection = lock(&state.peer).connection.clone();
+            let peer = lock(&state.peer).clone();
+            let connection = &peer.connection;
             status.connected &= connection.close_reason().is_none();
             status.rtt_ms = connection.rtt().as_secs_f64() * 1e3;
-            status.address = connection.remote_address();
+            status.address = peer.address();
             status.bytes = connection.stats().udp_rx.bytes;
             status.silent = lock(&state.heard).elapsed();
             status.progress = lock(&state.inbox).progress();
@@ -164,7 +167,7 @@ impl StationHandle {
 
     /// Handshakes refused since the start.
     pub fn refusals(&self) -> u64 {
-        self.shared.refusals.load(Ordering::Relaxed)
+        self.shared.events.refusals()
     }
 }
 
@@ -174,7 +177,6 @@ pub struct StationLink {
     dial: Vec<String>,
     shared: Arc<Shared>,
     arrivals: mpsc::Receiver<Peer>,
-    events: Events,
 }
 
 /// What [`StationLink::open`] gives: the link to run, its handle, records, events.
@@ -185,18 +187,17 @@ impl StationLink {
     pub fn open(settings: &StationSettings, recall: Recall) -> Result<OpenStation, LinkError> {
         let (event_sender, event_receiver) = mpsc::channel(256);
         let events = Events::new(event_sender);
-        let (sender, arrivals) = mpsc::channel(16);
-        let door = Door::open(Role::Station, &settings.files, settings.listen, events.clone(), sender)?;
+        let (door, arrivals) = Door::open(Role::Station, &settings.files, settings.listen, events.clone())?;
         let (records, record_receiver) = mpsc::channel(1_024);
         let shared = Arc::new(Shared {
             payloads: Mutex::default(),
             recall,
             records,
             thumbnails: settings.thumbnails,
-            refusals: AtomicU64::new(0),
+            events,
         });
         let handle = StationHandle { shared: Arc::clone(&shared) };
-        let link = Self { door, dial: settings.dial.clone(), shared, arrivals, events };
+        let link = Self { door, dial: settings.dial.clone(), shared, arrivals };
         Ok((link, handle, record_receiver, event_receiver))
     }
 
@@ -206,31 +207,16 @@ impl StationLink {
     }
 
     /// Receives until `stop` says so (or its sender is gone).
-    pub async fn run(mut self, mut stop: watch::Receiver<bool>) {
-        let mut tasks = tokio::task::JoinSet::new();
-        tasks.spawn(self.door.clone().listen());
-        tasks.spawn(self.door.clone().watch_keys());
-        for address in self.dial.drain(..) {
-            tasks.spawn(self.door.clone().dial(address));
-        }
-        loop {
-            self.shared.refusals.store(self.events.refusals(), Ordering::Relaxed);
-            tokio::select! {
-                peer = self.arrivals.recv() => {
-                    let Some(peer) = peer else { break };
-                    self.welcome(peer, &mut tasks);
-                }
-                _ = stop.wait_for(|stop| *stop) => break,
-                () = tokio::time::sleep(Duration::from_millis(500)) => {}
-            }
-            while tasks.try_join_next().is_some() {}
-        }
-        self.door.shut().await;
+    pub async fn run(self, stop: watch::Receiver<bool>) {
+        let shared = self.shared;
+        self.door.run(self.dial, self.arrivals, stop, |peer| welcome(&shared, peer)).await;
     }
+}
 
+impl Shared {
     /// The state of a payload, made when it first comes; an older connection ends.
     fn state_of(&self, peer: &Peer) -> Arc<PayloadState> {
-        let mut payloads = lock(&self.shared.payloads);
+        let mut payloads = lock(&self.payloads);
         if let Some(state) = payloads.get(&peer.name) {
             let old = std::mem::replace(&mut *lock(&state.peer), peer.clone());
             old.supersede();
@@ -241,7 +227,7 @@ impl StationLink {
         let status = PayloadStatus {
             name: peer.name.clone(),
             connected: true,
-            address: peer.connection.remote_address(),
+            address: peer.address(),
             rtt_ms: 0.0,
             silent: Duration::ZERO,
             bytes: 0,
@@ -260,24 +246,24 @@ impl StationLink {
         payloads.insert(peer.name.clone(), Arc::clone(&state));
         state
     }
+}
 
-    fn welcome(&self, peer: Peer, tasks: &mut tokio::task::JoinSet<()>) {
-        let state = self.state_of(&peer);
-        let (shared, events) = (Arc::clone(&self.shared), self.events.clone());
-        tasks.spawn(async move {
-            let up = || {
-                if !state.told.swap(true, Ordering::Relaxed) {
-                    let address = peer.connection.remote_address();
-                    events.tell(LinkEvent::Up { peer: peer.name.clone(), address });
-                }
-            };
-            let ended = receive::receive(&shared, &state, &peer, up).await;
-            let ours = lock(&state.peer).connection.stable_id() == peer.connection.stable_id();
-            if ours {
-                lock(&state.status).connected = false;
-                state.told.store(false, Ordering::Relaxed);
-                events.ended(&peer, ended);
+/// A session; an older one of the same payload ends.
+fn welcome(shared: &Arc<Shared>, peer: Peer) -> impl Future<Output = ()> + Send + use<> {
+    let (state, shared) = (shared.state_of(&peer), Arc::clone(shared));
+    async move {
+        let up = || {
+            if !state.told.swap(true, Ordering::Relaxed) {
+                let address = peer.address();
+                shared.events.tell(LinkEvent::Up { peer: peer.name.clone(), address });
             }
-        });
+        };
+        let ended = receive::receive(&shared, &state, &peer, up).await;
+        let ours = lock(&state.peer).connection.stable_id() == peer.connection.stable_id();
+        if ours {
+            lock(&state.status).connected = false;
+            state.told.store(false, Ordering::Relaxed);
+            shared.events.ended(&peer, ended);
+        }
     }
 }

@@ -1,12 +1,10 @@
 //! Back-fill out of the store on the data card: earlier runs, and what memory no longer holds.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use ring::rand::SecureRandom as _;
 
-use super::backlog::{Backlog, Extent};
-use crate::io::records::Record;
+use super::backlog::{Backlog, Extent, Found};
 use crate::io::store::StoreHandle;
 
 /// Name under which the card keeps its identity.
@@ -58,7 +56,7 @@ impl Backlog for StoreBacklog {
         self.store.extents().into_iter().map(|extent| on_link(extent, self.card)).collect()
     }
 
-    fn read(&self, run: u32, first: u32, end: u32, max_bytes: usize) -> Vec<(u32, Arc<Record>)> {
+    fn read(&self, run: u32, first: u32, end: u32, max_bytes: usize) -> Found {
         self.store.read(run ^ self.card, first, end, max_bytes)
     }
 

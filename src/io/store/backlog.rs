@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::handle::StoreHandle;
 use super::index::QueuedRecord;
-use crate::io::link::{Backlog, Extent};
+use crate::io::link::{Backlog, Extent, Found, Unread};
 use crate::io::records::{Record, Schema};
 use crate::time::MonoTime;
 
@@ -31,11 +31,16 @@ impl Backlog for StoreHandle {
         index.queued_runs().into_iter().map(extent).collect()
     }
 
-    fn read(&self, run: u32, first: u32, end: u32, max_bytes: usize) -> Vec<(u32, Arc<Record>)> {
-        let Some(index) = self.index() else { return Vec::new() };
+    fn read(&self, run: u32, first: u32, end: u32, max_bytes: usize) -> Found {
+        // Not open yet, or broken: it may answer later.
+        let Some(index) = self.index() else { return Err(Unread { end }) };
         let mut bytes = 0;
         let mut found = Vec::new();
-        for (number, queued) in index.queued(run, first, end) {
+        for entry in index.queued(run, first, end) {
+            let Ok((number, queued)) = entry else {
+                // What came before the error is answered; behind it nothing is known.
+                return if found.is_empty() { Err(Unread { end }) } else { Ok(found) };
+            };
             let Some(record) = record_of(queued) else { continue };
             bytes += record.data.len() + OVERHEAD;
             if bytes > max_bytes && !found.is_empty() {
@@ -43,7 +48,7 @@ impl Backlog for StoreHandle {
             }
             found.push((number, Arc::new(record)));
         }
-        found
+        Ok(found)
     }
 
     fn acknowledge(&self, station: &str, run: u32, through: u32) {

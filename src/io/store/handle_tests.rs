@@ -131,7 +131,7 @@ fn a_flight_is_recorded_named_and_read_again() {
     assert_eq!(handle.state("datum", Duration::from_secs(5)), Some(vec![1, 2, 3]));
     let index = handle.index().unwrap();
     assert_eq!(index.queued_runs(), [(1, 0, 40)]);
-    let (number, record) = index.queued(1, 7, 8).next().unwrap();
+    let (number, record) = index.queued(1, 7, 8).next().unwrap().unwrap();
     assert_eq!(
         (number, &record.data[..], &record.topic[..]),
         (7, &7u32.to_le_bytes()[..], "/target/ugv/state")

@@ -221,11 +221,19 @@ impl Index {
         self.db.range(from..to).flatten().map(|(k, v)| (k.to_vec(), v.to_vec()))
     }
 
-    /// Queued records `first..end` of a run, ascending.
-    pub fn queued(&self, run: u32, first: u32, end: u32) -> impl Iterator<Item = (u32, QueuedRecord)> {
+    /// Queued records `first..end` of a run, ascending, as far as the card can be read. An entry that is
+    /// no record is left out.
+    pub fn queued(
+        &self,
+        run: u32,
+        first: u32,
+        end: u32,
+    ) -> impl Iterator<Item = sled::Result<(u32, QueuedRecord)>> {
         let from = key(BACKFILL, &[&run.to_be_bytes(), &first.to_be_bytes()]);
         let to = key(BACKFILL, &[&run.to_be_bytes(), &end.to_be_bytes()]);
-        self.items(from, to).filter_map(|(k, v)| Some((number(&k[5..])?, QueuedRecord::from_bytes(&v)?)))
+        let parsed =
+            |(k, v): (sled::IVec, sled::IVec)| Some((number(&k[5..])?, QueuedRecord::from_bytes(&v)?));
+        self.db.range(from..to).filter_map(move |entry| entry.map(parsed).transpose())
     }
 
     /// Runs with queued records: run, least number, one more than the greatest.
