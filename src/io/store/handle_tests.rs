@@ -141,10 +141,10 @@ fn a_flight_is_recorded_named_and_read_again() {
     let backlog: &dyn crate::io::link::Backlog = &handle;
     let extents = backlog.extents();
     assert_eq!((extents[0].run, extents[0].first, extents[0].end, &extents[0].flight[..]), (1, 0, 40, name));
-    let read = backlog.read(1, 38, 99, 10_000);
+    let read = backlog.read(1, 38, 99, 10_000).unwrap();
     assert_eq!(read.iter().map(|(n, _)| *n).collect::<Vec<_>>(), [38, 39]);
     assert_eq!(read[0].1.schema, Schema::TargetState);
-    assert_eq!(backlog.read(1, 0, 40, 1).len(), 1);
+    assert_eq!(backlog.read(1, 0, 40, 1).unwrap().len(), 1);
     store.stop();
 }
 
