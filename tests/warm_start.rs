@@ -50,13 +50,19 @@ fn flown() -> (Vec<Event>, WarmState) {
     (after.to_vec(), serde_json::from_str(&told).expect("what was written is read"))
 }
 
+/// The events of a run that begins with a state.
+fn continued(warm: WarmState, after: &[Event]) -> Vec<Event> {
+    let first = Event { t_recv: after[0].t_recv, seq: 0, body: EventBody::Warm(Box::new(warm)) };
+    std::iter::once(first).chain(after.iter().cloned()).collect()
+}
+
 #[test]
 fn a_restarted_pipeline_tracks_at_once_and_knows_its_sensors() {
     let (after, warm) = flown();
     let learnt = warm.filter.clone().expect("the filter had started");
     let begin = after[0].t_recv;
-    let mut pipeline = Pipeline::new(&config()).with_warm_state(warm.clone());
-    let out = outputs(&mut pipeline, &after);
+    let mut pipeline = Pipeline::new(&config());
+    let out = outputs(&mut pipeline, &continued(warm.clone(), &after));
     let (tracking, sigma) = first_tracking(&out).expect("it tracks again");
     assert!(tracking - begin < Span::from_s(2.0), "after {:?}", tracking - begin);
     let cold = outputs(&mut Pipeline::new(&config()), &after);
@@ -82,7 +88,7 @@ fn a_state_of_another_place_or_damaged_is_not_used() {
     elsewhere.site.datum[0] += 1.0;
     elsewhere.arrivals.clear();
     elsewhere.filter.as_mut().expect("there is one").mean[3] = f64::NAN;
-    let out = outputs(&mut Pipeline::new(&config()).with_warm_state(elsewhere), &after);
+    let out = outputs(&mut Pipeline::new(&config()), &continued(elsewhere, &after));
     assert_eq!(out.len(), cold);
     let frames = after.iter().filter(|e| matches!(e.body, EventBody::Frame(_))).count();
     assert!(frames > 10 && first_tracking(&out).is_some());

@@ -16,6 +16,7 @@ use super::health::{self, Figures};
 use super::latencies::Latencies;
 use super::outlets::Outlets;
 use super::supervise::Heart;
+use super::warm::{self, Origin};
 
 /// What the health task and the pipeline's task show each other. Copies are the same board.
 #[derive(Clone, Debug, Default)]
@@ -56,12 +57,14 @@ pub fn run(
         config,
         around,
         board,
+        origin: Origin::here(config, around.clock),
         outlets,
         pipeline: Pipeline::with_terrain(config, config_file::terrain_of(config)),
         ticks: Ticks::default(),
         latencies: Latencies::default(),
         outputs: Vec::new(),
     };
+    brain.continue_from_earlier(heart);
     let mut end = None;
     loop {
         heart.beat();
@@ -85,6 +88,7 @@ struct Brain<'a> {
     config: &'a Config,
     around: &'a Surroundings,
     board: &'a Board,
+    origin: Origin,
     outlets: Outlets,
     pipeline: Pipeline,
     ticks: Ticks,
@@ -93,6 +97,25 @@ struct Brain<'a> {
 }
 
 impl Brain<'_> {
+    /// Continues from what an earlier run left on the card, where that is fresh. It is an event like
+    /// every other, the first of all: what flew is what replays.
+    fn continue_from_earlier(&mut self, heart: &Heart) {
+        if !self.config.store.enabled {
+            return;
+        }
+        let tell = |words: String| self.around.log.tell(OperatorEvent::WarmStart, "", words);
+        match warm::wait_for(self.outlets.slot(), &self.origin, self.around, heart) {
+            Some(Ok((state, age))) => {
+                tell(format!("continues from what was known {:.1} s ago", age.s()));
+                let body = EventBody::Warm(Box::new(state));
+                let event = self.around.inbox.number(self.around.began, body);
+                self.handle(&event);
+            }
+            Some(Err(stale)) => tell(format!("what an earlier run knew is not used: {stale}")),
+            None => {}
+        }
+    }
+
     fn pass_time(&mut self) {
         let now = self.around.clock.now();
         for t in self.ticks.until(now) {
@@ -165,5 +188,8 @@ impl Brain<'_> {
             shown.figures.clone()
         });
         self.around.log.write(health::line(health, self.config, Some(&figures)));
+        if let (Some(state), Some(store)) = (self.pipeline.warm_state(), self.outlets.slot().get()) {
+            warm::save(&store, &self.origin, health.t, &state);
+        }
     }
 }

@@ -9,6 +9,7 @@ use crate::io::device::{Fault, NoteKind, Report, Stop};
 use crate::io::pps;
 use crate::io::serial::{self, SerialSettings};
 use crate::msg::{EventBody, Source};
+use crate::time::MonoTime;
 
 use super::events::Event;
 use super::inbox::Inbox;
@@ -21,6 +22,8 @@ use super::supervise::Heart;
 pub struct Surroundings {
     /// The clock.
     pub clock: HostClock,
+    /// When the graph began: before anything was heard.
+    pub began: MonoTime,
     /// Asks for the end.
     pub stop: Stop,
     /// The operator's log.

@@ -54,6 +54,8 @@ pub enum Event {
     PowerBack,
     /// The computer is hot.
     Hot,
+    /// There is a state of an earlier run; whether it is continued from.
+    WarmStart,
     /// The configuration was read again.
     Reloaded,
     /// A changed value of the configuration takes a restart.
@@ -104,6 +106,7 @@ impl Event {
             Self::PowerGoing => row("power_going", Error, 0),
             Self::PowerBack => row("power_back", Info, 0),
             Self::Hot => row("hot", Warn, 60),
+            Self::WarmStart => row("warm_start", Info, 0),
             Self::Reloaded => row("reloaded", Info, 0),
             Self::NeedsRestart => row("needs_restart", Warn, 0),
             Self::ReloadRefused => row("reload_refused", Error, 0),

@@ -26,4 +26,5 @@ pub mod run;
 pub mod supervise;
 pub mod topology;
 pub mod truth;
+pub mod warm;
 mod watch;

@@ -36,6 +36,11 @@ impl Outlets {
         }
     }
 
+    /// The data card's place.
+    pub fn slot(&self) -> &Slot {
+        &self.slot
+    }
+
     /// Keeps an event as it was heard.
     pub fn event(&mut self, event: &Event) {
         self.began.get_or_insert(event.t_recv);

@@ -73,6 +73,7 @@ pub struct Graph {
 pub fn start(config: &Config, clock: HostClock, log: &Log) -> std::io::Result<Graph> {
     let around = Surroundings {
         clock,
+        began: clock.now(),
         stop: Stop::default(),
         log: log.clone(),
         presence: Presence::default(),

@@ -11,7 +11,7 @@ use prost::Message as _;
 use super::mcap_read::{self, McapReader, RawMessage, ReadError};
 use super::mcap_write::{CONFIG_ATTACHMENT, McapWriter, WriteError};
 use super::proto::{foxglove, host_time, windhover};
-use super::records::{self, FRAME_NUMBER_KEY, IN_SEQUENCE, topic};
+use super::records::{self, FRAME_NUMBER_KEY, IN_SEQUENCE, topic, warm};
 use crate::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
 use crate::time::{MonoTime, Span};
 
@@ -124,6 +124,10 @@ impl CaptureReader {
                 let index = if numbered { raw.sequence } else { self.frames };
                 self.frames = index.saturating_add(1);
                 Some(EventBody::Frame(frame(raw, index)?))
+            }
+            topic::WARM_START => {
+                let told = warm::state(&windhover::WarmState::decode(&raw.data[..])?);
+                told.map(|state| EventBody::Warm(Box::new(state)))
             }
             topic::SOURCE_EVENT => source_event(&windhover::SourceEvent::decode(&raw.data[..])?),
             _ => None,

@@ -26,6 +26,11 @@ impl HostClock {
         MonoTime::from_ns(raw(ClockId::Monotonic)) + self.host_from_monotonic
     }
 
+    /// The constant: host time less CLOCK_MONOTONIC.
+    pub fn less_monotonic(&self) -> Span {
+        self.host_from_monotonic
+    }
+
     /// Host time of a CLOCK_MONOTONIC stamp, as drivers give them.
     pub fn from_monotonic(&self, stamp: Duration) -> MonoTime {
         MonoTime::from_ns(i64::try_from(stamp.as_nanos()).unwrap_or(i64::MAX)) + self.host_from_monotonic

@@ -1,4 +1,4 @@
-//! What this process costs the computer.
+//! What this process costs the computer, and which boot of it this is.
 
 /// Resident memory in megabytes; `None` where /proc does not tell.
 pub fn resident_mb() -> Option<f64> {
@@ -8,11 +8,23 @@ pub fn resident_mb() -> Option<f64> {
     Some(kb * 1024.0 / 1e6)
 }
 
+/// The kernel's name for this boot; `None` where /proc does not tell.
+pub fn boot_id() -> Option<String> {
+    let id = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok()?;
+    Some(id.trim().to_owned()).filter(|id| !id.is_empty())
+}
+
 #[cfg(test)]
 mod tests {
     #[test]
     fn a_process_has_memory() {
         let mb = super::resident_mb().expect("told by /proc");
         assert!((0.5..100_000.0).contains(&mb), "{mb}");
+    }
+
+    #[test]
+    fn a_boot_keeps_its_name() {
+        let id = super::boot_id().expect("told by /proc");
+        assert_eq!(super::boot_id().as_deref(), Some(id.as_str()));
     }
 }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use super::WarmState;
 use crate::time::MonoTime;
 
 /// Where an event comes from.
@@ -61,6 +62,8 @@ pub enum EventBody {
     SourceUp(Source),
     /// A device went away.
     SourceDown(Source),
+    /// What an earlier run of the same flight had learnt; comes before everything else, or not at all.
+    Warm(Box<WarmState>),
 }
 
 /// How the bytes of a frame are to be read.

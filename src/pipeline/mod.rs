@@ -86,17 +86,6 @@ impl Pipeline {
         }
     }
 
-    /// Continues from what an earlier run of the same flight had learnt: site, clock fit, sensors' slow
-    /// errors. A state of another place or configuration is not used. Call before the first event; the
-    /// same state and events always give the same outputs.
-    #[must_use]
-    pub fn with_warm_state(mut self, warm: WarmState) -> Self {
-        self.gps.resume(&warm.arrivals);
-        self.finder.resume(warm.site);
-        self.warm = warm.filter.filter(WarmFilter::is_sound);
-        self
-    }
-
     /// What a restarted program should continue from; `None` while the site is not settled.
     pub fn warm_state(&self) -> Option<WarmState> {
         let estimators = self.estimators.as_ref()?;
@@ -138,6 +127,7 @@ impl Pipeline {
                 self.take_estimated(t, out);
             }
             EventBody::Pulse => self.gps.pulse(t),
+            EventBody::Warm(state) => self.resume(state),
             EventBody::SourceUp(_) | EventBody::SourceDown(_) => {}
         }
     }
@@ -161,6 +151,17 @@ impl Pipeline {
             estimators.joint.finish(&mut self.estimated);
         }
         self.take_estimated(t, out);
+    }
+
+    /// Continues from what an earlier run of the same flight had learnt: site, clock fit, sensors' slow
+    /// errors. A state of another place or configuration is not used, nor one that comes too late.
+    fn resume(&mut self, warm: &WarmState) {
+        if self.estimators.is_some() {
+            return;
+        }
+        self.gps.resume(&warm.arrivals);
+        self.finder.resume(warm.site);
+        self.warm = warm.filter.clone().filter(WarmFilter::is_sound);
     }
 
     fn gnss_bytes(&mut self, bytes: &[u8], event: &Event, out: &mut Vec<Output>) {

@@ -74,14 +74,19 @@ pub struct Feeder {
 }
 
 impl Feeder {
-    pub fn start(mut gps: Line, mut compass: Line) -> Self {
+    pub fn start(gps: Line, compass: Line) -> Self {
+        Self::at_height(gps, compass, 43.0)
+    }
+
+    /// The same at a height above sea level; the bench's ground is at 33 m.
+    pub fn at_height(mut gps: Line, mut compass: Line, alt_msl_m: f64) -> Self {
         let stop = Arc::new(AtomicBool::new(false));
         let asked = stop.clone();
         let thread = std::thread::spawn(move || {
             let mut n = 0u32;
             while !asked.load(Ordering::Acquire) {
                 if n.is_multiple_of(4) {
-                    gps.send(epoch(n / 4).as_bytes());
+                    gps.send(epoch(n / 4, alt_msl_m).as_bytes());
                 }
                 compass.send(sentence("C123.4P-0.5R0.3T21.0").as_bytes());
                 n += 1;
@@ -100,11 +105,11 @@ impl Feeder {
 }
 
 /// One epoch of a 5 Hz receiver over Lisbon.
-fn epoch(n: u32) -> String {
+fn epoch(n: u32, alt_msl_m: f64) -> String {
     let (seconds, tenths) = (n / 5, n % 5 * 2);
     let time = format!("1504{:02}.{tenths}", seconds % 60);
     let rmc = sentence(&format!("GPRMC,{time},A,3842.20000,N,00911.00000,W,000.0,000.0,181126,003.4,W"));
-    let gga = sentence(&format!("GPGGA,{time},3842.20000,N,00911.00000,W,1,09,0.9,43.0,M,50.0,M,,"));
+    let gga = sentence(&format!("GPGGA,{time},3842.20000,N,00911.00000,W,1,09,0.9,{alt_msl_m:.1},M,50.0,M,,"));
     rmc + &gga
 }
 
@@ -150,12 +155,17 @@ impl Bench {
     fn write_camera(&self, frames: u32, period_s: f64) {
         let folder = self.path("camera");
         std::fs::create_dir(&folder).expect("created");
-        let pixels = vec![90u8; 320 * 256];
-        std::fs::write(folder.join("grey.pgm"), [b"P5\n320 256\n255\n".as_slice(), &pixels].concat())
-            .expect("written");
+        self.draw(|_, _| 90);
         let rows = (0..frames).map(|n| format!("{:.3},grey.pgm\n", f64::from(n) * period_s));
         let list: String = std::iter::once("time_s,file\n".to_owned()).chain(rows).collect();
         std::fs::write(folder.join("times.csv"), list).expect("written");
+    }
+
+    /// Makes every frame this picture, a grey level for each column and row.
+    pub fn draw(&self, level: impl Fn(usize, usize) -> u8) {
+        let pixels: Vec<u8> = (0..320 * 256).map(|i| level(i % 320, i / 320)).collect();
+        let picture = [b"P5\n320 256\n255\n".as_slice(), &pixels].concat();
+        std::fs::write(self.path("camera/grey.pgm"), picture).expect("written");
     }
 
     pub fn lines(&self) -> (Line, Line) {

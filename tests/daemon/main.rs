@@ -2,6 +2,7 @@
 //! V4L2 call is what flies.
 
 mod harness;
+mod warm;
 
 use std::process::Command;
 use std::time::Duration;

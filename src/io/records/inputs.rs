@@ -2,7 +2,7 @@
 
 use prost::Message as _;
 
-use super::{Record, Schema, topic};
+use super::{Record, Schema, topic, warm};
 use crate::io::proto::{foxglove, timestamp, windhover};
 use crate::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
 use crate::time::MonoTime;
@@ -30,6 +30,10 @@ pub fn of_event(event: &Event) -> Option<Record> {
         EventBody::Pulse => source_event(Source::Gps, "pulse", 0),
         EventBody::SourceUp(source) => source_event(*source, "up", 0),
         EventBody::SourceDown(source) => source_event(*source, "down", 0),
+        EventBody::Warm(state) => {
+            let data = warm::message(t, state).encode_to_vec();
+            record(topic::WARM_START, Schema::WarmState, t, t, data)
+        }
         EventBody::Tick => return None,
     })
 }

@@ -4,6 +4,7 @@ mod inputs;
 mod outputs;
 mod schema;
 pub mod topic;
+pub mod warm;
 
 pub use inputs::{encoding_of_raw, of_event};
 pub use outputs::{Recorder, detections, health, ownship, target_state};

@@ -39,6 +39,8 @@ pub enum Schema {
     Fusion,
     /// `windhover.Health`
     Health,
+    /// `windhover.WarmState`
+    WarmState,
 }
 
 impl Schema {
@@ -62,12 +64,13 @@ impl Schema {
             Self::Attitude => "windhover.Attitude",
             Self::Fusion => "windhover.Fusion",
             Self::Health => "windhover.Health",
+            Self::WarmState => "windhover.WarmState",
         }
     }
 
     /// The schema of that full name.
     pub fn named(name: &str) -> Option<Self> {
-        const ALL: [Schema; 17] = [
+        const ALL: [Schema; 18] = [
             Schema::SerialBytes,
             Schema::SourceEvent,
             Schema::CompressedImage,
@@ -85,6 +88,7 @@ impl Schema {
             Schema::Attitude,
             Schema::Fusion,
             Schema::Health,
+            Schema::WarmState,
         ];
         ALL.into_iter().find(|schema| schema.name() == name)
     }

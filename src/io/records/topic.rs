@@ -8,6 +8,8 @@ pub const COMPASS_SERIAL: &str = "/compass/serial";
 pub const CAMERA_IMAGE: &str = "/camera/image";
 /// Losses, arrivals and departures of devices.
 pub const SOURCE_EVENT: &str = "/source/event";
+/// What a restarted daemon continued from.
+pub const WARM_START: &str = "/warm_start";
 /// Position fixes for maps.
 pub const GPS_FIX: &str = "/gps/fix";
 /// GPS epochs, whole.

@@ -20,7 +20,7 @@ use super::volume::Volume;
 use crate::config::{Config, StoreConfig};
 use crate::io::clock::HostClock;
 use crate::io::records::{Record, topic};
-use crate::msg::{Event, EventBody};
+use crate::msg::{Event, EventBody, WarmState};
 use crate::time::UtcTime;
 
 /// Dates before this are a receiver's error (a week number that rolled over, a clock without a
@@ -129,6 +129,7 @@ impl StoreHandle {
             EventBody::GnssBytes(bytes) => (topic::GPS_SERIAL, bytes.len(), Weight::Small),
             EventBody::CompassBytes(bytes) => (topic::COMPASS_SERIAL, bytes.len(), Weight::Small),
             EventBody::Frame(frame) => (topic::CAMERA_IMAGE, frame.data.len(), Weight::Frame),
+            EventBody::Warm(_) => (topic::WARM_START, size_of::<WarmState>() + 1024, Weight::Small),
             EventBody::Dropped { .. }
             | EventBody::Pulse
             | EventBody::SourceUp(_)

@@ -1,0 +1,182 @@
+//! What outlives a restart: saved to the card once a second, taken back at the start where it is fresh.
+
+use std::time::Duration;
+
+use prost::Message as _;
+
+use super::card::Slot;
+use super::devices::Surroundings;
+use super::supervise::Heart;
+use crate::config::Config;
+use crate::io::clock::HostClock;
+use crate::io::process;
+use crate::io::proto::{host_time, windhover};
+use crate::io::records::warm;
+use crate::io::store::{Recording, StoreHandle};
+use crate::msg::WarmState;
+use crate::time::{MonoTime, Span};
+
+/// Its name among the store's last known states.
+const STATE: &str = "warm";
+
+/// A state older than this is of another flight: the service manager restarts a daemon in seconds.
+const OLDEST: Span = Span::from_ns(120_000_000_000);
+
+/// How long the pipeline waits at the start for the card to tell the state. What devices deliver
+/// meanwhile waits in the inbox.
+const PATIENCE: Span = Span::from_ns(1_500_000_000);
+
+/// Where and as what this process runs: what a state must have in common with it.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct Origin {
+    boot_id: Option<String>,
+    host_from_monotonic: Span,
+    config_crc: u32,
+}
+
+/// Why a state is not continued from.
+#[derive(Clone, Copy, PartialEq, Debug, thiserror::Error)]
+pub enum Stale {
+    /// Not a state of this program.
+    #[error("it is not one of this version")]
+    Unreadable,
+    /// The computer was booted between; the clocks of two boots do not compare.
+    #[error("the computer has been booted since")]
+    AnotherBoot,
+    /// It knows other devices or other mounts.
+    #[error("the configuration has been changed since")]
+    AnotherConfiguration,
+    /// Of another flight, or the future.
+    #[error("it is {0:.0} s old")]
+    Age(f64),
+}
+
+impl Origin {
+    /// This process.
+    pub fn here(config: &Config, clock: HostClock) -> Self {
+        // A configuration that was checked can be written.
+        let text = config.to_toml().unwrap_or_default();
+        Self {
+            boot_id: process::boot_id(),
+            host_from_monotonic: clock.less_monotonic(),
+            config_crc: crc32fast::hash(text.as_bytes()),
+        }
+    }
+
+    /// A state of time `t`, as it is kept.
+    pub fn sign(&self, t: MonoTime, state: &WarmState) -> Vec<u8> {
+        let message = windhover::WarmState {
+            boot_id: self.boot_id.clone().unwrap_or_default(),
+            host_from_monotonic_ns: self.host_from_monotonic.ns(),
+            config_crc: self.config_crc,
+            ..warm::message(t, state)
+        };
+        message.encode_to_vec()
+    }
+
+    /// A state that was kept, on this process's clock, where it is fresh at `now`; and its age. The age
+    /// is told by the monotonic clock, so the computer's date may have been set between.
+    pub fn take_back(&self, kept: &[u8], now: MonoTime) -> Result<(WarmState, Span), Stale> {
+        let message = windhover::WarmState::decode(kept).map_err(|_| Stale::Unreadable)?;
+        let mut state = warm::state(&message).ok_or(Stale::Unreadable)?;
+        if self.boot_id.as_deref() != Some(message.boot_id.as_str()) {
+            return Err(Stale::AnotherBoot);
+        }
+        if self.config_crc != message.config_crc {
+            return Err(Stale::AnotherConfiguration);
+        }
+        let moved_ns = self.host_from_monotonic.ns().wrapping_sub(message.host_from_monotonic_ns);
+        let held_ns = host_time(message.timestamp.as_ref()).ns().wrapping_add(moved_ns);
+        let age = Span::from_ns(now.ns().saturating_sub(held_ns));
+        if age < Span::ZERO || age > OLDEST {
+            return Err(Stale::Age(age.s()));
+        }
+        for arrival in &mut state.arrivals {
+            arrival.t_ns = arrival.t_ns.wrapping_add(moved_ns);
+            arrival.offset_ns = arrival.offset_ns.wrapping_add(moved_ns);
+        }
+        if let Some(filter) = &mut state.filter {
+            filter.t_ns = filter.t_ns.wrapping_add(moved_ns);
+        }
+        Ok((state, age))
+    }
+}
+
+/// Gives the store a state to keep.
+pub fn save(store: &StoreHandle, origin: &Origin, t: MonoTime, state: &WarmState) {
+    store.put_state(STATE, origin.sign(t, state));
+}
+
+/// The state to continue from and its age; `None` where the card has none, does not record, or does not
+/// answer soon; `Some(Err)` where it has one that is not to be used.
+pub fn wait_for(
+    slot: &Slot,
+    origin: &Origin,
+    around: &Surroundings,
+    heart: &Heart,
+) -> Option<Result<(WarmState, Span), Stale>> {
+    let end = around.clock.now() + PATIENCE;
+    while !around.stop.asked() && around.clock.now() < end {
+        heart.beat();
+        if let Some(store) = slot.get() {
+            if let Some(index) = store.index() {
+                return Some(origin.take_back(&index.state(STATE)?, around.clock.now()));
+            }
+            if matches!(store.status().recording, Recording::Stopped(_)) {
+                return None;
+            }
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::msg::{WarmArrival, WarmSite};
+
+    fn origin() -> Origin {
+        Origin { boot_id: Some("b".into()), host_from_monotonic: Span::from_s(1000.0), config_crc: 7 }
+    }
+
+    fn at(s: f64) -> MonoTime {
+        MonoTime::default() + Span::from_s(s)
+    }
+
+    fn state() -> WarmState {
+        let site =
+            WarmSite { datum: [1.0, 2.0, 3.0], ground_height_m: 3.0, geoid_m: 0.0, declination_rad: 0.0 };
+        let arrivals = vec![WarmArrival { t_ns: at(1999.0).ns(), offset_ns: at(1500.0).ns() }];
+        WarmState { site, arrivals, filter: None }
+    }
+
+    #[test]
+    fn a_fresh_state_is_taken_back_as_it_was() {
+        let kept = origin().sign(at(2000.0), &state());
+        assert_eq!(origin().take_back(&kept, at(2003.0)), Ok((state(), Span::from_s(3.0))));
+    }
+
+    #[test]
+    fn a_clock_that_was_set_between_changes_nothing_but_the_scale() {
+        let kept = origin().sign(at(2000.0), &state());
+        let year = 31_536_000.0;
+        let set = Origin { host_from_monotonic: Span::from_s(1000.0 + year), ..origin() };
+        let (taken, age) = set.take_back(&kept, at(2003.0 + year)).expect("fresh");
+        assert_eq!(age, Span::from_s(3.0));
+        assert_eq!(taken.arrivals[0].t_ns, at(1999.0 + year).ns());
+        assert_eq!(taken.arrivals[0].offset_ns, at(1500.0 + year).ns());
+    }
+
+    #[test]
+    fn what_is_old_or_of_another_boot_or_configuration_is_not_used() {
+        let kept = origin().sign(at(2000.0), &state());
+        let refused = |origin: Origin, now: f64| origin.take_back(&kept, at(now)).expect_err("refused");
+        assert_eq!(refused(origin(), 2121.0), Stale::Age(121.0));
+        assert_eq!(refused(origin(), 1999.0), Stale::Age(-1.0));
+        assert_eq!(refused(Origin { boot_id: Some("c".into()), ..origin() }, 2003.0), Stale::AnotherBoot);
+        assert_eq!(refused(Origin { boot_id: None, ..origin() }, 2003.0), Stale::AnotherBoot);
+        assert_eq!(refused(Origin { config_crc: 8, ..origin() }, 2003.0), Stale::AnotherConfiguration);
+        assert_eq!(origin().take_back(&[0xff; 20], at(2003.0)), Err(Stale::Unreadable));
+    }
+}

@@ -1,0 +1,95 @@
+//! A daemon killed in flight and started again goes on with what it knew.
+
+use std::path::Path;
+
+use rustix::process::Signal;
+use windhover::config::TagFamily;
+use windhover::detect::tag_pattern;
+use windhover::io::mcap_read::{McapReader, RawMessage};
+use windhover::io::proto::{host_time, windhover as wh};
+use windhover::io::records::topic;
+use windhover::time::Span;
+
+use super::harness::{Bench, Feeder};
+
+/// Pixels of a cell: a tag of 0.48 m and 8 cells, 3.8 m below a camera of f = 255 px.
+const CELL_PX: usize = 4;
+/// The tag is 0.55 m over ground at 33 m.
+const ALT_MSL_M: f64 = 33.0 + 0.55 + 255.0 * 0.48 / (8 * CELL_PX) as f64;
+
+/// The tag of the bench's vehicle in the middle of the picture.
+fn vehicle_below(bench: &Bench) {
+    let tag = tag_pattern(TagFamily::Tag36h11, 0);
+    let (left, top) = (160 - tag.side() * CELL_PX / 2, 128 - tag.side() * CELL_PX / 2);
+    let cell = |at: usize, first: usize| at.checked_sub(first).map(|px| px / CELL_PX);
+    bench.draw(|u, v| match (cell(u, left), cell(v, top)) {
+        (Some(x), Some(y)) if x < tag.side() && y < tag.side() => 20 + 200 * u8::from(tag.white(x, y)),
+        _ => 90,
+    });
+}
+
+fn messages(flight: &Path) -> Vec<RawMessage> {
+    McapReader::open(flight).expect("readable").collect()
+}
+
+fn of<M: prost::Message + Default>(messages: &[RawMessage], topic: &str) -> Vec<M> {
+    let on_topic = messages.iter().filter(|m| m.channel.topic == topic);
+    on_topic.map(|m| M::decode(&m.data[..]).expect("decodes")).collect()
+}
+
+#[test]
+fn a_restart_in_flight_tracks_within_two_seconds_and_replays() {
+    // Given a daemon that tracks the vehicle below and is killed in flight.
+    let bench = Bench::new();
+    // Frames as they were seen, not as JPEG, so that the replay sees the same.
+    bench.configure(|text| text.replace("[store]", "[store]\nframes = \"png\""));
+    vehicle_below(&bench);
+    let (gps, compass) = bench.lines();
+    let daemon = bench.start();
+    let feeder = Feeder::at_height(gps, compass, ALT_MSL_M);
+    let (_, mut seen) = daemon.wait(&["event=target_tracking"], 20.0);
+    for _ in 0..5 {
+        seen = daemon.wait_from(seen, &["event=health"], 5.0).1;
+    }
+    let before = daemon.log().lines().count();
+    daemon.kill();
+
+    // When it is started again, then it continues and tracks.
+    let daemon = bench.start();
+    let (line, seen) = daemon.wait_from(before, &["event=warm_start"], 10.0);
+    assert!(line.contains("continues from"), "{line}");
+    let (_, mut seen) = daemon.wait_from(seen, &["event=target_tracking"], 20.0);
+    for _ in 0..2 {
+        seen = daemon.wait_from(seen, &["event=health"], 5.0).1;
+    }
+    daemon.signal(Signal::TERM);
+    assert!(daemon.ended(4.0).0.success());
+    feeder.stop();
+
+    // Then, by the daemon's own records, from the first frame to the first tracked state it is not two
+    // seconds, and the map has not moved.
+    let flights = bench.flights();
+    assert_eq!(flights.len(), 2, "{flights:?}");
+    let (first, second) = (messages(&flights[0]), messages(&flights[1]));
+    let states: Vec<wh::TargetState> = of(&second, &topic::target_state("ugv"));
+    let tracked = states.iter().find(|s| s.status == i32::from(wh::TrackStatus::Tracking)).expect("tracks");
+    let taken = host_time(tracked.timestamp.as_ref()) - host_time(states[0].timestamp.as_ref());
+    assert!(taken < Span::from_s(2.0), "{taken:?} from the first frame to tracking");
+    let datums = |flight: &[RawMessage]| -> Vec<[f64; 3]> {
+        of::<wh::Datum>(flight, topic::DATUM).iter().map(|d| [d.lat_deg, d.lon_deg, d.height_m]).collect()
+    };
+    assert_eq!((datums(&first).len(), datums(&first)), (1, datums(&second)));
+    let states: Vec<wh::WarmState> = of(&second, topic::WARM_START);
+    assert_eq!(states.len(), 1, "what it continued from is in the flight");
+
+    // When the second flight is replayed, then the same is estimated.
+    let flight = flights[1].to_string_lossy().into_owned();
+    bench.command(&["replay", &flight, "--out", "again.mcap"]);
+    let again = messages(&bench.path("again.mcap"));
+    let rows = |flight: &[RawMessage]| -> Vec<wh::TargetState> { of(flight, &topic::target_state("ugv")) };
+    let (flown, replayed) = (rows(&second), rows(&again));
+    assert!(flown.len() > 10, "{}", flown.len());
+    for (flown, replayed) in flown.iter().zip(&replayed) {
+        assert_eq!(flown, replayed);
+    }
+}
