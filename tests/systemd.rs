@@ -41,3 +41,17 @@ fn the_unit_watches_and_restarts() {
     let stop = unit.lines().find_map(|line| line.strip_prefix("TimeoutStopSec="));
     assert_eq!(stop, Some("5s"));
 }
+
+#[test]
+fn the_cards_units_are_what_systemd_takes() {
+    for unit in ["var-lib-windhover.mount", "windhover-card.service"] {
+        let path = format!("{}/systemd/{unit}", env!("CARGO_MANIFEST_DIR"));
+        let run = Command::new("systemd-analyze").args(["verify", "--man=no", &path]).output();
+        let Ok(output) = run else {
+            eprintln!("skipped: systemd-analyze is not installed");
+            return;
+        };
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.success() && !said.contains(unit), "{said}");
+    }
+}

@@ -203,7 +203,7 @@ impl Pipeline {
         out.push(notice(t, NoticeKind::DatumSet, Some(Source::Gps), words));
         out.push(Output::Datum(t, datum));
         let mut joint = Estimator::new(&self.config, &settled.site);
-        if let Some(warm) = self.warm.take() {
+        if let Some(warm) = self.warm.take().filter(|_| settled.continued) {
             joint.resume(warm);
         }
         let paper = PaperEstimator::new(&self.config, &settled.site);

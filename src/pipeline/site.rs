@@ -26,6 +26,8 @@ pub(super) struct SettledSite {
     pub(super) site: Site,
     /// The same as plain numbers, for a warm start.
     pub(super) warm: WarmSite,
+    /// Whether it is an earlier run's.
+    pub(super) continued: bool,
     pub(super) declination_notice: Option<String>,
     pub(super) ground_notice: Option<String>,
 }
@@ -45,7 +47,7 @@ impl SiteFinder {
         let at = position(epoch)?;
         let first = *self.first.get_or_insert(at);
         if let Some(warm) = self.warm.take().filter(|warm| agrees(warm, &at, config)) {
-            return Some(self.settled(warm, None, config));
+            return Some(SettledSite { continued: true, ..self.settled(warm, None, config) });
         }
         self.seen += 1;
         let geoid_m = epoch.geoid_m.unwrap_or(0.0);
@@ -93,7 +95,7 @@ impl SiteFinder {
             }
         };
         let site = Site { frame, ground, declination_rad: warm.declination_rad };
-        SettledSite { site, warm, declination_notice, ground_notice }
+        SettledSite { site, warm, continued: false, declination_notice, ground_notice }
     }
 
     /// Declination in radians and what to say of it; `None` while waiting for a date.

@@ -109,7 +109,8 @@ fn epoch(n: u32, alt_msl_m: f64) -> String {
     let (seconds, tenths) = (n / 5, n % 5 * 2);
     let time = format!("1504{:02}.{tenths}", seconds % 60);
     let rmc = sentence(&format!("GPRMC,{time},A,3842.20000,N,00911.00000,W,000.0,000.0,181126,003.4,W"));
-    let gga = sentence(&format!("GPGGA,{time},3842.20000,N,00911.00000,W,1,09,0.9,{alt_msl_m:.1},M,50.0,M,,"));
+    let gga =
+        sentence(&format!("GPGGA,{time},3842.20000,N,00911.00000,W,1,09,0.9,{alt_msl_m:.1},M,50.0,M,,"));
     rmc + &gga
 }
 

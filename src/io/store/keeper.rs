@@ -16,7 +16,7 @@ use super::rebuild;
 use super::retention;
 use super::seal::{self, Sealing};
 use super::shared::Shared;
-use super::status::StoreNotice;
+use super::status::{Recording, StoreNotice};
 use super::volume::{StoreResult, Volume};
 use crate::config::StoreConfig;
 use crate::io::clock::HostClock;
@@ -79,6 +79,8 @@ pub(super) struct Keeper {
     present: Option<(u32, String)>,
     /// Whether the index was told to be complete since it was opened.
     complete: bool,
+    /// The file system the index is on.
+    device: Option<u64>,
 }
 
 impl Keeper {
@@ -96,12 +98,14 @@ impl Keeper {
             tasks: VecDeque::new(),
             present: None,
             complete: false,
+            device: None,
         }
     }
 
     /// Runs until the recorder is gone.
     pub(super) fn run(mut self, inbox: &Receiver<Message>) {
         loop {
+            self.leave_lost_card();
             self.open_index();
             let wait = if self.tasks.is_empty() { 100 } else { 0 };
             match inbox.recv_timeout(Duration::from_millis(wait)) {
@@ -185,14 +189,23 @@ impl Keeper {
         self.tried_at = Some(self.clock.now());
     }
 
+    /// An index that is open keeps a card that was taken away busy, and is of no use.
+    fn leave_lost_card(&mut self) {
+        if self.index.is_some() && self.volume.device().ok() != self.device {
+            self.close_index();
+        }
+    }
+
     /// Opens the index once the card is there; an unusable one is moved aside and made again.
     fn open_index(&mut self) {
         let now = self.clock.now();
         let waiting = self.tried_at.is_some_and(|tried| now - tried < RETRY_INDEX);
-        if self.index.is_some() || self.present.is_none() || waiting {
+        let stopped = matches!(self.shared.status().recording, Recording::Stopped(_));
+        if self.index.is_some() || self.present.is_none() || waiting || stopped {
             return;
         }
         self.tried_at = Some(now);
+        self.device = self.volume.device().ok();
         let dir = self.volume.path(INDEX);
         let opened = match Index::open(&dir) {
             Err(error @ IndexError::Unusable { .. }) => {

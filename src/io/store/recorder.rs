@@ -19,7 +19,7 @@ use super::record::{ChannelDef, DROPOUT_TOPIC, RawRecord, STATE_TOPIC, Weight};
 use super::segment::Head;
 use super::shared::Shared;
 use super::status::{Durations, Recording, StoreNotice};
-use super::volume::{StoreError, StoreResult, Volume};
+use super::volume::{StoreError, StoreResult, Volume, device_of};
 use crate::config::StoreConfig;
 use crate::io::clock::HostClock;
 use crate::time::{MonoTime, Span};
@@ -59,6 +59,8 @@ pub(super) struct Recorder {
     committed: Durations,
     dropouts: Arc<ChannelDef>,
     lock: Option<RecorderLock>,
+    /// The file system recorded to.
+    device: Option<u64>,
 }
 
 impl Recorder {
@@ -84,6 +86,7 @@ impl Recorder {
             committed: Durations::default(),
             dropouts: ChannelDef::json(DROPOUT_TOPIC),
             lock: None,
+            device: None,
         }
     }
 
@@ -175,6 +178,9 @@ impl Recorder {
         if self.missed.count() > 0 {
             self.record_dropout(now);
         }
+        if let Err(error) = self.same_card() {
+            return self.fail(&error);
+        }
         let Some(flight) = &mut self.flight else { return };
         let result = flight.commit(unsigned(now));
         let after = self.clock.now();
@@ -198,6 +204,15 @@ impl Recorder {
         if free.is_some_and(|free| free < floor) {
             self.pause_for_space(floor);
         }
+    }
+
+    /// A file that is open outlives the unmounting of its card: what is written to it then reaches nobody.
+    fn same_card(&self) -> StoreResult<()> {
+        if Some(self.volume.device()?) == self.device {
+            return Ok(());
+        }
+        let gone = std::io::Error::other("the card was taken away or exchanged");
+        Err(StoreError::new("go on recording to", self.volume.root(), gone))
     }
 
     fn pause_for_space(&mut self, floor: u64) {
@@ -265,6 +280,7 @@ impl Recorder {
         // The lock of a card that was pulled is worth nothing: it is taken anew.
         self.lock = None;
         self.lock = Some(RecorderLock::acquire(self.volume.root())?);
+        self.device = Some(self.volume.device()?);
         let now_ns = unsigned(self.clock.now());
         let start = self.shared.start();
         if let Some(flight) = &mut self.flight {
@@ -356,15 +372,9 @@ impl Recorder {
 
 /// An empty mount point is a directory of the system card: recording there would fill it.
 fn require_mount(volume: &Volume) -> StoreResult<()> {
-    use std::os::unix::fs::MetadataExt;
     let root = volume.root();
-    let device = |path: &std::path::Path| {
-        std::fs::metadata(path)
-            .map(|m| m.dev())
-            .map_err(|e| StoreError::new("find the data card at", path, e))
-    };
     let parent = root.parent().unwrap_or(root);
-    if device(root)? == device(parent)? {
+    if volume.device()? == device_of(parent)? {
         let missing = std::io::Error::other("nothing is mounted there (the data card is missing?)");
         return Err(StoreError::new("record to", root, missing));
     }

@@ -4,7 +4,7 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::ErrorKind;
-use std::os::unix::fs::FileExt;
+use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -39,6 +39,12 @@ impl StoreError {
 /// Result of a file operation.
 pub type StoreResult<T> = Result<T, StoreError>;
 
+/// The file system of a path.
+pub fn device_of(path: &Path) -> StoreResult<u64> {
+    let told = std::fs::metadata(path).map_err(|e| StoreError::new("find the data card at", path, e))?;
+    Ok(told.dev())
+}
+
 /// A directory tree on the card. Paths given to it are relative to its root.
 #[derive(Clone, Debug)]
 pub struct Volume {
@@ -65,6 +71,11 @@ impl Volume {
     /// The absolute path of a relative one.
     pub fn path(&self, relative: &str) -> PathBuf {
         self.root.join(relative)
+    }
+
+    /// The file system that is there now: a card that was taken away or exchanged is another.
+    pub fn device(&self) -> StoreResult<u64> {
+        device_of(&self.root)
     }
 
     fn fault(&self) -> std::io::Result<()> {
