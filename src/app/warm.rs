@@ -47,8 +47,8 @@ pub enum Stale {
     #[error("the configuration has been changed since")]
     AnotherConfiguration,
     /// Of another flight, or the future.
-    #[error("it is {0:.0} s old")]
-    Age(f64),
+    #[error("it is {:.0} s old", .0.s())]
+    Age(Span),
 }
 
 impl Origin {
@@ -89,7 +89,7 @@ impl Origin {
         let held_ns = host_time(message.timestamp.as_ref()).ns().wrapping_add(moved_ns);
         let age = Span::from_ns(now.ns().saturating_sub(held_ns));
         if age < Span::ZERO || age > OLDEST {
-            return Err(Stale::Age(age.s()));
+            return Err(Stale::Age(age));
         }
         for arrival in &mut state.arrivals {
             arrival.t_ns = arrival.t_ns.wrapping_add(moved_ns);
@@ -172,8 +172,8 @@ mod tests {
     fn what_is_old_or_of_another_boot_or_configuration_is_not_used() {
         let kept = origin().sign(at(2000.0), &state());
         let refused = |origin: Origin, now: f64| origin.take_back(&kept, at(now)).expect_err("refused");
-        assert_eq!(refused(origin(), 2121.0), Stale::Age(121.0));
-        assert_eq!(refused(origin(), 1999.0), Stale::Age(-1.0));
+        assert_eq!(refused(origin(), 2121.0), Stale::Age(Span::from_s(121.0)));
+        assert_eq!(refused(origin(), 1999.0), Stale::Age(Span::from_s(-1.0)));
         assert_eq!(refused(Origin { boot_id: Some("c".into()), ..origin() }, 2003.0), Stale::AnotherBoot);
         assert_eq!(refused(Origin { boot_id: None, ..origin() }, 2003.0), Stale::AnotherBoot);
         assert_eq!(refused(Origin { config_crc: 8, ..origin() }, 2003.0), Stale::AnotherConfiguration);
