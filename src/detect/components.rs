@@ -1,17 +1,21 @@
 //! Connected dark regions from runs of bits: no per-pixel labels, no hash maps.
+//!
+//! What a run touches in the row above is counted, not searched: the runs above that ended before it and
+//! those that have begun by its end are population counts of the row's words. That has no branches to
+//! mispredict, which on textured ground is where the time goes.
 
 use super::binarise::Bitmap;
+use super::simd::{Kernel, Simd};
 
-/// Dark pixels `start..end` of a row, and the label they were given first.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+/// Dark pixels `start..end` of a row.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 struct Run {
     start: u16,
     end: u16,
-    label: u32,
 }
 
 /// A connected dark region: its box (inclusive) and area, pixels.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub(super) struct Component {
     pub left: u16,
     pub right: u16,
@@ -29,11 +33,16 @@ impl Component {
         usize::from(self.bottom - self.top) + 1
     }
 
-    fn add(&mut self, start: u16, end: u16, v: u16) {
-        self.left = self.left.min(start);
-        self.right = self.right.max(end - 1);
+    /// No pixel: what others are added to.
+    const NOTHING: Self = Self { left: u16::MAX, right: 0, top: u16::MAX, bottom: 0, area: 0 };
+
+    #[inline(always)]
+    fn add(&mut self, run: &Run, v: u16) {
+        self.left = self.left.min(run.start);
+        self.right = self.right.max(run.end - 1);
+        self.top = self.top.min(v);
         self.bottom = v;
-        self.area += u32::from(end - start);
+        self.area += u32::from(run.end - run.start);
     }
 
     fn merge(&mut self, other: &Self) {
@@ -48,14 +57,47 @@ impl Component {
 /// Leftmost and rightmost pixel of each row of a component, top row first.
 pub(super) type Outline<'a> = &'a [(u16, u16)];
 
+/// Where runs start and end in 64 pixels of a row, and how many have before.
+#[derive(Clone, Copy, Debug, Default)]
+struct Marks {
+    starts: u64,
+    ends: u64,
+    started: u32,
+    ended: u32,
+}
+
+impl Marks {
+    /// Runs that end before column `u`.
+    #[inline(always)]
+    fn ended_before(row: &[Self], u: u16) -> usize {
+        let m = &row[usize::from(u >> 6)];
+        m.ended as usize + (m.ends & ((1 << (u & 63)) - 1)).count_ones() as usize
+    }
+
+    /// Runs that start at column `u` or before.
+    #[inline(always)]
+    fn started_by(row: &[Self], u: u16) -> usize {
+        let m = &row[usize::from(u >> 6)];
+        m.started as usize + (m.starts & (u64::MAX >> (63 - (u & 63)))).count_ones() as usize
+    }
+}
+
 /// Labels bitmaps; keeps its buffers.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Labeller {
     runs: Vec<Run>,
-    /// Where each row's runs start, and where the last row's end. Each row is closed by `SENTINEL`.
+    labels: Vec<u32>,
+    /// Where each row's runs start, and where the last row's end.
     rows: Vec<u32>,
+    /// Marks of the row above and of the row at hand.
+    marks: [Vec<Marks>; 2],
     /// Label above each label; a root is its own.
     parents: Vec<u32>,
+    /// How many labels there are; buffers only grow.
+    count: usize,
+    /// Labels found to be of one component, and how many pairs there are.
+    joins: Vec<(u32, u32)>,
+    joined: usize,
     components: Vec<Component>,
     /// Where a label's outline starts, `NOT_KEPT` where its component is not kept.
     outline_at: Vec<u32>,
@@ -65,14 +107,11 @@ pub(super) struct Labeller {
 
 const NOT_KEPT: u32 = u32::MAX;
 
-/// Ends every row of runs: touches nothing and is passed by nothing.
-const SENTINEL: Run = Run { start: u16::MAX, end: u16::MAX, label: 0 };
-
 impl Labeller {
     /// Finds the components of a bitmap (pixels that touch by a side or a corner) and outlines those that
     /// `keep` accepts. Bitmaps are less than 65 000 pixels wide and high.
-    pub fn label(&mut self, bits: &Bitmap, keep: impl Fn(&Component) -> bool) {
-        self.find_runs(bits);
+    pub fn label(&mut self, bits: &Bitmap, simd: Simd, keep: impl Fn(&Component) -> bool) {
+        simd.run(FindRuns { labeller: self, bits });
         self.gather(keep);
         self.outline();
     }
@@ -86,64 +125,116 @@ impl Labeller {
     }
 
     /// Splits rows into runs and labels them by what they touch in the row above.
+    #[inline(always)]
     fn find_runs(&mut self, bits: &Bitmap) {
-        for buffer in [&mut self.rows, &mut self.parents] {
-            buffer.clear();
+        self.rows.clear();
+        let words = bits.width.div_ceil(64);
+        for marks in &mut self.marks {
+            // One more than there are words: a run may end just behind the last.
+            marks.clear();
+            marks.resize(words + 1, Marks::default());
         }
-        self.components.clear();
-        self.runs.clear();
-        self.runs.push(SENTINEL);
-        let mut above = 0;
+        let (mut above, mut first) = (0, 0);
+        (self.count, self.joined) = (0, 0);
         for v in 0..bits.height {
-            let first = self.runs.len();
             self.rows.push(first as u32);
-            split_row(bits.row(v), &mut self.runs);
-            self.runs.push(SENTINEL);
-            self.label_row(above, first, v as u16);
-            above = first;
+            let after = first + self.split_row(bits.row(v), first);
+            self.label_row(above, first..after, v as u16);
+            self.marks.swap(0, 1);
+            (above, first) = (first, after);
         }
-        self.rows.push(self.runs.len() as u32);
+        self.rows.push(first as u32);
+        for &(a, b) in &self.joins[..self.joined] {
+            union(&mut self.parents, a, b);
+        }
     }
 
-    /// Labels the runs from `first` on; those of the row above start at `above`.
-    fn label_row(&mut self, above: usize, first: usize, v: u16) {
-        let (upper, lower) = self.runs.split_at_mut(first);
-        let upper = &upper[above..];
-        let mut up = 0;
-        for run in lower.iter_mut() {
-            let (start, end) = (run.start, run.end);
-            if start == u16::MAX {
-                break;
-            }
-            // Runs that end before this one starts, even diagonally, touch none further right either.
-            while upper[up].end < start {
-                up += 1;
-            }
-            if upper[up].start > end {
-                run.label = self.parents.len() as u32;
-                self.parents.push(run.label);
-                self.components.push(Component {
-                    left: start,
-                    right: end - 1,
-                    top: v,
-                    bottom: v,
-                    area: u32::from(end - start),
-                });
-                continue;
-            }
-            let mut label = root(&mut self.parents, upper[up].label);
-            while upper[up + 1].start <= end {
-                up += 1;
-                label = union(&mut self.parents, label, upper[up].label);
-            }
-            run.label = label;
-            self.components[label as usize].add(start, end, v);
+    /// Writes the runs of a row from `first` on, and its marks; how many there are.
+    #[inline(always)]
+    fn split_row(&mut self, words: &[u64], first: usize) -> usize {
+        // A pixel may start or end a run: in the worst case every second one starts one.
+        let most = first + words.len() * 32 + 8;
+        if self.runs.len() < most {
+            self.runs.resize(most, Run::default());
         }
+        let marks = &mut self.marks[1][..words.len() + 1];
+        let (mut carry, mut started, mut ended) = (0, first, first);
+        for (index, (&word, mark)) in words.iter().zip(marks.iter_mut()).enumerate() {
+            let before = word << 1 | carry;
+            carry = word >> 63;
+            let (mut starts, mut ends) = (word & !before, before & !word);
+            *mark = Marks { starts, ends, started: (started - first) as u32, ended: (ended - first) as u32 };
+            let base = (index * 64) as u16;
+            let (next_started, next_ended) =
+                (started + starts.count_ones() as usize, ended + ends.count_ones() as usize);
+            while starts | ends != 0 {
+                // Four at a time, whether they are there or not: what is too much is written over.
+                let a = &mut self.runs[started..started + 4];
+                for run in a {
+                    run.start = base.wrapping_add(starts.trailing_zeros() as u16);
+                    starts &= starts.wrapping_sub(1);
+                }
+                let b = &mut self.runs[ended..ended + 4];
+                for run in b {
+                    run.end = base.wrapping_add(ends.trailing_zeros() as u16);
+                    ends &= ends.wrapping_sub(1);
+                }
+                started += 4;
+                ended += 4;
+            }
+            (started, ended) = (next_started, next_ended);
+        }
+        if ended < started {
+            self.runs[ended].end = (words.len() * 64) as u16;
+        }
+        marks[words.len()] =
+            Marks { starts: 0, ends: 0, started: (started - first) as u32, ended: (ended - first) as u32 };
+        started - first
+    }
+
+    /// Labels the runs of a row; those of the row above start at `above`. Nothing branches on what a run
+    /// touches, save where it touches three or more.
+    #[inline(always)]
+    fn label_row(&mut self, above: usize, row: std::ops::Range<usize>, v: u16) {
+        let marks = &self.marks[0][..];
+        // One more than there can be: what is too much is written over.
+        let most = row.end + 1;
+        if self.labels.len() < most {
+            self.labels.resize(most, 0);
+            self.parents.resize(most, 0);
+            self.components.resize(most, Component::default());
+            self.joins.resize(most, (0, 0));
+        }
+        let (mut count, mut joined) = (self.count, self.joined);
+        let (runs, labels) = (&self.runs[row.clone()], &mut self.labels[above..most]);
+        let (parents, components) = (&mut self.parents[..most], &mut self.components[..most]);
+        let joins = &mut self.joins[..most];
+        for (run, k) in runs.iter().zip(row.start - above..) {
+            // Runs touch by corners too: one above may end where this starts, or start where it ends.
+            let from = Marks::ended_before(marks, run.start);
+            let to = Marks::started_by(marks, run.end);
+            let is_new = from >= to;
+            parents[count] = count as u32;
+            components[count] = Component::NOTHING;
+            let own = if is_new { count as u32 } else { labels[from] };
+            count += usize::from(is_new);
+            labels[k] = own;
+            components[own as usize].add(run, v);
+            let other = labels[from + 1];
+            joins[joined] = (own, other);
+            joined += usize::from((to > from + 1) & (own != other));
+            if to > from + 2 {
+                for &other in &labels[from + 2..to] {
+                    union(parents, own, other);
+                }
+            }
+        }
+        (self.count, self.joined) = (count, joined);
     }
 
     /// Sums labels up into components and finds place for the outlines of those kept.
     fn gather(&mut self, keep: impl Fn(&Component) -> bool) {
-        for label in 0..self.parents.len() {
+        for label in 0..self.count {
             let parent = self.parents[label] as usize;
             if parent != label {
                 // A parent comes before its children, so it is a root by now.
@@ -156,7 +247,7 @@ impl Labeller {
         self.kept.clear();
         self.outline_at.clear();
         let mut total = 0;
-        for (label, &parent) in self.parents.iter().enumerate() {
+        for (label, &parent) in self.parents[..self.count].iter().enumerate() {
             let at = if parent as usize != label {
                 self.outline_at[parent as usize]
             } else if keep(&self.components[label]) {
@@ -178,10 +269,11 @@ impl Labeller {
             return;
         }
         for (v, bounds) in self.rows.windows(2).enumerate() {
-            for run in &self.runs[bounds[0] as usize..bounds[1] as usize - 1] {
-                let at = self.outline_at[run.label as usize];
+            let row = bounds[0] as usize..bounds[1] as usize;
+            for (run, &label) in self.runs[row.clone()].iter().zip(&self.labels[row]) {
+                let at = self.outline_at[label as usize];
                 if at != NOT_KEPT {
-                    let top = self.components[self.parents[run.label as usize] as usize].top;
+                    let top = self.components[self.parents[label as usize] as usize].top;
                     let (left, right) = &mut self.outlines[at as usize + v - usize::from(top)];
                     *left = run.start.min(*left);
                     *right = (run.end - 1).max(*right);
@@ -191,45 +283,27 @@ impl Labeller {
     }
 }
 
-/// Appends the runs of a row of bits.
-fn split_row(words: &[u64], runs: &mut Vec<Run>) {
-    // A set bit where a pixel differs from the one before it; every second one ends a run.
-    let (mut carry, mut open, mut start) = (0, false, 0);
-    for (index, &word) in words.iter().enumerate() {
-        let mut changes = word ^ (word << 1 | carry);
-        carry = word >> 63;
-        let base = (index * 64) as u16;
-        if open && changes != 0 {
-            let end = base + changes.trailing_zeros() as u16;
-            changes &= changes - 1;
-            runs.push(Run { start, end, label: 0 });
-            open = false;
-        }
-        while changes != 0 {
-            start = base + changes.trailing_zeros() as u16;
-            changes &= changes - 1;
-            if changes == 0 {
-                open = true;
-                break;
-            }
-            let end = base + changes.trailing_zeros() as u16;
-            changes &= changes - 1;
-            runs.push(Run { start, end, label: 0 });
-        }
-    }
-    if open {
-        runs.push(Run { start, end: (words.len() * 64) as u16, label: 0 });
+/// `Labeller::find_runs`, with the instructions this processor has.
+struct FindRuns<'a> {
+    labeller: &'a mut Labeller,
+    bits: &'a Bitmap,
+}
+
+impl Kernel for FindRuns<'_> {
+    #[inline(always)]
+    fn run(self) {
+        self.labeller.find_runs(self.bits);
     }
 }
 
-/// Joins two sets, given the first one's root; the earlier root stays root.
-fn union(parents: &mut [u32], a: u32, b: u32) -> u32 {
-    let b = root(parents, b);
-    let (first, second) = (a.min(b), a.max(b));
-    parents[second as usize] = first;
-    first
+/// Joins two sets; the earlier root stays root.
+#[inline(always)]
+fn union(parents: &mut [u32], a: u32, b: u32) {
+    let (a, b) = (root(parents, a), root(parents, b));
+    parents[a.max(b) as usize] = a.min(b);
 }
 
+#[inline(always)]
 fn root(parents: &mut [u32], mut i: u32) -> u32 {
     loop {
         let parent = parents[i as usize];
@@ -299,7 +373,7 @@ mod tests {
                 .collect();
             let bits = Bitmap::from_pixels(width, height, &dark);
             let mut labeller = Labeller::default();
-            labeller.label(&bits, |_| true);
+            labeller.label(&bits, Simd::best(), |_| true);
             let mut labelled: Vec<Component> = labeller.kept().map(|(c, _)| *c).collect();
             let mut expected = flooded(&bits);
             let key = |c: &Component| (c.top, c.left, c.bottom, c.right, c.area);

@@ -75,7 +75,7 @@ impl DiscFinder {
                 && w.min(h) <= sizes.1 + 2.0
                 && w.min(h) >= LEAST_AXES * 0.9 * w.max(h)
         };
-        self.labeller.label(&self.bits, keep);
+        self.labeller.label(&self.bits, self.simd, keep);
         for (component, outline) in self.labeller.kept() {
             if let Some(rough) = ellipse_of(component, outline)
                 && let Some(blob) = refine(image, &rough)

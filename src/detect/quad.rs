@@ -50,13 +50,17 @@ impl QuadFinder {
     /// The quadrilateral that a component's hull nearly is, half a pixel outside the centres of its
     /// outermost pixels; `None` where the hull is of another shape.
     pub fn quad(&mut self, component: &Component, outline: Outline<'_>, limits: SizeLimits) -> Option<Quad> {
+        // Solid blobs, most of what there is, are told by their rows alone: a tag has light cells inside, at
+        // least a seventh of its square.
+        let rows: u32 = outline.iter().map(|(left, right)| u32::from(right - left) + 1).sum();
+        if component.area as f32 > MOST_FILL * rows as f32 {
+            return None;
+        }
         self.find_hull(component, outline);
         let hull_area = polygon_area(&self.hull);
         // What its pixels cover, not only their centres.
         let covered = hull_area + 1.0 + 0.5 * perimeter(&self.hull);
-        let fill = component.area as f32 / covered;
-        // Every tag has light cells inside: at least a seventh of its square.
-        if covered < 0.5 * limits.least * limits.least || fill > MOST_FILL {
+        if covered < 0.5 * limits.least * limits.least {
             return None;
         }
         let quad = largest_quad(&self.hull)?;

@@ -10,13 +10,19 @@ use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
 use super::family::Family;
 use super::homography::Homography;
-use super::quad::{Quad, bilinear, distance};
+use super::quad::{Point, Quad, distance};
+use super::simd::{Kernel, Simd};
 use crate::msg::ImageView;
 
 const PARAMETERS: usize = 10;
+/// `PARAMETERS` in whole vector registers.
+const PADDED: usize = 12;
 
 type Information = SMatrix<f64, PARAMETERS, PARAMETERS>;
 type Row = SVector<f64, PARAMETERS>;
+
+/// Where the corners are in ξ and η.
+const CORNERS: [(f64, f64); 4] = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
 
 /// A refined tag.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -30,18 +36,18 @@ pub(super) struct Refined {
 /// A point on an edge between a dark and a light cell.
 #[derive(Clone, Copy, PartialEq, Debug)]
 struct EdgePoint {
-    xi: f64,
-    eta: f64,
+    xi: f32,
+    eta: f32,
     /// From dark to light in tag coordinates.
-    light: [f64; 2],
+    light: [f32; 2],
 }
 
-/// One located edge: `residual` px along the normal, ∂/∂parameters, weight.
+/// One located edge: `residual` px along the normal, ∂/∂parameters (padded), weight.
 #[derive(Clone, Copy, Debug)]
 struct Located {
-    row: Row,
-    residual: f64,
-    strength: f64,
+    row: [f32; PADDED],
+    residual: f32,
+    strength: f32,
 }
 
 /// Curvature that a wide lens gives straight lines, 1/px: 0.18 r² distortion at a focal length of 1000 px
@@ -61,14 +67,27 @@ const NEIGHBOURS: f64 = 4.5;
 /// What stays of an edge's error when noise is averaged away: sampling, neighbouring cells, print. Pixels.
 const FLOOR_PX: f64 = 0.02;
 
+/// A step that moves no corner further is the last, pixels: each is about a third of the one before.
+const SETTLED_PX: f64 = 0.02;
+
+/// Weights that follow residuals make each step about a third too short.
+const OVERSTEP: f64 = 1.4;
+
 /// Finds edges and fits them; keeps its buffers.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub(super) struct Refiner {
+    simd: Simd,
     points: Vec<EdgePoint>,
     located: Vec<Located>,
+    /// Whether the tag's cells, its ring included, are light, row by row.
+    lights: Vec<bool>,
 }
 
 impl Refiner {
+    pub fn new(simd: Simd) -> Self {
+        Self { simd, points: Vec::new(), located: Vec::new(), lights: Vec::new() }
+    }
+
     /// Refines corners given in the tag's own order; `None` where too few edges are seen or the fit leaves
     /// what was given.
     pub fn refine(
@@ -87,15 +106,17 @@ impl Refiner {
         let mut variance = 0.0;
         for round in 0..6 {
             let half = if round == 0 { (0.7 * cell).clamp(1.5, 6.0) } else { (0.5 * cell).clamp(1.25, 4.0) };
-            self.locate(image, &model, half, if round == 0 { 2 } else { 1 });
+            self.locate(image, &model, half as f32, if round == 0 { 2 } else { 1 });
             if self.located.len() < 24 {
                 return None;
             }
             let spread = self.spread();
+
             let (step, info, var) = self.solve(&model, bow, spread)?;
-            model.theta += step;
+            let before = model;
+            model.theta += step * if round == 0 { 1.0 } else { OVERSTEP };
             (information, variance) = (info, var);
-            if round > 0 && step.rows(0, 6).amax() < 0.005 {
+            if round > 0 && model.moved(&before) < SETTLED_PX {
                 break;
             }
         }
@@ -111,63 +132,32 @@ impl Refiner {
         self.points.clear();
         let w = family.width as i32;
         let per_cell = (cell / 1.4).clamp(2.0, 4.0) as usize;
-        let light = |x: i32, y: i32| family.is_light(id, x, y);
-        let scale = 2.0 / f64::from(w);
+        self.lights.clear();
+        let around = (-1..=w).flat_map(|y| (-1..=w).map(move |x| (x, y)));
+        self.lights.extend(around.map(|(x, y)| family.is_light(id, x, y) == Some(true)));
+        let light = |x: i32, y: i32| self.lights[((y + 1) * (w + 2) + x + 1) as usize];
+        let scale = 2.0 / w as f32;
         for y in 0..w {
             for x in 0..=w {
-                if let (Some(a), Some(b)) = (light(x - 1, y), light(x, y))
-                    && a != b
-                {
-                    for k in 0..per_cell {
-                        let t = (k as f64 + 0.5) / per_cell as f64;
-                        let sign = if b { 1.0 } else { -1.0 };
-                        let along = (f64::from(y) + t) * scale - 1.0;
-                        self.points.push(EdgePoint {
-                            xi: f64::from(x) * scale - 1.0,
-                            eta: along,
-                            light: [sign, 0.0],
-                        });
+                let edge = x as f32 * scale - 1.0;
+                let (upright, level) = ((light(x - 1, y), light(x, y)), (light(y, x - 1), light(y, x)));
+                for k in 0..per_cell {
+                    let along = (y as f32 + (k as f32 + 0.5) / per_cell as f32) * scale - 1.0;
+                    let sign = |to: bool| if to { 1.0 } else { -1.0 };
+                    if upright.0 != upright.1 {
+                        self.points.push(EdgePoint { xi: edge, eta: along, light: [sign(upright.1), 0.0] });
                     }
-                }
-                if let (Some(a), Some(b)) = (light(y, x - 1), light(y, x))
-                    && a != b
-                {
-                    for k in 0..per_cell {
-                        let t = (k as f64 + 0.5) / per_cell as f64;
-                        let sign = if b { 1.0 } else { -1.0 };
-                        let along = (f64::from(y) + t) * scale - 1.0;
-                        self.points.push(EdgePoint {
-                            xi: along,
-                            eta: f64::from(x) * scale - 1.0,
-                            light: [0.0, sign],
-                        });
+                    if level.0 != level.1 {
+                        self.points.push(EdgePoint { xi: along, eta: edge, light: [0.0, sign(level.1)] });
                     }
                 }
             }
         }
     }
 
-    fn locate(&mut self, image: ImageView<'_>, model: &Model, half: f64, every: usize) {
-        self.located.clear();
-        for point in self.points.iter().step_by(every) {
-            let (p, jacobian) = model.at(point.xi, point.eta);
-            // The normal of the edge in the image: across the direction in which it runs.
-            let (d_xi, d_eta) = model.directions(point.xi, point.eta);
-            let along = d_eta * point.light[0] - d_xi * point.light[1];
-            let towards = d_xi * point.light[0] + d_eta * point.light[1];
-            let length = along.norm();
-            if !(length > 1e-9) {
-                continue;
-            }
-            let mut n = Vector2::new(-along.y, along.x) / length;
-            if n.dot(&towards) < 0.0 {
-                n = -n;
-            }
-            if let Some((offset, strength)) = edge_offset(image, p, n, half) {
-                let row: Row = jacobian.tr_mul(&n);
-                self.located.push(Located { row, residual: offset, strength });
-            }
-        }
+    fn locate(&mut self, image: ImageView<'_>, model: &Model, half: f32, every: usize) {
+        let Self { points, located, .. } = self;
+        self.simd.run(Locate { points, located, image, model: model.narrow(), half, every });
     }
 
     /// Robust spread of the residuals, pixels.
@@ -188,24 +178,25 @@ impl Refiner {
     }
 
     fn solve(&self, model: &Model, bow: f64, spread: f64) -> Option<(Row, Information, f64)> {
-        let mut information = Information::zeros();
-        let mut right = Row::zeros();
+        let mut sums = [[0.0f32; PADDED]; PARAMETERS];
+        let mut rights = [0.0f32; PADDED];
         let (mut sum, mut weights) = (0.0, 0.0);
-        let mean = self.located.iter().map(|l| l.strength).sum::<f64>() / self.located.len() as f64;
+        let count = self.located.len() as f32;
+        let mean = self.located.iter().map(|l| l.strength).sum::<f32>() / count;
         for l in &self.located {
-            let normalised = l.residual / (2.0 * spread);
+            let normalised = l.residual / (2.0 * spread as f32);
             // Strong edges are located better, up to the point where noise no longer tells.
             let weight = (l.strength / mean).min(1.5) / (1.0 + normalised * normalised);
-            for i in 0..PARAMETERS {
-                let scaled = weight * l.row[i];
-                (0..=i).for_each(|j| information[(i, j)] += scaled * l.row[j]);
+            for (sums, r) in sums.iter_mut().zip(l.row) {
+                add_scaled(sums, weight * r, &l.row);
             }
-            right.axpy(weight * l.residual, &l.row, 1.0);
+            add_scaled(&mut rights, weight * l.residual, &l.row);
             sum += weight * l.residual * l.residual;
             weights += weight;
         }
-        let variance = sum / weights * self.located.len() as f64 / (self.located.len() as f64 - 8.0);
-        information.fill_upper_triangle_with_lower_triangle();
+        let variance = f64::from(sum / weights * count / (count - 8.0));
+        let mut information = Information::from_fn(|i, j| f64::from(sums[i.min(j)][i.max(j)]));
+        let mut right = Row::from_fn(|i, _| f64::from(rights[i]));
         for k in 8..PARAMETERS {
             let hold = variance.max(1e-4) / (bow * bow);
             information[(k, k)] += hold;
@@ -216,16 +207,24 @@ impl Refiner {
     }
 }
 
+#[inline(always)]
+fn add_scaled(to: &mut [f32; PADDED], factor: f32, row: &[f32; PADDED]) {
+    to.iter_mut().zip(row).for_each(|(to, r)| *to += factor * r);
+}
+
 /// Homography in ξ, η (row by row, last entry 1), and the two bows.
 #[derive(Clone, Copy, Debug)]
 struct Model {
     theta: Row,
     axes: [Vector2<f64>; 2],
+    /// Of the pixels meant here: near the tag, so that the parameters are of one size.
+    origin: Vector2<f64>,
 }
 
 impl Model {
     fn of_corners(corners: &Quad) -> Option<Self> {
-        let wide = corners.map(|p| p.map(f64::from));
+        let origin = [0, 1].map(|k| corners.iter().map(|p| f64::from(p[k])).sum::<f64>() / 4.0);
+        let wide = corners.map(|p| [f64::from(p[0]) - origin[0], f64::from(p[1]) - origin[1]]);
         // A square from 0 to 2, moved by one.
         let h = Homography::of_square(2.0, &wide)?.0;
         let moved = [h[2] + h[0] + h[1], h[5] + h[3] + h[4], 1.0 + h[6] + h[7]];
@@ -241,10 +240,16 @@ impl Model {
             let d = Vector2::new(wide[b][0] - wide[a][0], wide[b][1] - wide[a][1]);
             d / d.norm().max(1e-9)
         };
-        Some(Self { theta, axes: [unit(0, 1), unit(0, 3)] })
+        Some(Self { theta, axes: [unit(0, 1), unit(0, 3)], origin: origin.into() })
     }
 
-    /// Pixel of a tag point and ∂pixel/∂parameters.
+    /// How far a corner is from where another model has it, at most.
+    fn moved(&self, other: &Self) -> f64 {
+        let moved = |(x, y): (f64, f64)| (self.at(x, y).0 - other.at(x, y).0).norm();
+        CORNERS.into_iter().map(moved).fold(0.0, f64::max)
+    }
+
+    /// Pixel of a tag point, from the origin, and ∂pixel/∂parameters.
     fn at(&self, xi: f64, eta: f64) -> (Vector2<f64>, SMatrix<f64, 2, PARAMETERS>) {
         let t = &self.theta;
         let w = 1.0 / (t[6] * xi + t[7] * eta + 1.0);
@@ -260,14 +265,12 @@ impl Model {
         (p, jacobian)
     }
 
-    /// Images of the directions of ξ and η.
-    fn directions(&self, xi: f64, eta: f64) -> (Vector2<f64>, Vector2<f64>) {
-        let t = &self.theta;
-        let w = 1.0 / (t[6] * xi + t[7] * eta + 1.0);
-        let (u, v) = ((t[0] * xi + t[1] * eta + t[2]) * w, (t[3] * xi + t[4] * eta + t[5]) * w);
-        let d_xi = Vector2::new(t[0] - u * t[6], t[3] - v * t[6]) * w + self.axes[1] * (2.0 * t[9] * xi);
-        let d_eta = Vector2::new(t[1] - u * t[7], t[4] - v * t[7]) * w + self.axes[0] * (2.0 * t[8] * eta);
-        (d_xi, d_eta)
+    fn narrow(&self) -> NarrowModel {
+        NarrowModel {
+            theta: std::array::from_fn(|i| self.theta[i] as f32),
+            axes: self.axes.map(|a| [a.x as f32, a.y as f32]),
+            origin: [self.origin.x as f32, self.origin.y as f32],
+        }
     }
 
     fn result(&self, information: &Information, variance: f64, cell: f64) -> Option<Refined> {
@@ -277,9 +280,9 @@ impl Model {
         let floor = Matrix2::identity() * (FLOOR_PX * FLOOR_PX + neighbours * neighbours);
         let at = |xi: f64, eta: f64| {
             let (p, jacobian) = self.at(xi, eta);
-            (p, jacobian * covariance * jacobian.transpose() + floor)
+            (p + self.origin, jacobian * covariance * jacobian.transpose() + floor)
         };
-        let corners = [at(-1.0, -1.0), at(1.0, -1.0), at(1.0, 1.0), at(-1.0, 1.0)];
+        let corners = CORNERS.map(|(x, y)| at(x, y));
         let (center, center_cov) = at(0.0, 0.0);
         let finite = corners.iter().all(|c| c.0.iter().chain(c.1.iter()).all(|x| x.is_finite()));
         finite.then(|| Refined {
@@ -291,41 +294,96 @@ impl Model {
     }
 }
 
+/// The model in single precision, for the many edge points.
+struct NarrowModel {
+    theta: [f32; PARAMETERS],
+    axes: [[f32; 2]; 2],
+    origin: Point,
+}
+
+impl NarrowModel {
+    /// An edge point's pixel, the normal of the edge there from dark to light, and what the parameters do along
+    /// that normal.
+    #[inline(always)]
+    fn edge_at(&self, point: &EdgePoint) -> (Point, Point, [f32; PADDED]) {
+        let (t, xi, eta) = (&self.theta, point.xi, point.eta);
+        let [x, y] = self.axes;
+        let w = 1.0 / (t[6] * xi + t[7] * eta + 1.0);
+        let (u, v) = ((t[0] * xi + t[1] * eta + t[2]) * w, (t[3] * xi + t[4] * eta + t[5]) * w);
+        let (bow_x, bow_y) = (eta * eta - 1.0, xi * xi - 1.0);
+        let p = [
+            self.origin[0] + u + x[0] * t[8] * bow_x + y[0] * t[9] * bow_y,
+            self.origin[1] + v + x[1] * t[8] * bow_x + y[1] * t[9] * bow_y,
+        ];
+        // Images of the directions of ξ and η; the normal is across the one in which the edge runs.
+        let (bend_xi, bend_eta) = (2.0 * t[9] * xi, 2.0 * t[8] * eta);
+        let d_xi = [(t[0] - u * t[6]) * w + y[0] * bend_xi, (t[3] - v * t[6]) * w + y[1] * bend_xi];
+        let d_eta = [(t[1] - u * t[7]) * w + x[0] * bend_eta, (t[4] - v * t[7]) * w + x[1] * bend_eta];
+        let [lx, ly] = point.light;
+        let along = [d_eta[0] * lx - d_xi[0] * ly, d_eta[1] * lx - d_xi[1] * ly];
+        let towards = [d_xi[0] * lx + d_eta[0] * ly, d_xi[1] * lx + d_eta[1] * ly];
+        let length = (along[0] * along[0] + along[1] * along[1]).sqrt().max(1e-9);
+        let side = along[0] * towards[1] - along[1] * towards[0];
+        let scale = if side < 0.0 { -1.0 / length } else { 1.0 / length };
+        let n = [-along[1] * scale, along[0] * scale];
+        let across = -(u * n[0] + v * n[1]) * w;
+        let (nx, ny) = (n[0] * w, n[1] * w);
+        let row = [
+            xi * nx,
+            eta * nx,
+            nx,
+            xi * ny,
+            eta * ny,
+            ny,
+            across * xi,
+            across * eta,
+            (x[0] * n[0] + x[1] * n[1]) * bow_x,
+            (y[0] * n[0] + y[1] * n[1]) * bow_y,
+            0.0,
+            0.0,
+        ];
+        (p, n, row)
+    }
+}
+
 /// Where along `n` from `p` the image steps up, pixels, and how strongly: the centre of mass of the
 /// gradient under a biweight window of half width `half`, which follows the centre it finds. A blurred edge is
 /// symmetric, and so is the window: the centre is not biased by where the search began.
-fn edge_offset(image: ImageView<'_>, p: Vector2<f64>, n: Vector2<f64>, half: f64) -> Option<(f64, f64)> {
+#[inline(always)]
+fn edge_offset(image: ImageView<'_>, p: Point, n: Point, half: f32) -> Option<(f32, f32)> {
     const MOST: usize = 16;
     let spacing = (half * 0.25).max(0.5);
     let reach = ((half * 1.5 / spacing).ceil() as usize).min(MOST / 2 - 1);
     let count = 2 * reach + 1;
-    let far = p + n * (reach as f64 * spacing);
-    let near = p - n * (reach as f64 * spacing);
-    let inside = |q: Vector2<f64>| {
-        q.x >= 0.0 && q.y >= 0.0 && q.x <= (image.width - 1) as f64 && q.y <= (image.height - 1) as f64
-    };
-    if !(inside(far) && inside(near)) {
+    let step = [n[0] * spacing, n[1] * spacing];
+    let start = [p[0] - reach as f32 * step[0], p[1] - reach as f32 * step[1]];
+    let end = [p[0] + reach as f32 * step[0], p[1] + reach as f32 * step[1]];
+    if !(is_inside(image, start) && is_inside(image, end)) {
         return None;
     }
-    let (start, step) = ([near.x as f32, near.y as f32], [(n.x * spacing) as f32, (n.y * spacing) as f32]);
     let mut gradients = [0.0f32; MOST];
-    let mut before = bilinear(image, start);
+    let mut before = sample(image, start);
     for (k, gradient) in gradients.iter_mut().enumerate().take(count - 1) {
         let along = (k + 1) as f32;
-        let value = bilinear(image, [start[0] + along * step[0], start[1] + along * step[1]]);
+        let value = sample(image, [start[0] + along * step[0], start[1] + along * step[1]]);
         *gradient = value - before;
         before = value;
     }
-    let (half, spacing) = (half as f32, spacing as f32);
-    let (mut center, mut mass) = (0.0, 0.0);
+    let (mut center, mut mass) = (0.0f32, 0.0);
+    let per_half = 1.0 / half;
     for _ in 0..3 {
-        let (mut first, mut sum) = (0.0, 0.0);
-        for (k, gradient) in gradients.iter().enumerate().take(count - 1) {
-            let d = (k as f32 + 0.5 - reach as f32) * spacing - center;
-            let taper = (1.0 - (d / half) * (d / half)).max(0.0);
-            first += gradient * taper * taper * d;
-            sum += gradient * taper * taper;
+        // Eight sums side by side, so that they fit vector registers.
+        let (mut firsts, mut sums) = ([0.0f32; LANES], [0.0f32; LANES]);
+        for (chunk, gradients) in gradients.chunks_exact(LANES).enumerate() {
+            for lane in 0..LANES {
+                let d = ((chunk * LANES + lane) as f32 + 0.5 - reach as f32) * spacing - center;
+                let taper = (1.0 - (d * per_half) * (d * per_half)).max(0.0);
+                let weight = gradients[lane] * taper * taper;
+                firsts[lane] += weight * d;
+                sums[lane] += weight;
+            }
         }
+        let (first, sum) = (total(firsts), total(sums));
         if !(sum > 3.0) {
             return None;
         }
@@ -335,5 +393,56 @@ fn edge_offset(image: ImageView<'_>, p: Vector2<f64>, n: Vector2<f64>, half: f64
             return None;
         }
     }
-    Some((f64::from(center), f64::from(mass)))
+    Some((center, mass))
+}
+
+const LANES: usize = 8;
+
+#[inline(always)]
+fn total(x: [f32; LANES]) -> f32 {
+    let four: [f32; 4] = std::array::from_fn(|i| x[i] + x[i + 4]);
+    (four[0] + four[2]) + (four[1] + four[3])
+}
+
+/// Finds the edges at every so manieth point.
+struct Locate<'a> {
+    points: &'a [EdgePoint],
+    located: &'a mut Vec<Located>,
+    image: ImageView<'a>,
+    model: NarrowModel,
+    half: f32,
+    every: usize,
+}
+
+impl Kernel for Locate<'_> {
+    #[inline(always)]
+    fn run(self) {
+        self.located.clear();
+        for point in self.points.iter().step_by(self.every) {
+            let (p, n, row) = self.model.edge_at(point);
+            if let Some((offset, strength)) = edge_offset(self.image, p, n, self.half) {
+                self.located.push(Located { row, residual: offset, strength });
+            }
+        }
+    }
+}
+
+/// Whether a point and one a pixel further right and below are in the image.
+#[inline(always)]
+fn is_inside(image: ImageView<'_>, [u, v]: Point) -> bool {
+    u >= 0.0 && v >= 0.0 && u < image.width as f32 - 1.01 && v < image.height as f32 - 1.01
+}
+
+/// Bilinear pixel value at a point that `is_inside`.
+#[inline(always)]
+fn sample(image: ImageView<'_>, [u, v]: Point) -> f32 {
+    let (iu, iv) = (u as i32, v as i32);
+    let (fu, fv) = (u - iu as f32, v - iv as f32);
+    let at = iv as usize * image.stride + iu as usize;
+    let block = &image.data[at..at + image.stride + 2];
+    let (above, below) =
+        ([block[0], block[1]].map(f32::from), [block[image.stride], block[image.stride + 1]].map(f32::from));
+    let top = above[0] + fu * (above[1] - above[0]);
+    let bottom = below[0] + fu * (below[1] - below[0]);
+    top + fv * (bottom - top)
 }

@@ -95,7 +95,7 @@ impl TagDetector {
             bits: Bitmap::default(),
             labeller: Labeller::default(),
             finder: QuadFinder::default(),
-            refiner: Refiner::default(),
+            refiner: Refiner::new(Simd::best()),
             found: Vec::new(),
             negative: GrayImage::default(),
             noise: 0.0,
@@ -104,7 +104,7 @@ impl TagDetector {
 
     /// The same with other kernels, for comparison.
     pub fn with_simd(self, simd: Simd) -> Self {
-        Self { simd, ..self }
+        Self { simd, refiner: Refiner::new(simd), ..self }
     }
 
     /// Looks for tags from this edge on, pixels, from now on.
@@ -172,7 +172,7 @@ impl TagDetector {
         self.binariser.measure(level.image, self.simd);
         for &fraction in fractions {
             self.binariser.mark(level.image, gate, fraction, &mut self.bits, self.simd);
-            self.labeller.label(&self.bits, |c| may_be_border(c, limits, width, height));
+            self.labeller.label(&self.bits, self.simd, |c| may_be_border(c, limits, width, height));
             for (component, outline) in self.labeller.kept() {
                 let Some(quad) = self.finder.quad(component, outline, limits) else { continue };
                 let in_frame = quad.map(|p| p.map(|c| level.to_frame(c)));

@@ -2,7 +2,14 @@
 
 use std::arch::x86_64::*;
 
-use super::{TILE, scalar};
+use super::{Kernel, TILE, scalar};
+
+/// # Safety
+/// The processor must have AVX2, BMI1, BMI2 and POPCNT.
+#[target_feature(enable = "avx2,bmi1,bmi2,popcnt")]
+pub(super) unsafe fn run(kernel: impl Kernel) {
+    kernel.run();
+}
 
 /// # Safety
 /// The processor must have AVX2.

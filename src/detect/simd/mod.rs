@@ -19,6 +19,13 @@ enum Kind {
     Avx2,
 }
 
+/// Plain code that gains from being compiled for what the processor has; it must be `#[inline(always)]`.
+/// Floating-point operations are never fused, so that the result is the same.
+pub(super) trait Kernel {
+    /// Does the work.
+    fn run(self);
+}
+
 /// Pixels on a side of a tile.
 pub(super) const TILE: usize = 4;
 
@@ -26,7 +33,11 @@ impl Simd {
     /// The best this processor has.
     pub fn best() -> Self {
         #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") {
+        if std::arch::is_x86_feature_detected!("avx2")
+            && std::arch::is_x86_feature_detected!("bmi1")
+            && std::arch::is_x86_feature_detected!("bmi2")
+            && std::arch::is_x86_feature_detected!("popcnt")
+        {
             return Self(Kind::Avx2);
         }
         Self(Kind::Scalar)
@@ -35,6 +46,17 @@ impl Simd {
     /// Plain code, for comparison.
     pub fn scalar() -> Self {
         Self(Kind::Scalar)
+    }
+
+    /// Runs plain code compiled for this processor.
+    #[inline]
+    pub(super) fn run(self, kernel: impl Kernel) {
+        match self.0 {
+            Kind::Scalar => kernel.run(),
+            // SAFETY: `best` made this variant only where the processor has these.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx2 => unsafe { avx2::run(kernel) },
+        }
     }
 
     /// `to[u]` = mean of the 2×2 block at `2u`, halves rounded up.
