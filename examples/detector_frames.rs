@@ -113,22 +113,28 @@ impl Ground {
 struct Patch {
     middle: Vector2<f64>,
     half: Vector2<f64>,
-    turn: f64,
+    /// Cosine and sine of its turn.
+    turn: (f64, f64),
     tone: f64,
 }
 
 impl Patch {
     fn inside(&self, p: Vector2<f64>) -> Option<Vector2<f64>> {
-        let (s, c) = self.turn.sin_cos();
+        let (c, s) = self.turn;
         let d = p - self.middle;
         let q = Vector2::new(c * d.x + s * d.y, c * d.y - s * d.x);
         (q.x.abs() <= self.half.x && q.y.abs() <= self.half.y).then_some(q)
     }
 
     fn to_ground(&self, q: Vector2<f64>) -> Vector2<f64> {
-        let (s, c) = self.turn.sin_cos();
+        let (c, s) = self.turn;
         self.middle + Vector2::new(c * q.x - s * q.y, s * q.x + c * q.y)
     }
+}
+
+fn direction(rng: &mut ChaCha8Rng) -> (f64, f64) {
+    let angle: f64 = rng.random_range(0.0..std::f64::consts::TAU);
+    (angle.cos(), angle.sin())
 }
 
 /// One scene: ground plane, camera above it.
@@ -157,7 +163,7 @@ impl Scene {
         let view =
             Matrix3::from_columns(&[r.column(0).into(), r.column(1).into(), Vector3::new(0.0, 0.0, height)]);
         let reach = 0.55 * height;
-        let mut patch = |size: std::ops::Range<f64>, thin: f64| {
+        let patch = |rng: &mut ChaCha8Rng, size: std::ops::Range<f64>, thin: f64| {
             let size = rng.random_range(size);
             Patch {
                 middle: Vector2::new(
@@ -165,15 +171,15 @@ impl Scene {
                     rng.random_range(-0.8 * reach..0.8 * reach),
                 ),
                 half: Vector2::new(size, size * thin),
-                turn: rng.random_range(0.0..std::f64::consts::TAU),
+                turn: direction(rng),
                 tone: 0.0,
             }
         };
-        let mut patches: Vec<Patch> = (0..6).map(|_| patch(0.5..0.3 * height, 0.03)).collect();
-        patches.extend((0..3).map(|_| patch(0.15..0.6, 0.7)));
-        let mut plate = patch(1.0..1.01, 0.5);
+        let mut patches: Vec<Patch> = (0..6).map(|_| patch(rng, 0.5..0.3 * height, 0.03)).collect();
+        patches.extend((0..3).map(|_| patch(rng, 0.15..0.6, 0.7)));
+        let mut plate = patch(rng, 1.0..1.01, 0.5);
         plate.middle *= 0.85;
-        let mut shadow = patch(2.0 * height..2.1 * height, 0.06);
+        let mut shadow = patch(rng, 2.0 * height..2.1 * height, 0.06);
         for p in &mut patches {
             p.tone = rng.random_range(0.04..0.7);
         }
@@ -183,7 +189,7 @@ impl Scene {
         plate.tone = rng.random_range(0.3..0.6);
         if rng.random_bool(0.6) {
             // Its edge lies across a tag.
-            let normal = Vector2::new(-shadow.turn.sin(), shadow.turn.cos());
+            let normal = Vector2::new(-shadow.turn.1, shadow.turn.0);
             let aim = plate.to_ground(Vector2::new(TAG_AT * edge, rng.random_range(-0.4..0.4) * edge));
             shadow.middle = aim + normal * shadow.half.y;
         }
@@ -255,7 +261,7 @@ fn distorted(ray: Vector3<f64>) -> Vector2<f64> {
 fn undistorted(u: f64, v: f64) -> Vector3<f64> {
     let (xd, yd) = ((u - WIDTH as f64 / 2.0) / FOCAL, (v - HEIGHT as f64 / 2.0) / FOCAL);
     let (mut x, mut y) = (xd, yd);
-    for _ in 0..8 {
+    for _ in 0..12 {
         let bend = 1.0 + LENS * (x * x + y * y);
         (x, y) = (xd / bend, yd / bend);
     }

@@ -30,9 +30,14 @@ impl Bitmap {
     }
 }
 
-/// Least range over maximum, of 256. Ink is a fifth to a tenth as light as paper; blur and haze take some of
-/// that away, while most ground varies less.
-const LEAST_RELATIVE: u16 = 70;
+/// Least range over maximum, of 256, that counts as contrast: ink is a fifth to a tenth as light as paper, and
+/// blur and haze take some of that away, while most ground varies less.
+const LEAST_RELATIVE: usize = 70;
+
+/// Where more of the image than `BUSY_SHARE` has that contrast, only what has most is looked at, but all that
+/// has this much: a tag that is read keeps it, and coarse gravel does not cost more than grass.
+const ENOUGH_RELATIVE: usize = 160;
+const BUSY_SHARE: f32 = 0.3;
 
 /// Thresholds an image against its surroundings, 12×12 pixels around each tile.
 #[derive(Clone, Debug, Default)]
@@ -67,15 +72,33 @@ impl Binariser {
         widen(&self.high, &mut self.wide_high, &mut self.scratch, across, u8::max);
     }
 
+    /// The least range over maximum, of 256, that counts in this image: see `BUSY_SHARE`.
+    fn least_relative(&self, gate: u8) -> usize {
+        let mut tiles = [0u32; 256];
+        for (&low, &high) in self.wide_low.iter().zip(&self.wide_high) {
+            if high - low >= gate {
+                tiles[relative(low, high)] += 1;
+            }
+        }
+        let budget = (BUSY_SHARE * self.wide_low.len() as f32) as u32;
+        let (mut least, mut passed) = (ENOUGH_RELATIVE, tiles[ENOUGH_RELATIVE..].iter().sum::<u32>());
+        while least > LEAST_RELATIVE && passed + tiles[least - 1] <= budget {
+            least -= 1;
+            passed += tiles[least];
+        }
+        least
+    }
+
     /// Marks pixels below `fraction`/256 of the way from the local minimum to the local maximum, where
     /// these are at least `gate` apart and the minimum is well below the maximum; elsewhere nothing is dark.
     pub fn mark(&mut self, image: ImageView<'_>, gate: u8, fraction: u16, out: &mut Bitmap, simd: Simd) {
         let (across, down) = self.tiles;
         self.thresholds.resize(across * down, 0);
+        let least_relative = self.least_relative(gate);
         for ((t, &low), &high) in self.thresholds.iter_mut().zip(&self.wide_low).zip(&self.wide_high) {
             let range = high - low;
             let above = (u16::from(range) * fraction + 128) >> 8;
-            let seen = range >= gate && u16::from(range) * 256 >= u16::from(high) * LEAST_RELATIVE;
+            let seen = range >= gate && relative(low, high) >= least_relative;
             *t = if seen { low + above as u8 } else { 0 };
         }
         let per_row = image.width.div_ceil(64);
@@ -86,6 +109,11 @@ impl Binariser {
             simd.pack_below(image.row(v), &self.thresholds[tile * across..(tile + 1) * across], words);
         }
     }
+}
+
+/// Range over maximum, of 256.
+fn relative(low: u8, high: u8) -> usize {
+    usize::from(high - low) * 255 / usize::from(high.max(1))
 }
 
 /// Extreme over 3×3 tiles.

@@ -71,10 +71,10 @@ struct Found {
 }
 
 /// Where between the local minimum and maximum dark and light are divided, of 256. Low keeps a border whole
-/// where a shadow's edge crosses the tag; the coarser levels cost little and are divided a second time
-/// higher up, for borders that are blurred.
-const FRACTIONS_FINE: [u16; 1] = [85];
-const FRACTIONS_COARSE: [u16; 2] = [72, 116];
+/// where a shadow's edge crosses the tag; a second time higher up for borders that are blurred, which the
+/// coarser levels can afford, and small tags need in the finest.
+const FRACTIONS_ONCE: [u16; 1] = [85];
+const FRACTIONS_TWICE: [u16; 2] = [72, 116];
 
 /// Smallest edge in a level at which a border can be told from its surroundings, pixels.
 const LEAST_EDGE_IN_LEVEL: f32 = 12.0;
@@ -158,7 +158,8 @@ impl TagDetector {
         let first = usize::from(base != Base::Full).min(self.pyramid.len() - 1);
         let last = (first + 2).min(self.pyramid.len() - 1);
         for n in (first..=last).rev() {
-            let fractions: &[u16] = if n == first { &FRACTIONS_FINE } else { &FRACTIONS_COARSE };
+            let once = n == first && base == Base::Half;
+            let fractions: &[u16] = if once { &FRACTIONS_ONCE } else { &FRACTIONS_TWICE };
             self.search_level(image, n, fractions, inverted);
         }
     }
