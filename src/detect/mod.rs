@@ -5,6 +5,7 @@ mod codes;
 mod components;
 mod disc;
 mod disc_pairs;
+mod edge_points;
 mod edges;
 mod family;
 mod features;

@@ -8,15 +8,12 @@
 
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
+use super::edge_points::{EdgePoint, Locate, Located, NarrowModel, PADDED, PARAMETERS};
 use super::family::Family;
 use super::homography::Homography;
-use super::quad::{Point, Quad, distance};
-use super::simd::{Kernel, Simd};
+use super::quad::{Quad, distance};
+use super::simd::Simd;
 use crate::msg::ImageView;
-
-const PARAMETERS: usize = 10;
-/// `PARAMETERS` in whole vector registers.
-const PADDED: usize = 12;
 
 type Information = SMatrix<f64, PARAMETERS, PARAMETERS>;
 type Row = SVector<f64, PARAMETERS>;
@@ -31,23 +28,6 @@ pub(super) struct Refined {
     pub corner_cov: [Matrix2<f64>; 4],
     pub center: Vector2<f64>,
     pub center_cov: Matrix2<f64>,
-}
-
-/// A point on an edge between a dark and a light cell.
-#[derive(Clone, Copy, PartialEq, Debug)]
-struct EdgePoint {
-    xi: f32,
-    eta: f32,
-    /// From dark to light in tag coordinates.
-    light: [f32; 2],
-}
-
-/// One located edge: `residual` px along the normal, ∂/∂parameters (padded), weight.
-#[derive(Clone, Copy, Debug)]
-struct Located {
-    row: [f32; PADDED],
-    residual: f32,
-    strength: f32,
 }
 
 /// Curvature that a wide lens gives straight lines, 1/px: 0.18 r² distortion at a focal length of 1000 px
@@ -292,157 +272,4 @@ impl Model {
             center_cov,
         })
     }
-}
-
-/// The model in single precision, for the many edge points.
-struct NarrowModel {
-    theta: [f32; PARAMETERS],
-    axes: [[f32; 2]; 2],
-    origin: Point,
-}
-
-impl NarrowModel {
-    /// An edge point's pixel, the normal of the edge there from dark to light, and what the parameters do along
-    /// that normal.
-    #[inline(always)]
-    fn edge_at(&self, point: &EdgePoint) -> (Point, Point, [f32; PADDED]) {
-        let (t, xi, eta) = (&self.theta, point.xi, point.eta);
-        let [x, y] = self.axes;
-        let w = 1.0 / (t[6] * xi + t[7] * eta + 1.0);
-        let (u, v) = ((t[0] * xi + t[1] * eta + t[2]) * w, (t[3] * xi + t[4] * eta + t[5]) * w);
-        let (bow_x, bow_y) = (eta * eta - 1.0, xi * xi - 1.0);
-        let p = [
-            self.origin[0] + u + x[0] * t[8] * bow_x + y[0] * t[9] * bow_y,
-            self.origin[1] + v + x[1] * t[8] * bow_x + y[1] * t[9] * bow_y,
-        ];
-        // Images of the directions of ξ and η; the normal is across the one in which the edge runs.
-        let (bend_xi, bend_eta) = (2.0 * t[9] * xi, 2.0 * t[8] * eta);
-        let d_xi = [(t[0] - u * t[6]) * w + y[0] * bend_xi, (t[3] - v * t[6]) * w + y[1] * bend_xi];
-        let d_eta = [(t[1] - u * t[7]) * w + x[0] * bend_eta, (t[4] - v * t[7]) * w + x[1] * bend_eta];
-        let [lx, ly] = point.light;
-        let along = [d_eta[0] * lx - d_xi[0] * ly, d_eta[1] * lx - d_xi[1] * ly];
-        let towards = [d_xi[0] * lx + d_eta[0] * ly, d_xi[1] * lx + d_eta[1] * ly];
-        let length = (along[0] * along[0] + along[1] * along[1]).sqrt().max(1e-9);
-        let side = along[0] * towards[1] - along[1] * towards[0];
-        let scale = if side < 0.0 { -1.0 / length } else { 1.0 / length };
-        let n = [-along[1] * scale, along[0] * scale];
-        let across = -(u * n[0] + v * n[1]) * w;
-        let (nx, ny) = (n[0] * w, n[1] * w);
-        let row = [
-            xi * nx,
-            eta * nx,
-            nx,
-            xi * ny,
-            eta * ny,
-            ny,
-            across * xi,
-            across * eta,
-            (x[0] * n[0] + x[1] * n[1]) * bow_x,
-            (y[0] * n[0] + y[1] * n[1]) * bow_y,
-            0.0,
-            0.0,
-        ];
-        (p, n, row)
-    }
-}
-
-/// Where along `n` from `p` the image steps up, pixels, and how strongly: the centre of mass of the
-/// gradient under a biweight window of half width `half`, which follows the centre it finds. A blurred edge is
-/// symmetric, and so is the window: the centre is not biased by where the search began.
-#[inline(always)]
-fn edge_offset(image: ImageView<'_>, p: Point, n: Point, half: f32) -> Option<(f32, f32)> {
-    const MOST: usize = 16;
-    let spacing = (half * 0.25).max(0.5);
-    let reach = ((half * 1.5 / spacing).ceil() as usize).min(MOST / 2 - 1);
-    let count = 2 * reach + 1;
-    let step = [n[0] * spacing, n[1] * spacing];
-    let start = [p[0] - reach as f32 * step[0], p[1] - reach as f32 * step[1]];
-    let end = [p[0] + reach as f32 * step[0], p[1] + reach as f32 * step[1]];
-    if !(is_inside(image, start) && is_inside(image, end)) {
-        return None;
-    }
-    let mut gradients = [0.0f32; MOST];
-    let mut before = sample(image, start);
-    for (k, gradient) in gradients.iter_mut().enumerate().take(count - 1) {
-        let along = (k + 1) as f32;
-        let value = sample(image, [start[0] + along * step[0], start[1] + along * step[1]]);
-        *gradient = value - before;
-        before = value;
-    }
-    let (mut center, mut mass) = (0.0f32, 0.0);
-    let per_half = 1.0 / half;
-    for _ in 0..3 {
-        // Eight sums side by side, so that they fit vector registers.
-        let (mut firsts, mut sums) = ([0.0f32; LANES], [0.0f32; LANES]);
-        for (chunk, gradients) in gradients.chunks_exact(LANES).enumerate() {
-            for lane in 0..LANES {
-                let d = ((chunk * LANES + lane) as f32 + 0.5 - reach as f32) * spacing - center;
-                let taper = (1.0 - (d * per_half) * (d * per_half)).max(0.0);
-                let weight = gradients[lane] * taper * taper;
-                firsts[lane] += weight * d;
-                sums[lane] += weight;
-            }
-        }
-        let (first, sum) = (total(firsts), total(sums));
-        if !(sum > 3.0) {
-            return None;
-        }
-        center += (first / sum).clamp(-0.5 * half, 0.5 * half);
-        mass = sum;
-        if center.abs() > 0.6 * half {
-            return None;
-        }
-    }
-    Some((center, mass))
-}
-
-const LANES: usize = 8;
-
-#[inline(always)]
-fn total(x: [f32; LANES]) -> f32 {
-    let four: [f32; 4] = std::array::from_fn(|i| x[i] + x[i + 4]);
-    (four[0] + four[2]) + (four[1] + four[3])
-}
-
-/// Finds the edges at every so manieth point.
-struct Locate<'a> {
-    points: &'a [EdgePoint],
-    located: &'a mut Vec<Located>,
-    image: ImageView<'a>,
-    model: NarrowModel,
-    half: f32,
-    every: usize,
-}
-
-impl Kernel for Locate<'_> {
-    #[inline(always)]
-    fn run(self) {
-        self.located.clear();
-        for point in self.points.iter().step_by(self.every) {
-            let (p, n, row) = self.model.edge_at(point);
-            if let Some((offset, strength)) = edge_offset(self.image, p, n, self.half) {
-                self.located.push(Located { row, residual: offset, strength });
-            }
-        }
-    }
-}
-
-/// Whether a point and one a pixel further right and below are in the image.
-#[inline(always)]
-fn is_inside(image: ImageView<'_>, [u, v]: Point) -> bool {
-    u >= 0.0 && v >= 0.0 && u < image.width as f32 - 1.01 && v < image.height as f32 - 1.01
-}
-
-/// Bilinear pixel value at a point that `is_inside`.
-#[inline(always)]
-fn sample(image: ImageView<'_>, [u, v]: Point) -> f32 {
-    let (iu, iv) = (u as i32, v as i32);
-    let (fu, fv) = (u - iu as f32, v - iv as f32);
-    let at = iv as usize * image.stride + iu as usize;
-    let block = &image.data[at..at + image.stride + 2];
-    let (above, below) =
-        ([block[0], block[1]].map(f32::from), [block[image.stride], block[image.stride + 1]].map(f32::from));
-    let top = above[0] + fu * (above[1] - above[0]);
-    let bottom = below[0] + fu * (below[1] - below[0]);
-    top + fv * (bottom - top)
 }
