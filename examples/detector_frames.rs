@@ -126,7 +126,7 @@ impl Patch {
         (q.x.abs() <= self.half.x && q.y.abs() <= self.half.y).then_some(q)
     }
 
-    fn to_ground(&self, q: Vector2<f64>) -> Vector2<f64> {
+    fn ground_of(self, q: Vector2<f64>) -> Vector2<f64> {
         let (c, s) = self.turn;
         self.middle + Vector2::new(c * q.x - s * q.y, s * q.x + c * q.y)
     }
@@ -137,6 +137,9 @@ fn direction(rng: &mut ChaCha8Rng) -> (f64, f64) {
     (angle.cos(), angle.sin())
 }
 
+/// A plate with its two tags (identity and pattern), and the edge of their borders.
+type Plate = (Patch, f64, [(u32, TagPattern); 2]);
+
 /// One scene: ground plane, camera above it.
 struct Scene {
     ground: Ground,
@@ -145,7 +148,7 @@ struct Scene {
     view: Matrix3<f64>,
     back: Matrix3<f64>,
     patches: Vec<Patch>,
-    plate: Option<(Patch, f64, [(u32, TagPattern); 2])>,
+    plate: Option<Plate>,
     shadow: Option<(Patch, f64)>,
     gain: f64,
 }
@@ -190,7 +193,7 @@ impl Scene {
         if rng.random_bool(0.6) {
             // Its edge lies across a tag.
             let normal = Vector2::new(-shadow.turn.1, shadow.turn.0);
-            let aim = plate.to_ground(Vector2::new(TAG_AT * edge, rng.random_range(-0.4..0.4) * edge));
+            let aim = plate.ground_of(Vector2::new(TAG_AT * edge, rng.random_range(-0.4..0.4) * edge));
             shadow.middle = aim + normal * shadow.half.y;
         }
         let tags =
@@ -243,7 +246,7 @@ impl Scene {
         let of = |k: usize| {
             let at = if k == 0 { -TAG_AT } else { TAG_AT };
             let corners = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)].map(|(x, y)| {
-                let p = plate.to_ground(Vector2::new((at + x) * edge, y * edge));
+                let p = plate.ground_of(Vector2::new((at + x) * edge, y * edge));
                 distorted(self.view * Vector3::new(p.x, p.y, 1.0))
             });
             (tags[k].0, corners)

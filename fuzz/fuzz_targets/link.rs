@@ -11,7 +11,7 @@ fn stream<M: prost::Message + Default>(data: &[u8], read: usize) {
     for part in data.chunks(read) {
         deframer.push(part);
         loop {
-            match deframer.next::<M>() {
+            match deframer.message::<M>() {
                 Ok(Some(message)) => assert!(message.encoded_len() <= 2 * MESSAGE_LIMIT),
                 Ok(None) => break,
                 Err(_) => return,

@@ -45,7 +45,7 @@ impl Deframer {
     }
 
     /// The next whole message; `None` until there is one.
-    pub fn next<M: Message + Default>(&mut self) -> Result<Option<M>, WireError> {
+    pub fn message<M: Message + Default>(&mut self) -> Result<Option<M>, WireError> {
         let rest = &self.buffer[self.start..];
         let Some((length, used)) = length(rest)? else { return Ok(None) };
         let Some(body) = rest.get(used..used + length) else { return Ok(None) };
@@ -88,7 +88,7 @@ impl Reader {
     /// The next message; `None` where the stream ended between two.
     pub async fn next<M: Message + Default>(&mut self) -> Result<Option<M>, WireError> {
         loop {
-            if let Some(message) = self.deframer.next()? {
+            if let Some(message) = self.deframer.message()? {
                 return Ok(Some(message));
             }
             match self.stream.read_chunk(64 << 10, true).await {
@@ -149,7 +149,7 @@ mod tests {
             let (mut deframer, mut got) = (Deframer::default(), Vec::new());
             for part in bytes.chunks(cut) {
                 deframer.push(part);
-                while let Some(record) = deframer.next::<Record>().expect("well formed") {
+                while let Some(record) = deframer.message::<Record>().expect("well formed") {
                     got.push(record);
                 }
             }
@@ -161,10 +161,10 @@ mod tests {
             let mut deframer = Deframer::default();
             deframer.push(&bytes);
             // Each call uses up at least a byte or ends.
-            while let Ok(Some(_)) = deframer.next::<ToPayload>() {}
+            while let Ok(Some(_)) = deframer.message::<ToPayload>() {}
             let mut deframer = Deframer::default();
             deframer.push(&bytes);
-            while let Ok(Some(_)) = deframer.next::<Backfill>() {}
+            while let Ok(Some(_)) = deframer.message::<Backfill>() {}
             let _ = (Live::decode(&bytes[..]), ToStation::decode(&bytes[..]), Thumbnail::decode(&bytes[..]));
         }
     }
@@ -173,10 +173,10 @@ mod tests {
     fn lengths_beyond_the_limit_end_the_stream() {
         let mut deframer = Deframer::default();
         deframer.push(&[0xff, 0xff, 0xff, 0x7f]);
-        assert!(matches!(deframer.next::<Record>(), Err(WireError::Malformed(_))));
+        assert!(matches!(deframer.message::<Record>(), Err(WireError::Malformed(_))));
         let mut deframer = Deframer::default();
         deframer.push(&[0x80, 0x80, 0x80, 0x80, 0x80]);
-        assert!(matches!(deframer.next::<Record>(), Err(WireError::Malformed(_))));
+        assert!(matches!(deframer.message::<Record>(), Err(WireError::Malformed(_))));
     }
 
     #[test]
