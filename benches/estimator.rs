@@ -286,7 +286,7 @@ fn run(scenario: &Scenario, seed: u64, verbose: bool) -> Run {
             match output {
                 EstimatorOutput::Estimate(e) => f.add(&e, &world),
                 EstimatorOutput::Smoothed(e) => s.add(&e, &world),
-                EstimatorOutput::Reset { .. } => resets += 1,
+                EstimatorOutput::Reset { .. } | EstimatorOutput::Anchored { .. } => resets += 1,
                 EstimatorOutput::Ownship(_) | EstimatorOutput::Fusion(_) => {}
             }
         }

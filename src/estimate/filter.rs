@@ -2,6 +2,8 @@
 
 use std::collections::VecDeque;
 
+use nalgebra::Vector3;
+
 use crate::align::{History, Stamp};
 use crate::config::Config;
 use crate::geo::wrap_angle;
@@ -27,6 +29,11 @@ pub enum EstimatorOutput {
     Ownship(Ownship),
     /// What became of a measurement.
     Fusion(FusionResult),
+    /// The receiver jumped for good: helicopter, targets and ground features moved along.
+    Anchored {
+        /// By how much, NED.
+        moved_m: Vector3<f64>,
+    },
     /// The filter started again.
     Reset {
         /// Why.
@@ -48,6 +55,8 @@ pub struct Estimator {
     warm: Option<WarmFilter>,
     /// Exposure time of the last frame whose smoothed estimate has been told.
     smoothed_to: Option<MonoTime>,
+    /// Time of the last anchoring that has been told.
+    anchored: Option<MonoTime>,
 }
 
 /// Without any measurement for so long the state is worth nothing.
@@ -77,6 +86,7 @@ impl Estimator {
             lag: Span::from_ms(config.estimator.smoother_lag_ms),
             warm: None,
             smoothed_to: None,
+            anchored: None,
         }
     }
 
@@ -266,6 +276,12 @@ impl Estimator {
             entry.after.copy_from(&self.core.state);
         }
         out.extend(self.core.results.drain(..).map(EstimatorOutput::Fusion));
+        if let Some((t, moved_m)) = self.core.state.anchored
+            && self.anchored.is_none_or(|told| t > told)
+        {
+            self.anchored = Some(t);
+            out.push(EstimatorOutput::Anchored { moved_m });
+        }
         if !self.is_reasonable() {
             self.reset("the state was no longer a number within reason", out);
             return None;

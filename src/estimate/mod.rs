@@ -4,6 +4,7 @@
 //!
 //! `docs/estimator.md` gives state, models and what each choice is worth.
 
+mod anchor;
 mod bound;
 mod core;
 mod filter;

@@ -63,7 +63,7 @@ impl Core {
     }
 
     /// `z = p + R l + b − v τ + ½ a τ²`, with the antenna's velocity v and the delay τ.
-    fn fuse_gps_position(&mut self, position: &Vector3<f64>, has_height: bool) {
+    pub(super) fn expect_gps_position(&mut self, position: &Vector3<f64>, has_height: bool) {
         let (own, models) = (&self.state.own, &self.models);
         let m = if has_height { 3 } else { 2 };
         let arm = own.ned_from_body * models.antenna_at;
@@ -89,13 +89,17 @@ impl Core {
             set_row(z, i, attitude, &d_attitude);
             z.noise[i][i] = models.gps_noise_var * if i == 2 { 4.0 } else { 1.0 };
         }
+    }
+
+    fn fuse_gps_position(&mut self, position: &Vector3<f64>, has_height: bool) {
+        self.expect_gps_position(position, has_height);
+        let error = self.receiver_error();
         let outcome = self.fuse_gated(FusionSource::GpsPosition);
-        self.state.rejections.gps_position = counted(self.state.rejections.gps_position, outcome.ratio);
-        if self.state.rejections.gps_position >= self.restart_after {
-            self.state.rejections.gps_position = 0;
-            // The receiver's error has jumped: its bias is unknown again, position is not.
-            let variances: [f64; 3] = (self.models.gps_bias_var * 25.0).into();
-            self.state.renew(at::GPS_BIAS, &variances);
+        let rejections = &mut self.state.rejections;
+        rejections.gps_position = counted(rejections.gps_position, outcome.ratio);
+        let before = std::mem::replace(&mut rejections.gps_error, error);
+        if rejections.gps_position >= self.restart_after {
+            self.follow_jump(position, has_height, &before);
         }
     }
 
@@ -305,7 +309,7 @@ pub(super) fn start(
     state.echoes.iter_mut().for_each(|echo| echo.live = false);
     let mut variances = [0.0; at::OWN];
     // Position starts wide and is tied to the receiver's bias by the first update.
-    variances[at::POSITION..at::POSITION + 3].fill(1e4);
+    variances[at::POSITION..at::POSITION + 3].fill(ANYWHERE_VAR);
     variances[at::VELOCITY..at::VELOCITY + 3].fill(if velocity.is_some() { 1.0 } else { 100.0 });
     variances[at::ATTITUDE..at::ATTITUDE + 2].fill(START_TILT.powi(2));
     variances[at::ATTITUDE + 2] = models.heading_bias_var + START_HEADING.powi(2);
@@ -327,6 +331,8 @@ pub(super) fn start(
     true
 }
 
+/// Variance of a position that is about to be read off the receiver, m².
+pub(super) const ANYWHERE_VAR: f64 = 1e4;
 /// Tilt at the start, one sigma, rad: what a helicopter may fly with whatever its compass says.
 const START_TILT: f64 = 0.1;
 /// What a heading reading may have changed since it was taken, one sigma, rad.

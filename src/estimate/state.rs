@@ -171,6 +171,8 @@ impl Echo {
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Rejections {
     pub(super) gps_position: u32,
+    /// Horizontal error of the receiver that the last fix implied, m.
+    pub(super) gps_error: Vector2<f64>,
     pub(super) gps_velocity: u32,
     pub(super) heading: u32,
     pub(super) tilt: u32,
@@ -192,6 +194,8 @@ pub(super) struct State {
     pub(super) probe: Echo,
     pub(super) learnt: Learnt,
     pub(super) rejections: Rejections,
+    /// When the scene was last anchored anew, and by how much it moved.
+    pub(super) anchored: Option<(MonoTime, Vector3<f64>)>,
 }
 
 /// States of the probe: rate and specific force.
@@ -220,6 +224,7 @@ impl State {
         }
         self.probe.copy_from(&other.probe);
         self.rejections = other.rejections;
+        self.anchored = other.anchored;
     }
 
     /// Copies all but the delayed copies, to look ahead with; without allocating where the sizes match.

@@ -226,7 +226,7 @@ impl Core {
         self.fuse_feature(slot, track, false);
     }
 
-    fn drop_feature(&mut self, slot: usize) {
+    pub(super) fn drop_feature(&mut self, slot: usize) {
         self.state.features[slot].id = None;
         let start = self.state.feature_at(slot);
         self.state.renew(start, &[0.0; 2]);

@@ -314,6 +314,13 @@ impl Pipeline {
                     self.monitor.disposition(result.disposition);
                     out.push(Output::Fusion(result));
                 }
+                EstimatorOutput::Anchored { moved_m: d } => {
+                    let detail = format!(
+                        "the receiver jumped for good: everything moved by {:.1} m north, {:.1} m east, {:.1} m down",
+                        d.x, d.y, d.z
+                    );
+                    out.push(notice(t, NoticeKind::FilterReset, None, detail));
+                }
                 EstimatorOutput::Reset { reason } => {
                     out.push(notice(t, NoticeKind::FilterReset, None, reason.to_string()));
                 }
