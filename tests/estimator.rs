@@ -300,7 +300,8 @@ fn absurd_numbers_pass_without_harm() {
     assert!(s.coverage > 0.8 && s.heading < 0.1, "{s:?}");
 }
 
-/// Gives the fixes from each of `jumps` (seconds, metres north) on that much error on top.
+/// Gives the fixes from each of `jumps` (seconds, metres north) on that much error on top, and as much
+/// in height.
 fn with_jumps(flight: &Flight, jumps: &[(f64, f64)]) -> Vec<EstimatorOutput> {
     let (mut filter, mut out) = (flight.filter(), Vec::new());
     for heard in &flight.heard {
@@ -308,6 +309,7 @@ fn with_jumps(flight: &Flight, jumps: &[(f64, f64)]) -> Vec<EstimatorOutput> {
         if let Heard::Gnss(g) = &mut heard {
             let t_s = flight.world.seconds(g.t_valid);
             let north_m = jumps.iter().rev().find(|(from_s, _)| t_s >= *from_s).map_or(0.0, |j| j.1);
+            g.value.alt_msl_m = g.value.alt_msl_m.map(|alt| alt + north_m);
             g.value.lat_deg = g.value.lat_deg.map(|lat| lat + (north_m / METRES_A_RADIAN).to_degrees());
         }
         heard.give(&mut filter, &mut out);
@@ -349,6 +351,8 @@ fn a_lasting_jump_of_the_receiver_anchors_the_scene_anew() {
         let Some(off_m) = off(own.t_valid) else { continue };
         let (error, sigma) = (own.position_ned_m - truth.position_ned_m, own.position_sigma_m);
         assert!((error.x - off_m).abs() < 4.0 * sigma.x && error.y.abs() < 4.0 * sigma.y, "{own:?}");
+        // Tags show the height, whatever the receiver says of it.
+        assert!(error.z.abs() < 4.0 * sigma.z && error.z.abs() < 1.0, "{own:?}");
         assert!(sigma.x > 0.3 * prior_m && sigma.x < 1.2 * prior_m, "{sigma:?}");
     }
     // The vehicle went along, and nothing that does not depend on where the datum is noticed.

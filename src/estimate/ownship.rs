@@ -62,7 +62,7 @@ impl Core {
         }
     }
 
-    /// `z = p + R l + b − v τ + ½ a τ²`, with the antenna's velocity v and the delay τ.
+    /// Writes a fix into `z`: `z = p + R l + b − v τ + ½ a τ²`, with the antenna's velocity v and the delay τ.
     pub(super) fn expect_gps_position(&mut self, position: &Vector3<f64>, has_height: bool) {
         let (own, models) = (&self.state.own, &self.models);
         let m = if has_height { 3 } else { 2 };
