@@ -7,9 +7,9 @@ use std::hint::black_box;
 use criterion::{Criterion, criterion_group, criterion_main};
 use nalgebra::Vector2;
 use rand::{Rng, SeedableRng};
-use windhover::config::TagFamily;
-use windhover::detect::{Region, Simd, TagDetector, tag_pattern};
-use windhover::msg::GrayImage;
+use windhover::config::{Config, TagFamily};
+use windhover::detect::{FrameDetector, Region, Simd, TagDetector, tag_pattern};
+use windhover::msg::{FrameObservations, FramePrediction, GrayImage, ImageView, MarkerId, MarkerPrediction};
 
 fn put_tag(image: &mut GrayImage, id: u32, at: (usize, usize), cell: usize) {
     let pattern = tag_pattern(TagFamily::Tag36h11, id);
@@ -77,5 +77,48 @@ fn tags(c: &mut Criterion) {
     });
 }
 
-criterion_group!(benches, tags);
+/// The frame as seen by a camera that moved by some pixels: a window of the same buffer.
+fn moved(image: &GrayImage, by: usize) -> ImageView<'_> {
+    let mut view = image.view();
+    view.data = &view.data[by * view.stride + by..];
+    view.width -= 8;
+    view.height -= 8;
+    view
+}
+
+/// A frame while tracking: both tags where they were foretold, one strip of the rest, eight ground features.
+fn tracked(c: &mut Criterion) {
+    let image = frame();
+    let text =
+        include_str!("../config/windhover.toml").replace("id = 0", "id = 3").replace("id = 1", "id = 4");
+    let family = TagFamily::Tag36h11;
+    let marker = |id, u, size_px| MarkerPrediction {
+        marker: MarkerId::Tag { family, id },
+        center_px: Vector2::new(u, 425.0),
+        sigma_px: 4.0,
+        size_px,
+    };
+    let prediction = FramePrediction {
+        markers: vec![marker(3, 525.0, 40.0), marker(4, 755.0, 88.0)],
+        search: false,
+        size_range_px: Some((30.0, 110.0)),
+        occupied: vec![(Vector2::new(640.0, 440.0), 220.0)],
+    };
+    for features in [0, 8] {
+        let mut config = Config::parse(&text).expect("the shipped configuration");
+        config.detector.ground_features = features;
+        let mut detector = FrameDetector::new(&config);
+        let mut seen = FrameObservations::default();
+        let mut n = 0;
+        c.bench_function(&format!("detector/tracked frame/{features} features"), |b| {
+            b.iter(|| {
+                n += 1;
+                detector.process(black_box(moved(&image, n % 2 * 4)), None, Some(&prediction), &mut seen);
+            });
+        });
+        assert_eq!((seen.markers.len(), seen.features.len()), (2, features), "all are seen");
+    }
+}
+
+criterion_group!(benches, tags, tracked);
 criterion_main!(benches);
