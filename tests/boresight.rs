@@ -1,13 +1,12 @@
 //! The boresight proved on simulated flights with crooked mounts, as values, without rendering.
 
+mod guide;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use windhover::calibrate::boresight::{Boresight, BoresightError, Recording, boresight};
-use windhover::config::TargetModel;
-use windhover::simulate::{
-    HelicopterPath, Route, Sample, Scenario, SensorSuite, SpeedPlan, VehiclePlan, World,
-};
+use windhover::simulate::{HelicopterPath, Route, Sample, Scenario, SensorSuite, World};
 use windhover::time::Span;
 
 /// A minute over a marker at rest with a crooked camera and compass: a figure of eight, turning.
@@ -18,17 +17,7 @@ fn pattern(seed: u64) -> Scenario {
     scenario.compass.bias_sigma_deg = 1.5;
     scenario.camera.features = 0;
     // A guide that nobody sees leads the helicopter around its eight.
-    let mut guide = scenario.config.target[0].clone();
-    guide.name = "guide".into();
-    guide.model = TargetModel::Unicycle;
-    guide.marker[0].id = Some(8);
-    scenario.config.target.push(guide);
-    scenario.vehicles.push(VehiclePlan {
-        start: (0.0, 0.0, None),
-        speed: SpeedPlan::Cruise { mean_mps: 2.5, wander_mps: 0.3 },
-        route: Route::Eight { a_m: 5.0, b_m: 3.0 },
-    });
-    scenario.helicopter.path = HelicopterPath::Follow { target: 1 };
+    guide::lead(&mut scenario, 2.5, Route::Eight { a_m: 5.0, b_m: 3.0 });
     scenario.helicopter.heading_wander_deg = 80.0;
     scenario.helicopter.agitation_mps2 = 0.5;
     scenario

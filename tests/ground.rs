@@ -1,16 +1,15 @@
 //! The ground through the estimator: a marker at rest surveyed in passes, and a vehicle on a slope.
 
+mod guide;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nalgebra::{Rotation3, Vector2, Vector3};
-use windhover::config::TargetModel;
 use windhover::estimate::{Estimator, EstimatorOutput, Site};
 use windhover::geo::{Geodetic, Ground, LocalFrame, Terrain, Tile, euler_321, rot_y, wrap_angle};
 use windhover::msg::{AttitudeSample, GnssEpoch, Stamped, TargetEstimate, TrackStatus};
-use windhover::simulate::{
-    HelicopterPath, Route, Sample, Scenario, SensorSuite, SpeedPlan, VehiclePlan, World,
-};
+use windhover::simulate::{Route, Sample, Scenario, SensorSuite, World};
 
 /// Flies a scenario on a plane turned by `tilt` about the scenario's origin, through the filter over
 /// `ground`. Turning the whole world leaves every image as it is: only fixes and compass turn.
@@ -157,17 +156,7 @@ fn passes(seconds: f64) -> Scenario {
     scenario.duration_s = seconds;
     scenario.camera.features = 0;
     scenario.config.camera.fps = 4.0;
-    let mut guide = scenario.config.target[0].clone();
-    guide.name = "guide".into();
-    guide.model = TargetModel::Unicycle;
-    guide.marker[0].id = Some(8);
-    scenario.config.target.push(guide);
-    scenario.vehicles.push(VehiclePlan {
-        start: (0.0, 0.0, None),
-        speed: SpeedPlan::Cruise { mean_mps: 4.0, wander_mps: 0.3 },
-        route: Route::Eight { a_m: 25.0, b_m: 12.0 },
-    });
-    scenario.helicopter.path = HelicopterPath::Follow { target: 1 };
+    guide::lead(&mut scenario, 4.0, Route::Eight { a_m: 25.0, b_m: 12.0 });
     scenario
 }
 

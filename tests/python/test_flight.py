@@ -2,7 +2,6 @@
 
 import csv
 import pathlib
-import subprocess
 import tempfile
 import unittest
 
@@ -11,14 +10,7 @@ from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-BINARY = pathlib.Path(__file__).resolve().parents[2] / "target/debug/windhover"
-
-
-def run(*args):
-    done = subprocess.run([BINARY, *map(str, args)], capture_output=True, text=True)
-    if done.returncode:
-        raise AssertionError(f"windhover {args[0]} gave {done.returncode}: {done.stderr}")
-    return done.stdout
+from rig import windhover as run
 
 
 class Flight(unittest.TestCase):
