@@ -18,10 +18,10 @@ help:
 	@echo "make hil      the virtual payload computer: install, boot, fly, compare (as root)"
 	@echo "make hil-long the same with every scenario"
 
-# What the build needs of the system: a C compiler for the compression libraries, and clang's library
-# for the camera bindings.
+# What the build needs of the system: a C compiler for the compression libraries, CMake and an assembler
+# for JPEG, and clang's library for the camera bindings.
 setup:
-	@sh tests/setup/packages.sh build-essential libclang-dev pkg-config
+	@sh tests/setup/packages.sh build-essential cmake nasm libclang-dev pkg-config
 
 # What tests in other languages need: readers of our files written by other people.
 setup-python: setup

@@ -15,6 +15,7 @@ pub mod time;
 pub mod geo;
 pub mod config;
 pub mod msg;
+pub mod jpeg;
 pub mod decode;
 pub mod align;
 pub mod detect;

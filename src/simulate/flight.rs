@@ -11,6 +11,7 @@ use super::line::Line;
 use super::random::{Purpose, Stream};
 use super::render::Renderer;
 use super::world::World;
+use crate::jpeg::{self, Layout};
 use crate::msg::{Event, EventBody, FrameEncoding, FramePayload, GrayImage};
 use crate::time::{MonoTime, Span};
 
@@ -166,13 +167,8 @@ impl Flight {
 }
 
 fn jpeg(image: &GrayImage, quality: u8, frame: u32) -> Result<Vec<u8>, FlightError> {
-    let refused = |reason: String| FlightError::Jpeg { frame, reason };
-    let side = |size: usize| u16::try_from(size).map_err(|_| refused(format!("{size} pixels are too many")));
-    let mut bytes = Vec::with_capacity(image.data.len() / 4);
-    jpeg_encoder::Encoder::new(&mut bytes, quality.clamp(1, 100))
-        .encode(&image.data, side(image.width)?, side(image.height)?, jpeg_encoder::ColorType::Luma)
-        .map_err(|e| refused(e.to_string()))?;
-    Ok(bytes)
+    jpeg::encode(&image.data, Layout::Grey, (image.width, image.height), quality)
+        .map_err(|e| FlightError::Jpeg { frame, reason: e.to_string() })
 }
 
 impl Iterator for Flight {

@@ -7,6 +7,7 @@ use super::page::{Section, base64, paragraph};
 use crate::app::flight::{self, Flight};
 use crate::io::mcap_read::ReadError;
 use crate::io::proto::windhover as wh;
+use crate::jpeg::{self, Layout};
 use crate::msg::GrayImage;
 use crate::pipeline::frame::decode;
 use crate::time::MonoTime;
@@ -108,10 +109,7 @@ fn quality(image: &GrayImage) -> Quality {
 
 fn picture(image: &GrayImage, number: u32, t_s: f64, flight: &Flight) -> Option<Picture> {
     let small = shrunk(image);
-    let mut jpeg = Vec::new();
-    let encoder = jpeg_encoder::Encoder::new(&mut jpeg, JPEG_QUALITY);
-    let (width, height) = (u16::try_from(small.width).ok()?, u16::try_from(small.height).ok()?);
-    encoder.encode(&small.data, width, height, jpeg_encoder::ColorType::Luma).ok()?;
+    let jpeg = jpeg::encode(&small.data, Layout::Grey, (small.width, small.height), JPEG_QUALITY).ok()?;
     let seen = flight.detections.iter().find(|d| d.frame == number).cloned().unwrap_or_default();
     Some(Picture { jpeg, width: image.width, height: image.height, t_s, number, seen })
 }

@@ -1,10 +1,10 @@
 //! Thumbnails of the camera image: small JPEG pictures with what was detected in them.
 
-use jpeg_encoder::{ColorType, Encoder};
 use prost::Message as _;
 
 use crate::io::proto::link::Thumbnail;
 use crate::io::records;
+use crate::jpeg::{self, Layout};
 use crate::msg::{FeatureTrack, FramePayload, GrayImage, MarkerDetection};
 use crate::pipeline::frame;
 
@@ -49,12 +49,7 @@ impl Picture {
         let image = frame::decode(&self.frame, false).ok()?.gray;
         let factor = (image.width / width.max(1) as usize).max(1);
         let small = shrink(&image, factor);
-        let size = (u16::try_from(small.width).ok()?, u16::try_from(small.height).ok()?);
-        if size.0 == 0 || size.1 == 0 {
-            return None;
-        }
-        let mut jpeg = Vec::new();
-        Encoder::new(&mut jpeg, QUALITY).encode(&small.data, size.0, size.1, ColorType::Luma).ok()?;
+        let jpeg = jpeg::encode(&small.data, Layout::Grey, (small.width, small.height), QUALITY).ok()?;
         let found =
             records::detections(self.frame.index, self.frame.t_exposure, &self.markers, &self.features);
         Some(Thumbnail {

@@ -5,10 +5,10 @@ use std::sync::Arc;
 
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
-use jpeg_encoder::{ColorType, Encoder};
 
 use super::format::Compression;
 use crate::config::{FramePolicy, StoreConfig};
+use crate::jpeg::{self, Layout};
 use crate::msg::{FrameEncoding, FramePayload};
 
 /// Grey outside the region that is kept.
@@ -86,41 +86,38 @@ impl FrameKeeper {
     }
 
     fn jpeg(&self, frame: &FramePayload, region: Option<Region>) -> Option<(FrameEncoding, Vec<u8>)> {
-        let (color, channels, pixels) = packed(frame)?;
+        let (layout, pixels) = packed(frame)?;
         let pixels = match region {
-            Some(region) => blank_outside(&pixels, frame, channels, region),
+            Some(region) => blank_outside(&pixels, layout, frame, region).into(),
             None => pixels,
         };
-        let (width, height) = (u16::try_from(frame.width).ok()?, u16::try_from(frame.height).ok()?);
-        let mut out = Vec::with_capacity(pixels.len() / 4);
-        Encoder::new(&mut out, self.quality).encode(&pixels, width, height, color).ok()?;
-        Some((FrameEncoding::Jpeg, out))
+        let size = (frame.width as usize, frame.height as usize);
+        Some((FrameEncoding::Jpeg, jpeg::encode(&pixels, layout, size, self.quality).ok()?))
     }
 }
 
 /// Rows without gaps, as the JPEG encoder takes them; `None` for what is compressed already, not
 /// understood, or shorter than it says.
-fn packed(frame: &FramePayload) -> Option<(ColorType, usize, Cow<'_, [u8]>)> {
-    let (width, height) = (frame.width as usize, frame.height as usize);
-    let (color, channels) = match frame.encoding {
-        FrameEncoding::Grey => (ColorType::Luma, 1),
-        FrameEncoding::Rgb24 => (ColorType::Rgb, 3),
-        FrameEncoding::Bgr24 => (ColorType::Bgr, 3),
-        FrameEncoding::Yuyv => return Some((ColorType::Ycbcr, 3, yuv422(frame, [0, 1, 3])?.into())),
-        FrameEncoding::Uyvy => return Some((ColorType::Ycbcr, 3, yuv422(frame, [1, 0, 2])?.into())),
-        FrameEncoding::Nv12 => return Some((ColorType::Ycbcr, 3, nv12(frame)?.into())),
+fn packed(frame: &FramePayload) -> Option<(Layout, Cow<'_, [u8]>)> {
+    let (layout, channels) = match frame.encoding {
+        FrameEncoding::Grey => (Layout::Grey, 1),
+        FrameEncoding::Rgb24 => (Layout::Rgb, 3),
+        FrameEncoding::Bgr24 => (Layout::Bgr, 3),
+        FrameEncoding::Yuyv => return Some((Layout::Yuv422, yuv422(frame, [0, 1, 3])?.into())),
+        FrameEncoding::Uyvy => return Some((Layout::Yuv422, yuv422(frame, [1, 0, 2])?.into())),
+        FrameEncoding::Nv12 => return Some((Layout::Yuv420, nv12(frame)?.into())),
         FrameEncoding::Jpeg | FrameEncoding::Png | FrameEncoding::Unknown => return None,
     };
-    let row = width * channels;
+    let (row, height) = (frame.width as usize * channels, frame.height as usize);
     let stride = stride_of(frame, row)?;
     if stride == row {
-        return Some((color, channels, frame.data.get(..row * height)?.into()));
+        return Some((layout, frame.data.get(..row * height)?.into()));
     }
     let mut pixels = Vec::with_capacity(row * height);
     for v in 0..height {
         pixels.extend_from_slice(frame.data.get(v * stride..v * stride + row)?);
     }
-    Some((color, channels, pixels.into()))
+    Some((layout, pixels.into()))
 }
 
 fn stride_of(frame: &FramePayload, row: usize) -> Option<usize> {
@@ -128,45 +125,63 @@ fn stride_of(frame: &FramePayload, row: usize) -> Option<usize> {
     (stride >= row && row > 0 && frame.height > 0).then_some(stride)
 }
 
-/// 4:2:2 to three bytes a pixel. `order`: where the first Y, U and V are in each group of four; the
-/// second Y is two behind the first.
+/// Interleaved 4:2:2 to planes. `order`: where the first Y, U and V are in each group of four; the second
+/// Y is two behind the first.
 fn yuv422(frame: &FramePayload, [y, u, v]: [usize; 3]) -> Option<Vec<u8>> {
     let (width, height) = (frame.width as usize, frame.height as usize);
     let row = width.next_multiple_of(2) * 2;
     let stride = stride_of(frame, row)?;
-    let mut out = Vec::with_capacity(width * height * 3);
+    let mut out = vec![0; Layout::Yuv422.bytes(width, height)];
+    let (luma, color) = out.split_at_mut(width * height);
+    let (blue, red) = color.split_at_mut(width.div_ceil(2) * height);
     for line in 0..height {
-        let pairs = frame.data.get(line * stride..line * stride + row)?.chunks_exact(4);
-        let pixels = pairs.flat_map(|p| [[p[y], p[u], p[v]], [p[y + 2], p[u], p[v]]]);
-        pixels.take(width).for_each(|pixel| out.extend_from_slice(&pixel));
-    }
-    Some(out)
-}
-
-/// 4:2:0 with interleaved colour to three bytes a pixel.
-fn nv12(frame: &FramePayload) -> Option<Vec<u8>> {
-    let (width, height) = (frame.width as usize, frame.height as usize);
-    let stride = stride_of(frame, width)?;
-    let color = frame.data.get(stride * height..)?;
-    let mut out = Vec::with_capacity(width * height * 3);
-    for v in 0..height {
-        for u in 0..width {
-            let at = v / 2 * stride + (u & !1);
-            out.extend_from_slice(&[*frame.data.get(v * stride + u)?, *color.get(at)?, *color.get(at + 1)?]);
+        let packed = frame.data.get(line * stride..line * stride + row)?;
+        let luma = luma[line * width..(line + 1) * width].chunks_mut(2);
+        let colors = blue.iter_mut().zip(red.iter_mut()).skip(line * width.div_ceil(2));
+        for ((pair, luma), (blue, red)) in packed.chunks_exact(4).zip(luma).zip(colors) {
+            luma.iter_mut().zip([pair[y], pair[y + 2]]).for_each(|(to, from)| *to = from);
+            (*blue, *red) = (pair[u], pair[v]);
         }
     }
     Some(out)
 }
 
-fn blank_outside<'a>(pixels: &[u8], frame: &FramePayload, channels: usize, region: Region) -> Cow<'a, [u8]> {
-    let row = frame.width as usize * channels;
-    let mut out = vec![BLANK; pixels.len()];
-    let (u0, u1) = (region.u0.min(frame.width) as usize, region.u1.min(frame.width) as usize);
-    for v in region.v0.min(frame.height) as usize..region.v1.min(frame.height) as usize {
-        let part = v * row + u0 * channels..v * row + u1.max(u0) * channels;
-        out[part.clone()].copy_from_slice(&pixels[part]);
+/// 4:2:0 with interleaved colour to planes.
+fn nv12(frame: &FramePayload) -> Option<Vec<u8>> {
+    let (width, height) = (frame.width as usize, frame.height as usize);
+    let stride = stride_of(frame, width.next_multiple_of(2))?;
+    let (across, down) = (width.div_ceil(2), height.div_ceil(2));
+    let mut out = Vec::with_capacity(Layout::Yuv420.bytes(width, height));
+    for v in 0..height {
+        out.extend_from_slice(frame.data.get(v * stride..v * stride + width)?);
     }
-    out.into()
+    for channel in 0..2 {
+        for v in height..height + down {
+            let row = frame.data.get(v * stride..v * stride + 2 * across)?;
+            out.extend(row.chunks_exact(2).map(|pair| pair[channel]));
+        }
+    }
+    Some(out)
+}
+
+fn blank_outside(pixels: &[u8], layout: Layout, frame: &FramePayload, region: Region) -> Vec<u8> {
+    let mut out = vec![BLANK; pixels.len()];
+    let mut start = 0;
+    for plane in layout.planes(frame.width as usize, frame.height as usize) {
+        let samples = |from: u32, to: u32, step: usize, all: usize| {
+            let to = (to as usize).div_ceil(step).min(all);
+            (from as usize / step).min(to)..to
+        };
+        let (row, columns) =
+            (plane.width * plane.channels, samples(region.u0, region.u1, plane.step.0, plane.width));
+        for v in samples(region.v0, region.v1, plane.step.1, plane.height) {
+            let line = start + v * row;
+            let part = line + columns.start * plane.channels..line + columns.end * plane.channels;
+            out[part.clone()].copy_from_slice(&pixels[part]);
+        }
+        start += plane.bytes();
+    }
+    out
 }
 
 /// PNG at its fastest; `None` where the format has no lossless PNG.
@@ -176,7 +191,7 @@ fn png(frame: &FramePayload) -> Option<(FrameEncoding, Vec<u8>)> {
         FrameEncoding::Rgb24 => ExtendedColorType::Rgb8,
         _ => return None,
     };
-    let (_, _, pixels) = packed(frame)?;
+    let (_, pixels) = packed(frame)?;
     let mut out = Vec::with_capacity(pixels.len());
     PngEncoder::new_with_quality(&mut out, CompressionType::Fast, FilterType::Up)
         .write_image(&pixels, frame.width, frame.height, color)
