@@ -38,19 +38,21 @@ impl Plane {
 }
 
 impl Layout {
-    /// The planes of a picture of `width` by `height` pixels, in the order of its bytes.
+    /// The planes of a picture of `width` by `height` pixels, in the order of its bytes. Where colour is
+    /// coarser, the first plane is filled up to whole blocks.
     pub fn planes(self, width: usize, height: usize) -> Vec<Plane> {
-        let plane = |channels, (across, down)| Plane {
-            channels,
-            width: width.div_ceil(across),
-            height: height.div_ceil(down),
-            step: (across, down),
+        let plane = |channels, step| Plane { channels, width, height, step };
+        let subsampled = |(across, down): (usize, usize)| {
+            let (columns, rows) = (width.div_ceil(across), height.div_ceil(down));
+            let luma = Plane { channels: 1, width: columns * across, height: rows * down, step: (1, 1) };
+            let color = Plane { channels: 1, width: columns, height: rows, step: (across, down) };
+            vec![luma, color, color]
         };
         match self {
             Layout::Grey => vec![plane(1, (1, 1))],
             Layout::Rgb | Layout::Bgr => vec![plane(3, (1, 1))],
-            Layout::Yuv422 => vec![plane(1, (1, 1)), plane(1, (2, 1)), plane(1, (2, 1))],
-            Layout::Yuv420 => vec![plane(1, (1, 1)), plane(1, (2, 2)), plane(1, (2, 2))],
+            Layout::Yuv422 => subsampled((2, 1)),
+            Layout::Yuv420 => subsampled((2, 2)),
         }
     }
 

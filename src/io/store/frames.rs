@@ -132,14 +132,14 @@ fn yuv422(frame: &FramePayload, [y, u, v]: [usize; 3]) -> Option<Vec<u8>> {
     let row = width.next_multiple_of(2) * 2;
     let stride = stride_of(frame, row)?;
     let mut out = vec![0; Layout::Yuv422.bytes(width, height)];
-    let (luma, color) = out.split_at_mut(width * height);
-    let (blue, red) = color.split_at_mut(width.div_ceil(2) * height);
+    let (luma, color) = out.split_at_mut(row / 2 * height);
+    let (blue, red) = color.split_at_mut(row / 4 * height);
     for line in 0..height {
         let packed = frame.data.get(line * stride..line * stride + row)?;
-        let luma = luma[line * width..(line + 1) * width].chunks_mut(2);
-        let colors = blue.iter_mut().zip(red.iter_mut()).skip(line * width.div_ceil(2));
+        let luma = luma[line * row / 2..(line + 1) * row / 2].chunks_exact_mut(2);
+        let colors = blue.iter_mut().zip(red.iter_mut()).skip(line * row / 4);
         for ((pair, luma), (blue, red)) in packed.chunks_exact(4).zip(luma).zip(colors) {
-            luma.iter_mut().zip([pair[y], pair[y + 2]]).for_each(|(to, from)| *to = from);
+            luma.copy_from_slice(&[pair[y], pair[y + 2]]);
             (*blue, *red) = (pair[u], pair[v]);
         }
     }
@@ -152,8 +152,9 @@ fn nv12(frame: &FramePayload) -> Option<Vec<u8>> {
     let stride = stride_of(frame, width.next_multiple_of(2))?;
     let (across, down) = (width.div_ceil(2), height.div_ceil(2));
     let mut out = Vec::with_capacity(Layout::Yuv420.bytes(width, height));
-    for v in 0..height {
-        out.extend_from_slice(frame.data.get(v * stride..v * stride + width)?);
+    for v in 0..2 * down {
+        let start = v.min(height - 1) * stride;
+        out.extend_from_slice(frame.data.get(start..start + 2 * across)?);
     }
     for channel in 0..2 {
         for v in height..height + down {
