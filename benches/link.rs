@@ -1,7 +1,9 @@
 //! Proof of the wireless link over an impaired relay: cuts, loss, a line too slow, ten stations.
 //!
-//! `cargo bench --bench link` runs every case in about six minutes and prints how late live records were
-//! and whether all arrived once; `cargo bench --bench link -- cut25 slow` runs those named.
+//! `cargo bench --bench link` runs every case in about seven minutes and prints how late live records were
+//! and whether all arrived once; `cargo bench --bench link -- cut25 slow` runs those named. Beside each case
+//! stands the floor: how late bare UDP datagrams are that are sent 30 times a second through a relay of the
+//! same delay in the same run, which is what machine and harness add.
 
 #[path = "../tests/link/relay.rs"]
 #[expect(dead_code, reason = "the tests use the rest")]
@@ -10,7 +12,9 @@ mod relay;
 #[expect(dead_code, reason = "shared with the tests, which use more of it")]
 mod team;
 
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 
 use relay::{Radio, Relay};
 use team::{Got, Keys, Payload, Station, loopback, payload_settings, station_settings};
@@ -24,17 +28,67 @@ fn radio() -> Radio {
     Radio { delay: Duration::from_millis(DELAY_MS as u64), ..Radio::default() }
 }
 
+/// Bare datagrams through a relay, and how late they were, ms beyond its delay.
+struct Floor {
+    late_ms: Arc<Mutex<Vec<f64>>>,
+    stopped: Arc<AtomicBool>,
+}
+
+impl Floor {
+    fn start() -> Self {
+        let floor = Self { late_ms: Arc::default(), stopped: Arc::default() };
+        let port = || std::net::UdpSocket::bind("127.0.0.1:0").expect("a loopback port");
+        let (near, far, began) = (port(), port(), Instant::now());
+        let relay = Relay::start(far.local_addr().expect("bound"), radio(), 7);
+        near.connect(relay.address).expect("loopback");
+        far.set_read_timeout(Some(Duration::from_millis(200))).expect("a time-out above zero");
+        let stopped = Arc::clone(&floor.stopped);
+        std::thread::spawn(move || {
+            while !stopped.load(Ordering::Relaxed) {
+                std::thread::sleep(EVERY);
+                let sent = began.elapsed().as_nanos() as u64;
+                let _ = near.send(&sent.to_le_bytes());
+            }
+        });
+        let (stopped, late_ms) = (Arc::clone(&floor.stopped), Arc::clone(&floor.late_ms));
+        std::thread::spawn(move || {
+            let (mut stamp, _relay) = ([0; 8], relay);
+            while !stopped.load(Ordering::Relaxed) {
+                if far.recv(&mut stamp).is_ok() {
+                    let passed = began.elapsed().as_nanos() as u64 - u64::from_le_bytes(stamp);
+                    late_ms.lock().expect("not poisoned").push(passed as f64 * 1e-6 - DELAY_MS);
+                }
+            }
+        });
+        floor
+    }
+}
+
+impl Drop for Floor {
+    fn drop(&mut self) {
+        self.stopped.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Median, 99th percentile and maximum.
+fn spread(mut ms: Vec<f64>) -> [f64; 3] {
+    ms.sort_by(f64::total_cmp);
+    let at = |q: f64| ms.get(((ms.len() as f64 - 1.0) * q) as usize).copied().unwrap_or(f64::NAN);
+    [at(0.5), at(0.99), at(1.0)]
+}
+
 struct Bench {
     _keys: Keys,
     payload: Payload,
     relay: Relay,
     stations: Vec<Station>,
+    floor: Floor,
 }
 
 async fn start(radio: Radio, stations: usize) -> Bench {
     let keys = Keys::new();
     let payload = Payload::start(&payload_settings(keys.files(Role::Payload, "alpha"), loopback()), 1, None);
-    let relay = Relay::start(payload.address, radio, 42).await;
+    let relay = Relay::start(payload.address, radio, 42);
     let mut up = Vec::new();
     for n in 0..stations {
         let files = keys.files(Role::Station, &format!("station-{n}"));
@@ -44,7 +98,7 @@ async fn start(radio: Radio, stations: usize) -> Bench {
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
     tokio::time::sleep(Duration::from_secs(2)).await;
-    Bench { _keys: keys, payload, relay, stations: up }
+    Bench { _keys: keys, payload, relay, stations: up, floor: Floor::start() }
 }
 
 impl Bench {
@@ -81,14 +135,13 @@ impl Bench {
             live += got.live_ms.len();
             late.extend(got.live_ms.iter().map(|ms| ms - DELAY_MS));
         }
-        late.sort_by(f64::total_cmp);
-        let at = |q: f64| late.get(((late.len() as f64 - 1.0) * q) as usize).copied().unwrap_or(f64::NAN);
+        let floor = spread(self.floor.late_ms.lock().expect("not poisoned").clone());
+        let [p50, p99, most] = spread(late);
         println!(
-            "{name:10} {sent:6} sent, {live:6} live; later than the line's {DELAY_MS} ms: p50 {:6.1} p99 {:6.1} \
-             max {:6.1} ms; missing {missing}, twice {twice}, complete {seconds:.1} s after the last",
-            at(0.5),
-            at(0.99),
-            at(1.0)
+            "{name:10} {sent:6} sent, {live:6} live; ms beyond the line's {DELAY_MS}: p50 {p50:5.1} p99 {p99:5.1} \
+             max {most:5.1}; bare UDP p50 {:4.1} p99 {:4.1} max {:4.1}; missing {missing}, twice {twice}, \
+             complete {seconds:.1} s after the last",
+            floor[0], floor[1], floor[2]
         );
     }
 

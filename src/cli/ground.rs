@@ -51,6 +51,13 @@ pub(super) struct Args {
     /// Serve the vehicles as NMEA (RMC and GGA) over TCP here, for example 127.0.0.1:10110
     #[arg(long, value_name = "ADDRESS:PORT")]
     nmea: Option<SocketAddr>,
+    /// Serve Foxglove over its WebSocket; elsewhere than on loopback the token is asked for
+    #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1:8765")]
+    foxglove: Option<SocketAddr>,
+    /// Publish on Zenoh and answer queries there: without a value on loopback only, else a router's endpoint
+    /// (tcp/HOST:PORT) or a file with Zenoh's configuration; only where built with the feature `zenoh`
+    #[arg(long, value_name = "ENDPOINT|FILE", num_args = 0..=1, default_missing_value = "tcp/127.0.0.1:7447")]
+    zenoh: Option<String>,
     /// Ask for no thumbnails of the camera image
     #[arg(long)]
     no_thumbnails: bool,
@@ -66,6 +73,11 @@ pub(super) fn run(args: &Args) -> CliResult {
         |t: &String| t.len() >= 8 && t.chars().all(|c| c.is_ascii_alphanumeric() || "-_.~".contains(c));
     if args.token.as_ref().is_some_and(|token| !token_fits(token)) {
         return Err(CliError::usage("--token must be at least 8 letters, digits and -_.~"));
+    }
+    if args.zenoh.is_some() && !cfg!(feature = "zenoh") {
+        return Err(CliError::usage(
+            "this windhover was built without Zenoh: build it with `cargo build --release --features zenoh`",
+        ));
     }
     let revoked = args.revoked.clone().or_else(|| {
         let beside = args.authority.with_file_name("revoked.pem");
@@ -88,6 +100,9 @@ pub(super) fn run(args: &Args) -> CliResult {
         token: args.token.clone(),
         tiles: args.tiles.clone(),
         nmea: args.nmea,
+        foxglove: args.foxglove,
+        #[cfg(feature = "zenoh")]
+        zenoh: args.zenoh.clone(),
         terminal: std::io::stdout().is_terminal(),
     };
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;

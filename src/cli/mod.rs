@@ -55,7 +55,7 @@ enum Command {
     Run(run::Args),
     CheckConfig(check_config::Args),
     Decode(decode::Args),
-    Ground(ground::Args),
+    Ground(Box<ground::Args>),
     Keys(keys::Args),
     Montecarlo(montecarlo::Args),
     Report(report::Args),

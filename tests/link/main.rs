@@ -33,7 +33,7 @@ struct Pair {
 async fn pair(radio: Radio, seed: u64) -> Pair {
     let keys = Keys::new();
     let payload = Payload::start(&payload_settings(keys.files(Role::Payload, "alpha"), loopback()), 1, None);
-    let relay = Relay::start(payload.address, radio, seed).await;
+    let relay = Relay::start(payload.address, radio, seed);
     let station = Station::first(&station_settings(keys.files(Role::Station, "base"), Some(relay.address)));
     assert!(within(PATIENCE, || any(&station.events, is_up)).await, "no connection");
     Pair { _keys: keys, payload, relay, station }
@@ -105,7 +105,7 @@ async fn a_station_restarted_in_mid_backfill_goes_on_where_it_was() {
     let payload = Payload::start(&payload_settings(keys.files(Role::Payload, "alpha"), loopback()), 1, None);
     // Slow enough that 3000 records of the past take a while.
     let slow = Radio { rate: Some(60e3), ..Radio::default() };
-    let relay = Relay::start(payload.address, slow, 6).await;
+    let relay = Relay::start(payload.address, slow, 6);
     for _ in 0..3_000 {
         payload.send();
     }
@@ -139,7 +139,7 @@ async fn a_payload_restarted_in_mid_backfill_fills_from_its_store() {
     // Given: run 1 is on the card, run 2 is going on, and the station has got a part of both.
     let payload = Payload::start(&settings, 2, Some(Arc::clone(&old) as Arc<dyn Backlog>));
     let slow = Radio { rate: Some(40e3), ..Radio::default() };
-    let relay = Relay::start(payload.address, slow, 7).await;
+    let relay = Relay::start(payload.address, slow, 7);
     let station = Station::first(&station_settings(keys.files(Role::Station, "base"), Some(relay.address)));
     let some = within(PATIENCE, || station.of(1).times.len() > 100).await;
     assert!(some, "back-fill begins: {:?}", payload.handle.status());
@@ -197,7 +197,7 @@ async fn the_ceiling_is_obeyed_and_live_is_thinned_to_it() {
     let mut settings = payload_settings(keys.files(Role::Payload, "alpha"), loopback());
     settings.ceiling = Some(6_000.0);
     let payload = Payload::start(&settings, 1, None);
-    let relay = Relay::start(payload.address, Radio::default(), 8).await;
+    let relay = Relay::start(payload.address, Radio::default(), 8);
     let station = Station::first(&station_settings(keys.files(Role::Station, "base"), Some(relay.address)));
     assert!(within(PATIENCE, || any(&station.events, is_up)).await, "no connection");
     tokio::time::sleep(Duration::from_secs(1)).await;

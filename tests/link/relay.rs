@@ -1,16 +1,16 @@
 //! A UDP relay that behaves like a radio: loss, delay, a slow line with a queue, cuts, a new address.
+//!
+//! It has threads of its own and sleeps to a tenth of a millisecond, so that what is measured through it is
+//! the link and not the runtime's timer.
 
 use std::collections::HashMap;
-use std::net::SocketAddr;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::net::{SocketAddr, UdpSocket};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, mpsc};
+use std::time::{Duration, Instant};
 
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
-use tokio::net::UdpSocket;
-use tokio::sync::mpsc;
-use tokio::time::Instant;
 
 /// What the radio does to packets, each way.
 #[derive(Clone, Copy, Debug)]
@@ -35,6 +35,8 @@ impl Default for Radio {
 const QUEUE_S: f64 = 2.0;
 /// IPv4 and UDP headers, bytes.
 const HEADERS: usize = 28;
+/// How often threads look whether they are to end.
+const LOOK: Duration = Duration::from_millis(200);
 
 #[derive(Default)]
 struct State {
@@ -42,17 +44,28 @@ struct State {
     generation: u64,
 }
 
+#[derive(Default)]
+struct Shared {
+    state: Mutex<State>,
+    down: AtomicU64,
+    stopped: AtomicBool,
+}
+
+impl Shared {
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().expect("not poisoned")
+    }
+}
+
 /// The relay; it stops when dropped.
 pub struct Relay {
     pub address: SocketAddr,
-    state: Arc<Mutex<State>>,
-    down: Arc<AtomicU64>,
-    task: tokio::task::JoinHandle<()>,
+    shared: Arc<Shared>,
 }
 
 impl Drop for Relay {
     fn drop(&mut self) {
-        self.task.abort();
+        self.shared.stopped.store(true, Ordering::Relaxed);
     }
 }
 
@@ -60,106 +73,124 @@ impl Drop for Relay {
 struct Lane {
     free_at: Instant,
     random: ChaCha8Rng,
-    out: mpsc::UnboundedSender<(Instant, Vec<u8>)>,
+    out: mpsc::Sender<(Instant, Vec<u8>)>,
 }
 
 impl Lane {
-    fn new(seed: u64, socket: Arc<UdpSocket>, to: Option<SocketAddr>) -> Self {
-        let (out, mut queue) = mpsc::unbounded_channel::<(Instant, Vec<u8>)>();
-        tokio::spawn(async move {
-            while let Some((at, packet)) = queue.recv().await {
-                tokio::time::sleep_until(at).await;
+    fn new(seed: u64, socket: UdpSocket, to: Option<SocketAddr>) -> Self {
+        let (out, queue) = mpsc::channel::<(Instant, Vec<u8>)>();
+        std::thread::spawn(move || {
+            for (at, packet) in queue {
+                std::thread::sleep(at.saturating_duration_since(Instant::now()));
                 let _ = match to {
-                    Some(to) => socket.send_to(&packet, to).await,
-                    None => socket.send(&packet).await,
+                    Some(to) => socket.send_to(&packet, to),
+                    None => socket.send(&packet),
                 };
             }
         });
         Self { free_at: Instant::now(), random: ChaCha8Rng::seed_from_u64(seed), out }
     }
 
-    fn pass(&mut self, radio: &Radio, packet: &[u8]) -> bool {
+    fn pass(&mut self, radio: &Radio, packet: &[u8]) {
         let now = Instant::now();
         if radio.cut || self.random.random_bool(radio.loss) {
-            return false;
+            return;
         }
         let start = self.free_at.max(now);
         if let Some(rate) = radio.rate {
             if (start - now).as_secs_f64() > QUEUE_S {
-                return false;
+                return;
             }
             self.free_at = start + Duration::from_secs_f64((packet.len() + HEADERS) as f64 / rate);
         } else {
             self.free_at = now;
         }
-        self.out.send((self.free_at + radio.delay, packet.to_vec())).is_ok()
+        // The thread ends with this lane, not before.
+        let _ = self.out.send((self.free_at + radio.delay, packet.to_vec()));
     }
 }
 
 impl Relay {
     /// Relays to `target`.
-    pub async fn start(target: SocketAddr, radio: Radio, seed: u64) -> Self {
-        let socket = Arc::new(UdpSocket::bind("127.0.0.1:0").await.expect("a loopback port"));
+    pub fn start(target: SocketAddr, radio: Radio, seed: u64) -> Self {
+        let socket = port();
         let address = socket.local_addr().expect("bound");
-        let state = Arc::new(Mutex::new(State { radio, generation: 0 }));
-        let down = Arc::new(AtomicU64::new(0));
-        let task = tokio::spawn(forward(socket, target, Arc::clone(&state), Arc::clone(&down), seed));
-        Self { address, state, down, task }
+        let state = Mutex::new(State { radio, generation: 0 });
+        let shared = Arc::new(Shared { state, ..Shared::default() });
+        let of_thread = Arc::clone(&shared);
+        std::thread::spawn(move || forward(&socket, target, &of_thread, seed));
+        Self { address, shared }
     }
 
     /// Changes the weather.
     pub fn set(&self, change: impl FnOnce(&mut Radio)) {
-        change(&mut self.state.lock().expect("not poisoned").radio);
+        change(&mut self.shared.state().radio);
     }
 
     /// From now on the caller appears under another address, as after roaming.
     pub fn roam(&self) {
-        self.state.lock().expect("not poisoned").generation += 1;
+        self.shared.state().generation += 1;
     }
 
     /// Bytes that the target sent back, headers included.
     pub fn bytes_down(&self) -> u64 {
-        self.down.load(Ordering::Relaxed)
+        self.shared.down.load(Ordering::Relaxed)
     }
 }
 
-async fn forward(
-    socket: Arc<UdpSocket>,
-    target: SocketAddr,
-    state: Arc<Mutex<State>>,
-    down: Arc<AtomicU64>,
-    seed: u64,
-) {
-    let mut callers: HashMap<SocketAddr, (u64, Lane, tokio::task::JoinHandle<()>)> = HashMap::new();
+fn port() -> UdpSocket {
+    let socket = UdpSocket::bind("127.0.0.1:0").expect("a loopback port");
+    socket.set_read_timeout(Some(LOOK)).expect("a time-out above zero");
+    socket
+}
+
+/// What is known of one caller: under which address it appears, and the way up.
+struct Caller {
+    generation: u64,
+    up: Lane,
+    gone: Arc<AtomicBool>,
+}
+
+impl Drop for Caller {
+    fn drop(&mut self) {
+        self.gone.store(true, Ordering::Relaxed);
+    }
+}
+
+fn forward(socket: &UdpSocket, target: SocketAddr, shared: &Arc<Shared>, seed: u64) {
+    let mut callers: HashMap<SocketAddr, Caller> = HashMap::new();
     let mut buffer = vec![0; 65_536];
-    loop {
-        let Ok((length, from)) = socket.recv_from(&mut buffer).await else { continue };
+    while !shared.stopped.load(Ordering::Relaxed) {
+        let Ok((length, from)) = socket.recv_from(&mut buffer) else { continue };
         let (radio, generation) = {
-            let state = state.lock().expect("not poisoned");
+            let state = shared.state();
             (state.radio, state.generation)
         };
-        if callers.get(&from).is_none_or(|(known, ..)| *known != generation) {
-            let outside = Arc::new(UdpSocket::bind("127.0.0.1:0").await.expect("a loopback port"));
-            outside.connect(target).await.expect("loopback");
-            let up = Lane::new(seed ^ 1, Arc::clone(&outside), None);
-            let mut lane = Lane::new(seed ^ 2, Arc::clone(&socket), Some(from));
-            let (state, down) = (Arc::clone(&state), Arc::clone(&down));
-            let back = tokio::spawn(async move {
-                let mut buffer = vec![0; 65_536];
-                loop {
-                    // A target that is not there answers with an error; later it may be there again.
-                    let Ok(length) = outside.recv(&mut buffer).await else { continue };
-                    down.fetch_add((length + HEADERS) as u64, Ordering::Relaxed);
-                    let radio = state.lock().expect("not poisoned").radio;
-                    lane.pass(&radio, &buffer[..length]);
-                }
-            });
-            if let Some((_, _, old)) = callers.insert(from, (generation, up, back)) {
-                old.abort();
-            }
+        if callers.get(&from).is_none_or(|caller| caller.generation != generation) {
+            let outside = port();
+            outside.connect(target).expect("loopback");
+            let copy = |socket: &UdpSocket| socket.try_clone().expect("a file descriptor");
+            let up = Lane::new(seed ^ 1, copy(&outside), None);
+            let down = Lane::new(seed ^ 2, copy(socket), Some(from));
+            let (of_thread, gone) = (Arc::clone(shared), Arc::new(AtomicBool::new(false)));
+            let ended = Arc::clone(&gone);
+            std::thread::spawn(move || back(&outside, down, &of_thread, &ended));
+            callers.insert(from, Caller { generation, up, gone });
         }
-        if let Some((_, lane, _)) = callers.get_mut(&from) {
-            lane.pass(&radio, &buffer[..length]);
+        if let Some(caller) = callers.get_mut(&from) {
+            caller.up.pass(&radio, &buffer[..length]);
         }
+    }
+}
+
+/// What the target sends back to one caller.
+fn back(outside: &UdpSocket, mut lane: Lane, shared: &Shared, gone: &AtomicBool) {
+    let mut buffer = vec![0; 65_536];
+    while !gone.load(Ordering::Relaxed) {
+        // A target that is not there answers with an error; later it may be there again.
+        let Ok(length) = outside.recv(&mut buffer) else { continue };
+        shared.down.fetch_add((length + HEADERS) as u64, Ordering::Relaxed);
+        let radio = shared.state().radio;
+        lane.pass(&radio, &buffer[..length]);
     }
 }

@@ -75,6 +75,9 @@ async fn a_station_keeps_shows_and_feeds_what_it_receives() {
         token: None,
         tiles: None,
         nmea: Some(nmea),
+        foxglove: None,
+        #[cfg(feature = "zenoh")]
+        zenoh: None,
         terminal: false,
     };
     let stop = tokio::sync::watch::Sender::new(false);
@@ -126,6 +129,9 @@ async fn a_page_beyond_loopback_asks_for_its_token() {
         token: Some("open-sesame".into()),
         tiles: None,
         nmea: None,
+        foxglove: None,
+        #[cfg(feature = "zenoh")]
+        zenoh: None,
         terminal: false,
     };
     let stop = tokio::sync::watch::Sender::new(false);
@@ -154,6 +160,9 @@ async fn bytes_that_are_no_request_leave_the_page_as_it_was() {
         token: None,
         tiles: Some(keys.path().join("tiles")),
         nmea: None,
+        foxglove: None,
+        #[cfg(feature = "zenoh")]
+        zenoh: None,
         terminal: false,
     };
     let stop = tokio::sync::watch::Sender::new(false);

@@ -16,7 +16,7 @@ use crate::io::proto::schema_of_package;
 use crate::time::MonoTime;
 
 /// File in a flight's directory that tells which run it is of.
-const RUN_FILE: &str = "run";
+pub(super) const RUN_FILE: &str = "run";
 /// A segment ends at this many bytes of messages.
 const SEGMENT_BYTES: u64 = 64 << 20;
 
@@ -198,7 +198,7 @@ fn unsigned(t: MonoTime) -> u64 {
     u64::try_from(t.ns()).unwrap_or(0)
 }
 
-fn segments(dir: &Path) -> Vec<PathBuf> {
+pub(super) fn segments(dir: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(dir).into_iter().flatten().flatten();
     let mut files: Vec<_> =
         entries.map(|entry| entry.path()).filter(|p| p.extension().is_some_and(|e| e == "mcap")).collect();

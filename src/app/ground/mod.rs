@@ -3,10 +3,16 @@
 //! ```text
 //! payloads ─► io::link ─► intake ─┬─► mirror (thread: MCAP, fsync once a second) ─► "stored" to the payload
 //!                                 ├─► view ─► web page, GeoJSON, KML, NMEA
+//!                                 ├─► Foxglove, Zenoh
 //!                                 └─► one line a second per payload
 //! ```
 
 mod feeds;
+#[cfg(feature = "zenoh")]
+pub mod fleet;
+pub mod foxglove;
+#[cfg(feature = "zenoh")]
+mod history;
 pub mod mirror;
 pub mod view;
 pub mod web;
@@ -23,6 +29,7 @@ use crate::io::clock::HostClock;
 use crate::io::link::{
     Arrival, FromPayload, LinkError, LinkEvent, StationHandle, StationLink, StationSettings,
 };
+use foxglove::Scope;
 use mirror::{Mirror, MirrorError};
 use view::View;
 use web::Web;
@@ -45,12 +52,18 @@ pub struct GroundSettings {
     pub out: PathBuf,
     /// Where the web page is served.
     pub web: Option<SocketAddr>,
-    /// What visitors of the page must know; made up where the page is not on loopback and none is given.
+    /// What visitors of the page, and Foxglove, must know; made up where a port of theirs is not on loopback
+    /// and none is given.
     pub token: Option<String>,
     /// Folder with map tiles.
     pub tiles: Option<PathBuf>,
     /// Where NMEA is served over TCP.
     pub nmea: Option<SocketAddr>,
+    /// Where Foxglove is served over its WebSocket.
+    pub foxglove: Option<SocketAddr>,
+    /// How Zenoh is joined: an endpoint, or a file with Zenoh's own configuration.
+    #[cfg(feature = "zenoh")]
+    pub zenoh: Option<String>,
     /// Whether lines are rewritten in place, as on a terminal.
     pub terminal: bool,
 }
@@ -72,6 +85,15 @@ pub enum GroundError {
         /// What the system said.
         source: std::io::Error,
     },
+    /// Zenoh.
+    #[cfg(feature = "zenoh")]
+    #[error("station: cannot join Zenoh as {words}: {source}")]
+    Zenoh {
+        /// Endpoint or file as given.
+        words: String,
+        /// What Zenoh said.
+        source: zenoh::Error,
+    },
     /// The system.
     #[error("station: {0}")]
     System(#[from] std::io::Error),
@@ -83,6 +105,32 @@ fn lock(view: &Mutex<View>) -> MutexGuard<'_, View> {
 
 async fn listen(address: SocketAddr) -> Result<tokio::net::TcpListener, GroundError> {
     tokio::net::TcpListener::bind(address).await.map_err(|source| GroundError::Listen { address, source })
+}
+
+/// What visitors must know.
+struct Tokens(Option<Arc<str>>, bool);
+
+impl Tokens {
+    /// As given, or made up where a port is not on loopback.
+    fn of(settings: &GroundSettings) -> std::io::Result<Self> {
+        let open = [settings.web, settings.foxglove].into_iter().flatten();
+        let given = settings.token.as_deref().map(Arc::from);
+        if given.is_some() || open.clone().all(|address| address.ip().is_loopback()) {
+            return Ok(Self(given, settings.token.is_some()));
+        }
+        let made = random_token().ok_or_else(|| std::io::Error::other("no random bytes"))?;
+        Ok(Self(Some(made.into()), false))
+    }
+
+    /// The token asked for at this address: on loopback only one that was given.
+    fn at(&self, address: SocketAddr) -> Option<Arc<str>> {
+        self.0.clone().filter(|_| self.1 || !address.ip().is_loopback())
+    }
+
+    /// How it is written in a link.
+    fn asked(&self, address: SocketAddr) -> String {
+        self.at(address).map_or_else(String::new, |token| format!("?token={token}"))
+    }
 }
 
 /// 128 random bits in hexadecimal.
@@ -106,19 +154,20 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     let view = Arc::new(Mutex::new(View::default()));
     let live = broadcast::Sender::new(PAGE_QUEUE);
     let mut tasks = tokio::task::JoinSet::new();
+    let tokens = Tokens::of(&settings)?;
     if let Some(address) = settings.web {
         let listener = listen(address).await?;
-        let token = match (&settings.token, address.ip().is_loopback()) {
-            (Some(token), _) => Some(token.as_str().into()),
-            (None, true) => None,
-            (None, false) => {
-                Some(random_token().ok_or_else(|| std::io::Error::other("no random bytes"))?.into())
-            }
-        };
-        let asked = token.as_ref().map_or_else(String::new, |token: &Arc<str>| format!("?token={token}"));
-        println!("page at http://{}/{asked}", listener.local_addr()?);
+        println!("page at http://{}/{}", listener.local_addr()?, tokens.asked(address));
         let (view, live, tiles) = (Arc::clone(&view), live.clone(), settings.tiles.clone());
+        let token = tokens.at(address);
         tasks.spawn(async move { web::serve(listener, Web { view, live, tiles, token }).await });
+    }
+    let scope = settings.foxglove.map(|_| Scope::default());
+    if let (Some(address), Some(scope)) = (settings.foxglove, scope.clone()) {
+        let listener = listen(address).await?;
+        println!("Foxglove at ws://{}/{}", listener.local_addr()?, tokens.asked(address));
+        let token = tokens.at(address);
+        tasks.spawn(foxglove::serve(listener, foxglove::Server { scope, token }));
     }
     if let Some(address) = settings.nmea {
         let listener = listen(address).await?;
@@ -138,7 +187,23 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     tasks.spawn(report(handle, Arc::clone(&view), live.clone(), settings.terminal));
     tasks.spawn(tell(events, Arc::clone(&view), live.clone()));
     let ended = watch::Sender::new(false);
-    let taken = tokio::spawn(intake(records, ended.subscribe(), to_disk, view, live));
+    #[cfg(feature = "zenoh")]
+    let fleet = match settings.zenoh {
+        None => None,
+        Some(words) => match fleet::Fleet::open(&words, settings.out.clone()).await {
+            Ok(fleet) => Some(fleet),
+            Err(source) => return Err(GroundError::Zenoh { words, source }),
+        },
+    };
+    let outlets = Outlets {
+        to_disk,
+        view,
+        live,
+        scope,
+        #[cfg(feature = "zenoh")]
+        fleet,
+    };
+    let taken = tokio::spawn(intake(records, ended.subscribe(), outlets));
     let outcome = tokio::select! {
         _ = linked => Ok(()),
         Some(error) = failure.recv() => Err(error.into()),
@@ -150,14 +215,48 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     outcome
 }
 
-/// Hands records to the disk and to the pages, until the link has ended and nothing waits. A full disk
-/// queue holds the link back.
-async fn intake(
-    mut records: mpsc::Receiver<FromPayload>,
-    mut ended: watch::Receiver<bool>,
+/// Where records go.
+struct Outlets {
     to_disk: std::sync::mpsc::SyncSender<Arrival>,
     view: Arc<Mutex<View>>,
     live: broadcast::Sender<Arc<str>>,
+    scope: Option<Scope>,
+    #[cfg(feature = "zenoh")]
+    fleet: Option<fleet::Fleet>,
+}
+
+impl Outlets {
+    /// To everybody who looks; gives the message for the pages, where it makes one.
+    fn show(&self, arrival: &Arrival) -> Option<Arc<str>> {
+        if let Some(scope) = &self.scope {
+            scope.record(arrival);
+        }
+        #[cfg(feature = "zenoh")]
+        if let Some(fleet) = &self.fleet {
+            fleet.record(arrival);
+        }
+        lock(&self.view).record(arrival)
+    }
+
+    /// To the disk; `false` where that has ended. A full queue holds the link back.
+    async fn keep(&self, arrival: Arrival) -> bool {
+        let mut arrival = arrival;
+        loop {
+            match self.to_disk.try_send(arrival) {
+                Ok(()) => return true,
+                Err(std::sync::mpsc::TrySendError::Full(back)) => arrival = back,
+                Err(std::sync::mpsc::TrySendError::Disconnected(_)) => return false,
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    }
+}
+
+/// Hands records to the disk and to those who look, until the link has ended and nothing waits.
+async fn intake(
+    mut records: mpsc::Receiver<FromPayload>,
+    mut ended: watch::Receiver<bool>,
+    outlets: Outlets,
 ) {
     loop {
         let message = tokio::select! {
@@ -165,28 +264,25 @@ async fn intake(
             message = records.recv() => message,
             _ = ended.wait_for(|ended| *ended) => None,
         };
-        let Some(message) = message else { return };
         let news = match message {
-            FromPayload::Record(arrival) => {
-                let news = lock(&view).record(&arrival);
-                let mut arrival = Some(arrival);
-                while let Some(waiting) = arrival.take() {
-                    match to_disk.try_send(waiting) {
-                        Ok(()) => {}
-                        Err(std::sync::mpsc::TrySendError::Full(back)) => {
-                            arrival = Some(back);
-                            tokio::time::sleep(Duration::from_millis(5)).await;
-                        }
-                        Err(std::sync::mpsc::TrySendError::Disconnected(_)) => return,
-                    }
+            None => return,
+            Some(FromPayload::Record(arrival)) => {
+                let news = outlets.show(&arrival);
+                if !outlets.keep(arrival).await {
+                    return;
                 }
                 news
             }
-            FromPayload::Thumbnail { payload, thumbnail } => Some(lock(&view).thumbnail(&payload, thumbnail)),
+            Some(FromPayload::Thumbnail { payload, thumbnail }) => {
+                if let Some(scope) = &outlets.scope {
+                    scope.thumbnail(&payload, &thumbnail);
+                }
+                Some(lock(&outlets.view).thumbnail(&payload, thumbnail))
+            }
         };
         if let Some(news) = news {
             // Nobody may be looking.
-            let _ = live.send(news);
+            let _ = outlets.live.send(news);
         }
     }
 }

@@ -72,7 +72,7 @@ fn text(kind: &'static str, body: impl Into<Body>) -> Response {
 }
 
 /// Equal, compared in a time that tells nothing of where they differ.
-fn same(a: &str, b: &str) -> bool {
+pub(super) fn same(a: &str, b: &str) -> bool {
     a.len() == b.len() && a.bytes().zip(b.bytes()).fold(0, |sum, (a, b)| sum | (a ^ b)) == 0
 }
 
@@ -81,7 +81,8 @@ fn cookie(headers: &HeaderMap) -> Option<&str> {
     cookies.split(';').find_map(|c| c.trim().strip_prefix(COOKIE)?.strip_prefix('='))
 }
 
-fn query_token(request: &Request) -> Option<String> {
+/// The token in a request's address.
+pub(super) fn query_token(request: &Request) -> Option<String> {
     let query = request.uri().query()?;
     query.split('&').find_map(|pair| Some(pair.strip_prefix("token=")?.to_owned()))
 }

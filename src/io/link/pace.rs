@@ -1,7 +1,8 @@
 //! How much may be sent now: a bandwidth ceiling, and what the path is found to carry.
 //!
-//! Both are buckets that may go into debt by one message: sending is allowed while the balance is not
-//! negative, so an estimate never waits for more than the message before it.
+//! Both are buckets that may go into debt. What is sent again waits until the balance is not negative; what
+//! is live may go into debt by a little more than one portion of the former, so that it waits for none, and
+//! for nothing but the rate itself where live data alone is more than fits.
 
 use std::time::Duration;
 
@@ -29,6 +30,23 @@ const BASE_MEMORY: Duration = Duration::from_secs(30);
 /// looks, and one lost packet does not make a path lossy.
 const LOSS_MEMORY_S: f64 = 2.0;
 
+/// Debt up to which live data is sent: one portion of what is sent again takes 30 ms, and an estimate and an
+/// ownship sent after it are to wait for nothing.
+const LIVE_DEBT_S: f64 = 0.05;
+/// The same at rates so low that this is less than a packet or two, bytes.
+const LIVE_DEBT_LEAST: f64 = 300.0;
+/// What is saved up for a burst while nothing is sent, seconds of the rate.
+const SAVED_S: f64 = 0.004;
+
+/// What is to be sent, as to its right of way.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Way {
+    /// Live data.
+    Live,
+    /// What is sent again, and pictures.
+    Low,
+}
+
 /// A token bucket that may go into debt.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Bucket {
@@ -46,15 +64,24 @@ impl Bucket {
     fn fill(&mut self, now: Instant) {
         let passed = now.saturating_duration_since(self.filled).as_secs_f64();
         self.filled = now;
-        // A burst of at most 10 ms, or one packet, is saved up.
-        let most = (self.rate * 0.01).max(100.0);
+        // At the least as much as makes up for a timer of a millisecond.
+        let most = (self.rate * SAVED_S).max(100.0);
         self.balance = (self.balance + passed * self.rate).min(most);
     }
 
     /// Time until sending is allowed; zero when it is.
-    pub fn delay(&mut self, now: Instant) -> Duration {
+    pub fn delay(&mut self, way: Way, now: Instant) -> Duration {
         self.fill(now);
-        Duration::from_secs_f64((-self.balance / self.rate).max(0.0))
+        let debt = match way {
+            Way::Live => (self.rate * LIVE_DEBT_S).max(LIVE_DEBT_LEAST),
+            Way::Low => 0.0,
+        };
+        Duration::from_secs_f64(((-debt - self.balance) / self.rate).max(0.0))
+    }
+
+    /// Bytes a second.
+    pub fn rate(&self) -> f64 {
+        self.rate
     }
 
     /// Takes what was sent.
@@ -109,8 +136,8 @@ impl Governor {
     }
 
     /// Time until sending is allowed.
-    pub fn delay(&mut self, now: Instant) -> Duration {
-        let delay = self.bucket.delay(now);
+    pub fn delay(&mut self, way: Way, now: Instant) -> Duration {
+        let delay = self.bucket.delay(way, now);
         self.limited |= !delay.is_zero();
         delay
     }
@@ -182,12 +209,47 @@ mod tests {
         let mut bucket = Bucket::new(6_000.0, start);
         let mut sent = 0.0;
         for ms in 0..10_000 {
-            if bucket.delay(at(start, ms)).is_zero() {
+            if bucket.delay(Way::Low, at(start, ms)).is_zero() {
                 bucket.charge(240.0);
                 sent += 240.0;
             }
         }
         assert!((59_000.0..=60_500.0).contains(&sent), "{sent} bytes in 10 s");
+    }
+
+    #[test]
+    fn live_data_waits_for_no_portion_and_still_obeys_the_rate() {
+        let start = Instant::now();
+        let mut bucket = Bucket::new(10_000.0, start);
+        // Given: 80 bytes of live data every 10 ms, and all the rest given to what is sent again.
+        let (mut live, mut low) = (0.0, 0.0);
+        for ms in 0..10_000 {
+            let now = at(start, ms);
+            if bucket.delay(Way::Low, now).is_zero() {
+                bucket.charge(300.0);
+                low += 300.0;
+            }
+            if ms % 10 == 0 {
+                assert!(bucket.delay(Way::Live, now).is_zero(), "it waits after {ms} ms");
+                bucket.charge(80.0);
+                live += 80.0;
+            }
+        }
+        assert!((98_000.0..101_000.0).contains(&(live + low)), "{} bytes in 10 s", live + low);
+        // When: live data alone is more than fits, it gets the rate, and the rest nothing.
+        let (mut live, mut low) = (0.0, 0.0);
+        for ms in 10_000..20_000 {
+            let now = at(start, ms);
+            while bucket.delay(Way::Live, now).is_zero() {
+                bucket.charge(80.0);
+                live += 80.0;
+            }
+            if bucket.delay(Way::Low, now).is_zero() {
+                low += 300.0;
+            }
+        }
+        assert_eq!(low, 0.0);
+        assert!((99_000.0..101_000.0).contains(&live), "{live} bytes in 10 s");
     }
 
     /// A path with a queue: `capacity` bytes a second, `rtt` without queue. Gives the rate found and the
@@ -199,7 +261,7 @@ mod tests {
             let now = at(start, tick * 100);
             // Everything the bucket allows is sent in messages of 240 bytes.
             let mut offered = 0.0_f64;
-            while governor.delay(now).is_zero() && offered < 1e6 {
+            while governor.delay(Way::Low, now).is_zero() && offered < 1e6 {
                 governor.charge(240.0);
                 offered += 240.0;
             }
@@ -244,7 +306,7 @@ mod tests {
                 let fate = if random.random_bool(0.3) { &mut noted.lost } else { &mut noted.acked };
                 *fate += 240;
             }
-            assert!(!governor.delay(now).is_zero(), "the rate is the limit");
+            assert!(!governor.delay(Way::Low, now).is_zero(), "the rate is the limit");
             governor.update(noted, now);
             early = if tick == 50 { governor.rate() } else { early };
         }

@@ -10,14 +10,22 @@ use tokio::time::Instant;
 
 use super::{JUDGE, Session, lock};
 use crate::io::link::live::LiveQueue;
+use crate::io::link::pace::Way;
 use crate::io::link::wire::{self, WireError};
 use crate::io::proto::link::{self as pb, to_station};
 use crate::io::records::{Record, Schema};
 
 /// QUIC's short header, connection id, packet number, tag and frame header of one datagram, bytes.
 const QUIC_OVERHEAD: f64 = 1.0 + 8.0 + 2.0 + 16.0 + 3.0;
-/// Back-fill is written in portions that take the path this long, so that live data never waits longer.
+/// Back-fill is written in portions that take a slow path this long, so that live data never waits longer,
 const PORTION_S: f64 = 0.03;
+/// and on a path where a packet takes less, in portions of a packet
+const PACKET: f64 = 1_100.0;
+/// or of this long.
+const PORTION_FAST_S: f64 = 0.002;
+
+/// The shortest wait: what the runtime's timer can tell apart.
+const TIMER: Duration = Duration::from_millis(1);
 
 impl Session {
     /// The channel number of a record, and its announcement where the station has not had it on this path
@@ -52,15 +60,16 @@ impl Session {
     }
 
     /// Time until something may be sent.
-    fn delay(&self) -> Duration {
+    fn delay(&self, way: Way) -> Duration {
         let now = Instant::now();
-        let own = lock(&self.governor).delay(now);
-        let shared = self.shared.ceiling.as_ref().map_or(Duration::ZERO, |bucket| lock(bucket).delay(now));
+        let own = lock(&self.governor).delay(way, now);
+        let ceiling = self.shared.ceiling.as_ref();
+        let shared = ceiling.map_or(Duration::ZERO, |bucket| lock(bucket).delay(way, now));
         own.max(shared)
     }
 
     fn charge(&self, bytes: usize) {
-        let packets = (bytes as f64 / 1_100.0).ceil().max(1.0);
+        let packets = (bytes as f64 / PACKET).ceil().max(1.0);
         let cost = bytes as f64 + packets * (QUIC_OVERHEAD + self.headers);
         self.predicted.fetch_add(cost as u64, Ordering::Relaxed);
         self.charge_exactly(cost);
@@ -92,7 +101,7 @@ impl Session {
                 changed.await.map_err(|_| WireError::Ended("the program ends".into()))?;
                 continue;
             }
-            let delay = self.delay();
+            let delay = self.delay(Way::Live);
             if !delay.is_zero() {
                 // A newer estimate may come meanwhile and take the place of the one that waits.
                 let _ = tokio::time::timeout(delay, changed).await;
@@ -131,18 +140,19 @@ impl Session {
     async fn low_turn(&self) {
         loop {
             let cut = lock(&self.governor).is_cut();
-            let delay = self.delay();
+            let delay = self.delay(Way::Low);
             if !cut && delay.is_zero() && !self.live_waits.load(Ordering::Relaxed) {
                 return;
             }
-            tokio::time::sleep(delay.clamp(Duration::from_millis(2), JUDGE)).await;
+            tokio::time::sleep(delay.clamp(TIMER, JUDGE)).await;
         }
     }
 
     /// Bytes of one portion of back-fill or thumbnail.
     fn portion(&self) -> usize {
         let own = lock(&self.governor).rate();
-        ((own * PORTION_S) as usize).clamp(200, 32 << 10)
+        let rate = self.shared.ceiling.as_ref().map_or(own, |bucket| lock(bucket).rate().min(own));
+        ((rate * PORTION_S).min(PACKET).max(rate * PORTION_FAST_S) as usize).clamp(200, 32 << 10)
     }
 
     /// Sends again what the station misses, on one stream below all live data.

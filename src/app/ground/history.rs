@@ -1,0 +1,69 @@
+//! What a station's files hold of the past, by payload and topic.
+
+use std::path::Path;
+
+use super::mirror::{RUN_FILE, segments};
+use crate::time::MonoTime;
+
+/// A record out of the files.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Past<'a> {
+    /// Name of the payload.
+    pub payload: &'a str,
+    /// Topic of the flight.
+    pub topic: &'a str,
+    /// Name of the schema.
+    pub schema_name: &'a str,
+    /// Run of the payload.
+    pub run: u32,
+    /// Number in the run.
+    pub number: u32,
+    /// When it was true, the payload's host time.
+    pub t: MonoTime,
+    /// The protobuf message.
+    pub data: &'a [u8],
+}
+
+fn subdirectories(dir: &Path) -> Vec<(String, std::path::PathBuf)> {
+    let entries = std::fs::read_dir(dir).into_iter().flatten().flatten();
+    let mut found: Vec<_> = entries
+        .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()))
+        .filter_map(|entry| Some((entry.file_name().into_string().ok()?, entry.path())))
+        .collect();
+    found.sort();
+    found
+}
+
+/// Gives every record of the payloads that `wanted` names, as far as it is on the disk, in the order in which
+/// the files hold them, until `give` says that it is enough. A file that was cut off counts as far as its
+/// whole chunks go.
+pub fn read(root: &Path, wanted: impl Fn(&str) -> bool, mut give: impl FnMut(&Past<'_>) -> bool) {
+    for (payload, dir) in subdirectories(root).iter().filter(|(name, _)| wanted(name)) {
+        for (_, flight) in subdirectories(dir) {
+            let text = std::fs::read_to_string(flight.join(RUN_FILE)).unwrap_or_default();
+            let Ok(run) = u32::from_str_radix(text.trim(), 16) else { continue };
+            for path in segments(&flight) {
+                let Ok(bytes) = std::fs::read(&path) else { continue };
+                let options = mcap::read::Options::IgnoreEndMagic;
+                let Ok(stream) = mcap::MessageStream::new_with_options(&bytes, options.into()) else {
+                    continue;
+                };
+                for message in stream.map_while(Result::ok) {
+                    let schema = message.channel.schema.as_ref();
+                    let past = Past {
+                        payload,
+                        topic: &message.channel.topic,
+                        schema_name: schema.map_or("", |schema| &schema.name),
+                        run,
+                        number: message.sequence,
+                        t: MonoTime::from_ns(i64::try_from(message.publish_time).unwrap_or(i64::MAX)),
+                        data: &message.data,
+                    };
+                    if !give(&past) {
+                        return;
+                    }
+                }
+            }
+        }
+    }
+}
