@@ -5,12 +5,13 @@ CARGO ?= cargo
 VENV  ?= target/venv
 DEMO  ?= demo
 
-.PHONY: help setup setup-python build demo test test-python test-web check lint docs bench load clean deb hil hil-long
+.PHONY: help setup setup-python build demo test test-python test-web test-zenoh check lint docs bench load clean deb hil hil-long
 
 help:
 	@echo "make demo     build, simulate a flight, replay it, compare with the truth, write a report page"
 	@echo "make test     every test"
 	@echo "make test-web the station's page in headless Chromium (half a minute)"
+	@echo "make test-zenoh the station on Zenoh, met by the Python client (builds the feature zenoh: minutes)"
 	@echo "make check    format, lints, documentation, shipped configurations, licences"
 	@echo "make bench    the benchmarks under benches/"
 	@echo "make load     five minutes of raw frames at full pace: latency, processor time, memory, losses"
@@ -25,7 +26,7 @@ setup:
 
 # What tests in other languages need: readers of our files written by other people.
 setup-python: setup
-	@sh tests/setup/packages.sh python3 python3-venv
+	@sh tests/setup/packages.sh python3 python3-venv iproute2 nftables
 	@sh tests/setup/venv.sh $(VENV) tests/python/requirements.txt
 
 build: setup
@@ -48,6 +49,14 @@ test-web: setup-python
 	@sh tests/setup/packages.sh chromium
 	$(CARGO) build --locked
 	$(VENV)/bin/python -m unittest discover -s tests/web -p 'test_*.py' -v
+
+# The station built with the feature `zenoh`, met by the Python client. Not part of `make test`: the feature
+# adds a hundred crates to the build.
+test-zenoh: setup-python
+	@sh tests/setup/venv.sh $(VENV)-zenoh tests/zenoh/requirements.txt
+	$(CARGO) clippy --locked --features zenoh --lib --bins -- -D warnings
+	$(CARGO) build --locked --features zenoh
+	$(VENV)-zenoh/bin/python -m unittest discover -s tests/zenoh -p 'test_*.py' -v
 
 check: lint docs
 	for file in config/*.toml; do target/debug/windhover check-config $$file > /dev/null || exit 1; done

@@ -1,4 +1,4 @@
-//! Proof of the wireless link over an impaired relay: cuts, loss, a line too slow, ten stations.
+//! Proof of the wireless link over an impaired relay: cuts, loss, a line too slow, ten stations, an hour's cut.
 //!
 //! `cargo bench --bench link` runs every case in about seven minutes and prints how late live records were
 //! and whether all arrived once; `cargo bench --bench link -- cut25 slow` runs those named. Beside each case
@@ -17,7 +17,8 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use relay::{Radio, Relay};
-use team::{Got, Keys, Payload, Station, loopback, payload_settings, station_settings};
+use team::{Got, Keys, Payload, Station, card, loopback, payload_settings, station_settings};
+use windhover::io::link::Backlog;
 use windhover::io::link::keys::Role;
 
 /// One-way delay of the relay, ms.
@@ -86,8 +87,14 @@ struct Bench {
 }
 
 async fn start(radio: Radio, stations: usize) -> Bench {
+    start_with(radio, stations, 64 << 20, None).await
+}
+
+async fn start_with(radio: Radio, stations: usize, memory: usize, card: Option<Arc<dyn Backlog>>) -> Bench {
     let keys = Keys::new();
-    let payload = Payload::start(&payload_settings(keys.files(Role::Payload, "alpha"), loopback()), 1, None);
+    let mut settings = payload_settings(keys.files(Role::Payload, "alpha"), loopback());
+    settings.backlog_bytes = memory;
+    let payload = Payload::start(&settings, 1, card);
     let relay = Relay::start(payload.address, radio, 42);
     let mut up = Vec::new();
     for n in 0..stations {
@@ -115,7 +122,7 @@ impl Bench {
 
     async fn settle(&self, sent: u32, patience_s: u64) -> (f64, usize, usize) {
         let began = tokio::time::Instant::now();
-        let missing = |s: &Station| (sent as usize).saturating_sub(s.of(1).times.len());
+        let missing = |s: &Station| (sent as usize).saturating_sub(s.counts(1).0);
         while self.stations.iter().any(|s| missing(s) > 0) && began.elapsed().as_secs() < patience_s {
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
@@ -149,11 +156,11 @@ impl Bench {
         self.send(5.0).await;
         self.relay.set(|radio| radio.cut = true);
         self.send(seconds as f64).await;
-        let before = self.stations[0].of(1).live_ms.len();
+        let before = self.stations[0].counts(1).1;
         let restored = tokio::time::Instant::now();
         self.relay.set(|radio| radio.cut = false);
         let first = async {
-            while self.stations[0].of(1).live_ms.len() == before {
+            while self.stations[0].counts(1).1 == before {
                 tokio::time::sleep(Duration::from_millis(1)).await;
             }
             restored.elapsed().as_secs_f64() * 1e3
@@ -165,8 +172,46 @@ impl Bench {
     }
 }
 
+/// Memory of this process that is resident, bytes.
+fn resident() -> usize {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    let kib = line.and_then(|line| line.split_whitespace().next()?.parse::<usize>().ok());
+    kib.unwrap_or(0) << 10
+}
+
+/// An hour's cut in simulated time: 31 records a second for an hour as fast as they can be made, a second of
+/// them every millisecond. A card holds everything, memory a part.
+async fn hour() {
+    const SECONDS: u32 = 3_600;
+    const A_SECOND: u32 = 31;
+    const MEMORY: usize = 4 << 20;
+    let whole = card(1, SECONDS * A_SECOND + 300);
+    let bench = start_with(radio(), 1, MEMORY, Some(whole)).await;
+    bench.relay.set(|radio| radio.cut = true);
+    let before = resident();
+    for _ in 0..SECONDS {
+        for _ in 0..A_SECOND {
+            bench.payload.send();
+        }
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    let held = bench.payload.handle.status().backlog_bytes;
+    println!(
+        "hour       memory for back-fill {:.1} MB of {:.1} allowed; the process grew by {:.1} MB",
+        held as f64 * 1e-6,
+        MEMORY as f64 * 1e-6,
+        resident().saturating_sub(before) as f64 * 1e-6
+    );
+    bench.relay.set(|radio| radio.cut = false);
+    let sent = bench.send(10.0).await;
+    let outcome = bench.settle(sent, 300).await;
+    bench.report("hour", sent, outcome);
+}
+
 async fn case(name: &str) {
     match name {
+        "hour" => hour().await,
         "clear" | "loss10" | "loss30" => {
             let loss = match name {
                 "loss10" => 0.1,
@@ -201,7 +246,7 @@ async fn case(name: &str) {
 }
 
 fn main() {
-    let all = ["clear", "loss10", "loss30", "cut6", "cut25", "cut120", "slow", "ten"];
+    let all = ["clear", "loss10", "loss30", "cut6", "cut25", "cut120", "slow", "ten", "hour"];
     let named: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with('-')).collect();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)

@@ -10,11 +10,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use relay::{Radio, Relay};
-use team::{Keys, Payload, Station, any, loopback, payload_settings, station_settings, within};
+use team::{Keys, Payload, Station, any, card, loopback, payload_settings, station_settings, within};
 use windhover::io::link::keys::Role;
-use windhover::io::link::{Backlog, LinkEvent, MemoryBacklog};
-use windhover::io::records::{Record, Schema};
-use windhover::time::MonoTime;
+use windhover::io::link::{Backlog, LinkEvent};
 
 const PATIENCE: Duration = Duration::from_secs(20);
 
@@ -125,17 +123,7 @@ async fn a_station_restarted_in_mid_backfill_goes_on_where_it_was() {
 async fn a_payload_restarted_in_mid_backfill_fills_from_its_store() {
     let keys = Keys::new();
     let settings = payload_settings(keys.files(Role::Payload, "alpha"), loopback());
-    let old = Arc::new(MemoryBacklog::new(1, "boot-1", 64 << 20));
-    for n in 0..2_000 {
-        let t = MonoTime::from_ns(n);
-        old.append(Arc::new(Record {
-            topic: "/target/ugv/state".into(),
-            schema: Schema::TargetState,
-            log_time: t,
-            publish_time: t,
-            data: vec![1; 160],
-        }));
-    }
+    let old = card(1, 2_000);
     // Given: run 1 is on the card, run 2 is going on, and the station has got a part of both.
     let payload = Payload::start(&settings, 2, Some(Arc::clone(&old) as Arc<dyn Backlog>));
     let slow = Radio { rate: Some(40e3), ..Radio::default() };
@@ -154,6 +142,37 @@ async fn a_payload_restarted_in_mid_backfill_fills_from_its_store() {
     let payload = Payload::start(&again, 3, Some(old as Arc<dyn Backlog>));
     let sent = send(&payload, 20, Duration::from_millis(10)).await;
     // Then: the old run is completed from the card, the new one is whole.
+    station.complete(1, 2_000, PATIENCE).await;
+    station.complete(3, sent, PATIENCE).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn both_sides_restarted_in_mid_backfill_end_up_the_same() {
+    // Given: a run on the card, of which the station has got a part.
+    let keys = Keys::new();
+    let settings = payload_settings(keys.files(Role::Payload, "alpha"), loopback());
+    let old = card(1, 2_000);
+    let payload = Payload::start(&settings, 2, Some(Arc::clone(&old) as Arc<dyn Backlog>));
+    let slow = Radio { rate: Some(40e3), ..Radio::default() };
+    let relay = Relay::start(payload.address, slow, 9);
+    let calls = station_settings(keys.files(Role::Station, "base"), Some(relay.address));
+    let station = Station::first(&calls);
+    let some = within(PATIENCE, || station.counts(1).0 > 100).await;
+    assert!(some, "back-fill begins: {:?}", payload.handle.status());
+    // When: both end without a word and come back, the payload first.
+    let address = payload.address;
+    let got = station.vanish().await;
+    payload.vanish().await;
+    let half = got.lock().expect("not poisoned")[&1].times.len();
+    assert!(half < 2_000, "restarted in the middle");
+    relay.set(|radio| radio.rate = None);
+    let free = within(PATIENCE, || std::net::UdpSocket::bind(address).is_ok()).await;
+    assert!(free, "the port is still taken");
+    let again = payload_settings(keys.files(Role::Payload, "alpha"), Some(address));
+    let payload = Payload::start(&again, 3, Some(old as Arc<dyn Backlog>));
+    let station = Station::start(&calls, got);
+    let sent = send(&payload, 20, Duration::from_millis(10)).await;
+    // Then: what the station had does not come again, the rest does.
     station.complete(1, 2_000, PATIENCE).await;
     station.complete(3, sent, PATIENCE).await;
 }

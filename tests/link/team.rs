@@ -11,11 +11,11 @@ use windhover::io::clock::HostClock;
 use windhover::io::link::keys::{Authority, Role};
 use windhover::io::link::tls::KeyFiles;
 use windhover::io::link::{
-    Backlog, FromPayload, LinkEvent, LinkHandle, PayloadLink, PayloadSettings, RangeSet, StationHandle,
-    StationLink, StationSettings,
+    Backlog, FromPayload, LinkEvent, LinkHandle, MemoryBacklog, PayloadLink, PayloadSettings, RangeSet,
+    StationHandle, StationLink, StationSettings,
 };
 use windhover::io::records::{Record, Schema};
-use windhover::time::UtcTime;
+use windhover::time::{MonoTime, UtcTime};
 
 /// 2026-11-19T00:00:00Z: when the tests' certificates are made.
 pub const MADE: UtcTime = UtcTime::from_unix_ns(1_795_046_400_000_000_000);
@@ -70,6 +70,26 @@ pub fn any(log: &Log, matches: impl Fn(&LinkEvent) -> bool) -> bool {
     log.lock().expect("not poisoned").iter().any(matches)
 }
 
+/// A state of 160 bytes, heard and true at `t`.
+pub fn record(t: MonoTime) -> Record {
+    Record {
+        topic: "/target/ugv/state".into(),
+        schema: Schema::TargetState,
+        log_time: t,
+        publish_time: t,
+        data: vec![0x5a; 160],
+    }
+}
+
+/// A run of so many records on what stands for the card.
+pub fn card(run: u32, records: u32) -> Arc<MemoryBacklog> {
+    let card = MemoryBacklog::new(run, &format!("boot-{run}"), 256 << 20);
+    for n in 0..records {
+        card.append(Arc::new(record(MonoTime::from_ns(n.into()))));
+    }
+    Arc::new(card)
+}
+
 /// A running payload.
 pub struct Payload {
     pub handle: LinkHandle,
@@ -109,15 +129,7 @@ impl Payload {
 
     /// Sends one record of 160 bytes, as the estimator would; its log time is now.
     pub fn send(&self) -> u32 {
-        let now = self.clock.now();
-        let record = Record {
-            topic: "/target/ugv/state".into(),
-            schema: Schema::TargetState,
-            log_time: now,
-            publish_time: now,
-            data: vec![0x5a; 160],
-        };
-        self.handle.send(&record).expect("a record for the ground")
+        self.handle.send(&record(self.clock.now())).expect("a record for the ground")
     }
 
     /// Ends without a word, as when power fails.
@@ -215,10 +227,15 @@ impl Station {
         self.got.lock().expect("not poisoned").get(&run).cloned().unwrap_or_default()
     }
 
+    /// How many numbers of a run came, and how many records of it live.
+    pub fn counts(&self, run: u32) -> (usize, usize) {
+        let got = self.got.lock().expect("not poisoned");
+        got.get(&run).map_or((0, 0), |got| (got.times.len(), got.live_ms.len()))
+    }
+
     /// Waits until numbers 0 to `count` − 1 of a run are there, each once.
     pub async fn complete(&self, run: u32, count: u32, patience: Duration) {
-        let whole = |got: &Got| got.times.len() as u32 >= count;
-        let waited = within(patience, || whole(&self.of(run))).await;
+        let waited = within(patience, || self.counts(run).0 as u32 >= count).await;
         let got = self.of(run);
         assert!(
             waited,

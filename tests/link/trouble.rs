@@ -7,10 +7,8 @@ use std::time::Duration;
 use windhover::io::link::keys::Role;
 use windhover::io::link::tls::Identity;
 use windhover::io::link::{Backlog, Extent, Found, MemoryBacklog, Unread};
-use windhover::io::records::{Record, Schema};
-use windhover::time::MonoTime;
 
-use crate::team::{Keys, Payload, Station, loopback, payload_settings, station_settings, within};
+use crate::team::{Keys, Payload, Station, card, loopback, payload_settings, station_settings, within};
 
 /// Less than a station waits after another program of the same name took over.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -41,7 +39,7 @@ async fn a_payload_whose_streams_end_before_its_connection_is_called_again() {
 
 /// A card that cannot be read at first.
 struct Faulty {
-    card: MemoryBacklog,
+    card: Arc<MemoryBacklog>,
     failures: AtomicU32,
 }
 
@@ -64,17 +62,7 @@ impl Backlog for Faulty {
 async fn what_a_card_cannot_read_just_now_is_not_gone() {
     // Given: a run on a card whose first two reads fail, and the present run in memory.
     let keys = Keys::new();
-    let card = MemoryBacklog::new(1, "boot-1", 1 << 20);
-    for n in 0..50 {
-        let t = MonoTime::from_ns(n);
-        card.append(Arc::new(Record {
-            topic: "/target/ugv/state".into(),
-            schema: Schema::TargetState,
-            log_time: t,
-            publish_time: t,
-            data: vec![1; 160],
-        }));
-    }
+    let card = card(1, 50);
     let deep = Arc::new(Faulty { card, failures: AtomicU32::new(2) });
     let settings = payload_settings(keys.files(Role::Payload, "alpha"), loopback());
     let payload = Payload::start(&settings, 2, Some(deep as Arc<dyn Backlog>));

@@ -31,6 +31,12 @@ def free_port(kind=socket.SOCK_DGRAM):
         return probe.getsockname()[1]
 
 
+def listens(port):
+    """Whether somebody listens at a TCP port of this computer."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
 def until(what, seconds, message):
     """Waits until `what()` gives something true, and gives it."""
     end = time.monotonic() + seconds
@@ -72,9 +78,10 @@ class Flight:
 
 
 class Daemon:
-    """`windhover run` on a flight, with more configuration appended (TOML of whole tables)."""
+    """`windhover run` on a flight, with more configuration appended (TOML of whole tables); `inside` are the
+    words that bring a program to where it is to run."""
 
-    def __init__(self, flight, tables):
+    def __init__(self, flight, tables, inside=()):
         self.folder = tempfile.TemporaryDirectory()
         self.at = pathlib.Path(self.folder.name)
         self.ends, config = {}, flight.config
@@ -94,7 +101,7 @@ class Daemon:
         self.stopped = threading.Event()
         with open(self.log, "wb") as log:
             self.process = subprocess.Popen(
-                [BINARY, "run", "--config", self.at / "windhover.toml"], stdin=subprocess.DEVNULL, stderr=log
+                [*inside, BINARY, "run", "--config", self.at / "windhover.toml"], stdin=subprocess.DEVNULL, stderr=log
             )
         self.feeder = threading.Thread(target=self.feed, args=(flight,))
         self.feeder.start()
@@ -128,3 +135,36 @@ class Daemon:
         for end in self.ends.values():
             os.close(end)
         self.folder.cleanup()
+
+
+def link_tables(keys, address):
+    """Makes keys for a payload `alpha` and a station `base`; gives the configuration of the payload's link."""
+    for words in (["authority"], ["payload", "alpha"], ["station", "base"]):
+        windhover("keys", *words, "--dir", keys)
+    return (
+        f'[link]\nenabled = true\nlisten = "{address}"\nauthority = "{keys}/authority.pem"\n'
+        f'certificate = "{keys}/payload-alpha.pem"\nkey = "{keys}/payload-alpha.key"\n'
+    )
+
+
+def station(keys, address, out, *more, binary=BINARY, inside=(), stdout=subprocess.DEVNULL):
+    """A ground station `base` that calls a payload."""
+    return subprocess.Popen(
+        [
+            *inside, binary, "ground", "--connect", address, "--authority", keys / "authority.pem",
+            "--certificate", keys / "station-base.pem", "--out", out, *more,
+        ],
+        stdout=stdout,
+    )
+
+
+def kept(folder):
+    """Numbers a station keeps of its only payload, by flight: a list as they stand in the files, and how many
+    of them are states."""
+    numbers, states = {}, 0
+    for path in sorted(folder.glob("*/*/*.mcap")):
+        with open(path, "rb") as file:
+            for _, channel, message in make_reader(file).iter_messages():
+                numbers.setdefault(path.parent.name, []).append(message.sequence)
+                states += channel.topic.endswith("/state")
+    return numbers, states

@@ -43,15 +43,9 @@ class Ports(unittest.TestCase):
         self.assertEqual(sockets(self.fly("").process.pid), set())
 
     def test_only_what_is_configured_is_open_and_strangers_cost_nothing(self):
-        keys = self.flight.at / "keys"
-        for words in (["authority"], ["payload", "alpha"]):
-            rig.windhover("keys", *words, "--dir", keys)
         port = rig.free_port()
-        daemon = self.fly(
-            f'[link]\nenabled = true\nlisten = "127.0.0.1:{port}"\nauthority = "{keys}/authority.pem"\n'
-            f'certificate = "{keys}/payload-alpha.pem"\nkey = "{keys}/payload-alpha.key"\n'
-            f"[mavlink]\nenabled = true\n"
-        )
+        link = rig.link_tables(self.flight.at / "keys", f"127.0.0.1:{port}")
+        daemon = self.fly(link + "[mavlink]\nenabled = true\n")
         pid = daemon.process.pid
         rig.until(lambda: ("udp", port) in sockets(pid), 30, lambda: f"{sockets(pid)}")
         found = sockets(pid)

@@ -141,6 +141,7 @@ impl View {
                 json!({"name": s.name, "up": s.connected, "address": s.address.to_string(),
                     "rtt_ms": s.rtt_ms, "silent_ms": s.silent.as_millis() as u64, "software": s.software,
                     "received": s.progress.received, "missing": s.progress.missing,
+                    "overdue": s.progress.overdue,
                     "gone": s.progress.gone, "live_hz": payload.live_hz, "kbps": payload.kbps})
             })
             .collect();
@@ -212,7 +213,7 @@ impl View {
         let progress = status.progress;
         line += &format!(
             " | {live_hz:.0}/s live, {kbps:.0} kbit/s, rtt {:.1} ms | {} kept, {} missing",
-            status.rtt_ms, progress.received, progress.missing
+            status.rtt_ms, progress.received, progress.overdue
         );
         if progress.gone > 0 {
             line += &format!(", {} lost on board", progress.gone);

@@ -7,6 +7,11 @@ use crate::io::proto::link as pb;
 
 /// Ranges asked for at once.
 const WANT_RANGES: usize = 64;
+/// Which of the latest looks it is whose missing numbers are asked for: the last but one.
+const SETTLED: usize = OVERDUE_LOOKS - 2;
+/// Looks after which a number that is missing is overdue: two seconds of them. What goes by back-fill only
+/// takes about one.
+const OVERDUE_LOOKS: usize = 8;
 /// Runs kept in mind; a payload that announces more is not believed.
 const RUNS: usize = 4_096;
 
@@ -16,16 +21,21 @@ struct Run {
     flight: String,
     first: u32,
     end: u32,
-    /// `end` as it was one and two looks ago: what is younger may still be on its way.
-    settled: [u32; 2],
+    /// `end` as it was at the latest looks, oldest first: what is younger may still be on its way.
+    ends: [u32; OVERDUE_LOOKS],
     have: RangeSet,
     gone: RangeSet,
     stored: RangeSet,
 }
 
 impl Run {
-    fn missing(&self) -> impl Iterator<Item = (u32, u32)> + '_ {
-        self.have.missing(self.first.max(self.gone_below()), self.settled[0])
+    /// What is missing below a number.
+    fn missing(&self, end: u32) -> impl Iterator<Item = (u32, u32)> + '_ {
+        self.have.missing(self.first.max(self.gone_below()), end)
+    }
+
+    fn count_missing(&self, end: u32) -> u64 {
+        self.missing(end).map(|(first, end)| u64::from(end - first)).sum()
     }
 
     /// Everything below this is gone or was never announced.
@@ -39,8 +49,11 @@ impl Run {
 pub struct Progress {
     /// Records received, once each.
     pub received: u64,
-    /// Records known to exist and not received.
+    /// Records known to exist and not received, those on their way among them.
     pub missing: u64,
+    /// Those of them known for two seconds and more: none is what "nothing missing" means while a flight
+    /// goes on.
+    pub overdue: u64,
     /// Records that no longer exist on board.
     pub gone: u64,
     /// Records that came again and were dropped.
@@ -117,12 +130,12 @@ impl Inbox {
     /// look: what appeared since the last but one is given time.
     pub fn want(&mut self) -> pb::Want {
         for run in self.runs.values_mut() {
-            run.settled = [run.settled[1], run.end];
+            run.ends.rotate_left(1);
+            run.ends[OVERDUE_LOOKS - 1] = run.end;
         }
-        let ranges = self
-            .runs
-            .iter()
-            .flat_map(|(run, r)| r.missing().map(|(first, end)| pb::Range { run: *run, first, end }));
+        let ranges = self.runs.iter().flat_map(|(run, r)| {
+            r.missing(r.ends[SETTLED]).map(|(first, end)| pb::Range { run: *run, first, end })
+        });
         pb::Want { ranges: ranges.take(WANT_RANGES).collect() }
     }
 
@@ -132,11 +145,8 @@ impl Inbox {
         for run in self.runs.values() {
             progress.gone += run.gone.len();
             progress.received += run.have.len() - run.gone.len();
-            progress.missing += run
-                .have
-                .missing(run.first.max(run.gone_below()), run.end)
-                .map(|(f, e)| u64::from(e - f))
-                .sum::<u64>();
+            progress.missing += run.count_missing(run.end);
+            progress.overdue += run.count_missing(run.ends[0]);
         }
         progress
     }
@@ -171,6 +181,22 @@ mod tests {
         assert!(ranges(&inbox.want()).is_empty());
         let progress = inbox.progress();
         assert_eq!((progress.received, progress.missing, progress.gone, progress.repeated), (10, 0, 3, 2));
+    }
+
+    #[test]
+    fn what_is_missing_becomes_overdue_with_time() {
+        let mut inbox = Inbox::default();
+        inbox.announce(&extent(0, 10), |_, _| RangeSet::of(0, 6));
+        let told = |inbox: &Inbox| (inbox.progress().missing, inbox.progress().overdue);
+        for _ in 1..OVERDUE_LOOKS {
+            inbox.want();
+            assert_eq!(told(&inbox), (4, 0));
+        }
+        inbox.take(5, 11);
+        inbox.want();
+        assert_eq!(told(&inbox), (5, 4), "10 is still young");
+        inbox.take(5, 6);
+        assert_eq!(told(&inbox), (4, 3));
     }
 
     #[test]

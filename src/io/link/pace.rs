@@ -26,6 +26,9 @@ const SILENCE: Duration = Duration::from_millis(600);
 /// How long the least round-trip time is remembered: twice this at most.
 const BASE_MEMORY: Duration = Duration::from_secs(30);
 
+/// After a cut its losses are not held against the path: they are noted within this of the first
+/// acknowledgement.
+const FORGIVEN: Duration = Duration::from_millis(400);
 /// Over how long losses are weighed against what arrived: a slow path carries a packet or two between two
 /// looks, and one lost packet does not make a path lossy.
 const LOSS_MEMORY_S: f64 = 2.0;
@@ -105,6 +108,7 @@ pub struct Governor {
     queue: Duration,
     limited: bool,
     cut: bool,
+    restored: Option<Instant>,
 }
 
 impl Governor {
@@ -122,6 +126,7 @@ impl Governor {
             queue: Duration::ZERO,
             limited: false,
             cut: false,
+            restored: None,
         }
     }
 
@@ -164,7 +169,12 @@ impl Governor {
             return;
         }
         self.heard = now;
-        self.cut = false;
+        if std::mem::take(&mut self.cut) {
+            self.restored = Some(now);
+        }
+        if self.restored.is_some_and(|at| now.saturating_duration_since(at) < FORGIVEN) {
+            self.lost = 0.0;
+        }
         let weight = 1.0 - (-passed / 0.3).exp();
         self.delivered += weight * (noted.acked as f64 / passed - self.delivered);
         if let Some(rtt) = noted.least_rtt {
@@ -312,6 +322,30 @@ mod tests {
         }
         assert!(early > RATE_AT_START, "{early} bytes/s after 5 s");
         assert!(governor.rate() > 2.0 * RATE_AT_START, "{} bytes/s after a minute", governor.rate());
+    }
+
+    #[test]
+    fn what_a_cut_lost_does_not_slow_the_path_down_after_it() {
+        let start = Instant::now();
+        let mut governor = Governor::new(start);
+        let rtt = Some(Duration::from_millis(40));
+        let up = Noted { acked: 1_000, lost: 0, least_rtt: rtt };
+        // Given: a second of life, six of silence.
+        for tick in 1..=10 {
+            governor.update(up, at(start, tick * 100));
+        }
+        for tick in 11..=70 {
+            governor.update(Noted::default(), at(start, tick * 100));
+        }
+        let before = governor.rate();
+        // When: the first acknowledgement declares all that was sent meanwhile lost, the next some more.
+        for (tick, lost) in [(71, 45_000), (72, 2_000), (73, 0), (74, 0)] {
+            governor.charge(10.0 * before);
+            assert!(!governor.delay(Way::Low, at(start, tick * 100)).is_zero(), "the rate is the limit");
+            governor.update(Noted { lost, ..up }, at(start, tick * 100));
+        }
+        // Then: more is tried at once.
+        assert!(governor.rate() > 1.2 * before, "{} after {before} bytes/s", governor.rate());
     }
 
     #[test]

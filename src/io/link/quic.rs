@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use quinn::{ServerConfig, TransportConfig, VarInt};
+use quinn::{AckFrequencyConfig, ServerConfig, TransportConfig, VarInt};
 use ring::rand::SecureRandom as _;
 
 use super::events::LinkError;
@@ -50,6 +50,10 @@ pub(super) fn bind(address: SocketAddr) -> Result<std::net::UdpSocket, LinkError
     open().map_err(|source| LinkError::Bind { address, source })
 }
 
+/// The peer is asked to acknowledge within this: at 30 packets a second it would wait out its own 25 ms each
+/// time, which looks like a queue in the path.
+const ACK_DELAY: Duration = Duration::from_millis(5);
+
 /// Lets holders of a valid certificate in.
 pub(super) fn server_config(identity: &Identity) -> Result<ServerConfig, KeyError> {
     let mut config = ServerConfig::with_crypto(Arc::new(identity.server()?));
@@ -61,9 +65,12 @@ pub(super) fn server_config(identity: &Identity) -> Result<ServerConfig, KeyErro
 /// How QUIC behaves under the link: small buffers, packets that fit any path, nothing held back.
 pub(super) fn transport() -> Arc<TransportConfig> {
     let mut transport = TransportConfig::default();
+    let mut acknowledge = AckFrequencyConfig::default();
+    acknowledge.max_ack_delay(Some(ACK_DELAY));
     let idle = quinn::IdleTimeout::try_from(IDLE).expect("minutes fit into QUIC's 2^62 ms");
     transport
         .max_idle_timeout(Some(idle))
+        .ack_frequency_config(Some(acknowledge))
         .keep_alive_interval(Some(KEEP_ALIVE))
         .max_concurrent_bidi_streams(VarInt::from_u32(2))
         .max_concurrent_uni_streams(VarInt::from_u32(16))

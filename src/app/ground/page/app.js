@@ -120,14 +120,17 @@ function panels() {
     rows(table, list); $("sensors").replaceChildren(table);
   }
   if (p && p.link) {
-    const l = p.link, table = document.createElement("table"), all = l.received + l.missing, done = all ? 100 * l.received / all : 100;
+    const l = p.link, table = document.createElement("table"), all = l.received + l.overdue, done = all ? 100 * l.received / all : 100;
+    // What is younger than two seconds may still be on its way; what a silent payload has is not known.
+    const known = 2 + (l.silent_ms > 2000 || !l.up ? l.silent_ms / 1000 : 0);
     const bar = document.createElement("div"), fill = document.createElement("div");
     bar.className = "bar"; fill.style.width = `${done.toFixed(1)}%`; bar.append(fill);
     rows(table, [
       [l.address, l.up ? (l.silent_ms > 2000 ? `silent ${(l.silent_ms / 1000).toFixed(0)} s` : "connected") : "not connected", l.up ? (l.silent_ms > 2000 ? "warn" : "good") : "bad"],
       ["round trip", `${l.rtt_ms.toFixed(1)} ms`],
       ["live", `${l.live_hz.toFixed(1)} records/s, ${(l.kbps).toFixed(0)} kbit/s`],
-      ["complete", l.missing ? `${done.toFixed(1)} %, ${l.missing} to come` : `${l.received} records, nothing missing`],
+      ["kept", `${l.received} records`],
+      ["missing", l.overdue ? `${l.overdue} to come, ${done.toFixed(1)} % there` : `nothing up to ${known.toFixed(0)} s ago`, l.overdue ? "warn" : "good"],
       ...(l.gone ? [["lost on board", `${l.gone}`, "warn"]] : []),
       ["on board", l.software],
     ]);

@@ -102,9 +102,10 @@ class FieldMap {
       if (vertical) { c.moveTo(p, 0); c.lineTo(p, h); } else { c.moveTo(0, p); c.lineTo(w, p); }
       c.stroke(); c.fillStyle = css("--soft");
       const metres = +(Math.abs(i) * step).toPrecision(6);
-      if (vertical) c.fillText(i === 0 ? "0" : `${metres} ${i > 0 ? "E" : "W"}`, p + 4, 13);
+      // Not under the buttons.
+      if (vertical && p < w - 110) c.fillText(i === 0 ? "0" : `${metres} ${i > 0 ? "E" : "W"}`, p + 4, 13);
       // Not over the scale.
-      else if (p > 24 && p < h - 40) c.fillText(i === 0 ? "0" : `${metres} ${i > 0 ? "S" : "N"}`, 6, p - 4);
+      else if (!vertical && p > 24 && p < h - 40) c.fillText(i === 0 ? "0" : `${metres} ${i > 0 ? "S" : "N"}`, 6, p - 4);
     };
     for (let i = Math.ceil(-u0 / d); i * d + u0 < w; i++) line(i, true);
     for (let i = Math.ceil(-v0 / d); i * d + v0 < h; i++) line(i, false);
