@@ -50,6 +50,12 @@ pub enum Way {
     Low,
 }
 
+/// Share of losses above which acknowledgements are lost as well, and one look's least round-trip time may be
+/// that of a packet whose own acknowledgement never came: then the least of the last looks counts.
+const LOSSY: f64 = 0.05;
+/// How many looks.
+const LOOKS: usize = 3;
+
 /// A token bucket that may go into debt.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Bucket {
@@ -106,6 +112,7 @@ pub struct Governor {
     base: [Option<Duration>; 2],
     base_turned: Instant,
     queue: Duration,
+    rtts: [Duration; LOOKS],
     limited: bool,
     cut: bool,
     restored: Option<Instant>,
@@ -124,6 +131,7 @@ impl Governor {
             base: [None; 2],
             base_turned: now,
             queue: Duration::ZERO,
+            rtts: [Duration::MAX; LOOKS],
             limited: false,
             cut: false,
             restored: None,
@@ -197,7 +205,11 @@ impl Governor {
         }
         self.base[1] = Some(self.base[1].map_or(rtt, |least| least.min(rtt)));
         let base = self.base.iter().flatten().min().copied().unwrap_or(rtt);
-        self.queue = rtt.saturating_sub(base);
+        self.rtts.rotate_left(1);
+        self.rtts[LOOKS - 1] = rtt;
+        let lossy = self.lost > LOSSY * (self.lost + self.acked);
+        let least = if lossy { self.rtts.iter().min().copied().unwrap_or(rtt) } else { rtt };
+        self.queue = least.saturating_sub(base);
     }
 
     fn set_rate(&mut self, rate: f64) {
@@ -346,6 +358,22 @@ mod tests {
         }
         // Then: more is tried at once.
         assert!(governor.rate() > 1.2 * before, "{} after {before} bytes/s", governor.rate());
+    }
+
+    #[test]
+    fn a_late_acknowledgement_is_a_queue_only_where_none_are_lost() {
+        let start = Instant::now();
+        for (lost, slowed) in [(0, true), (200, false)] {
+            let mut governor = Governor::new(start);
+            let rate = governor.rate();
+            for tick in 1..=30 {
+                // Every tenth look sees but one packet, acknowledged 60 ms late.
+                let late = if tick % 10 == 0 { 60 } else { 0 };
+                let least_rtt = Some(Duration::from_millis(40 + late));
+                governor.update(Noted { acked: 800, lost, least_rtt }, at(start, tick * 100));
+            }
+            assert_eq!(governor.rate() < rate, slowed, "{} bytes/s with {lost} lost a look", governor.rate());
+        }
     }
 
     #[test]
