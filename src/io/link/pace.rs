@@ -10,9 +10,9 @@ use tokio::time::Instant;
 
 use super::sense::Noted;
 
-/// Standing delay in the path above which less is sent. Under the 150 ms that live data may be late at,
-/// above the 25 ms by which a receiver may delay its acknowledgement (RFC 9000, 18.2).
-const QUEUE_LIMIT: Duration = Duration::from_millis(40);
+/// Standing delay in the path above which less is sent. Well under the 150 ms that live data may be late at;
+/// above the few milliseconds by which stations are asked to acknowledge at the latest.
+const QUEUE_LIMIT: Duration = Duration::from_millis(30);
 /// Standing delay below which more is tried.
 const QUEUE_EMPTY: Duration = Duration::from_millis(15);
 /// Where the search begins, bytes a second: carries two vehicles at 15 Hz over the slowest radios.
