@@ -83,7 +83,7 @@ pub fn record(t: MonoTime) -> Record {
 
 /// A run of so many records on what stands for the card.
 pub fn card(run: u32, records: u32) -> Arc<MemoryBacklog> {
-    let card = MemoryBacklog::new(run, &format!("boot-{run}"), 256 << 20);
+    let card = MemoryBacklog::new(run, format!("boot-{run}"), 256 << 20);
     for n in 0..records {
         card.append(Arc::new(record(MonoTime::from_ns(n.into()))));
     }
