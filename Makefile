@@ -54,7 +54,6 @@ test-web: setup-python
 # adds a hundred crates to the build.
 test-zenoh: setup-python
 	@sh tests/setup/venv.sh $(VENV)-zenoh tests/zenoh/requirements.txt
-	$(CARGO) clippy --locked --features zenoh --lib --bins -- -D warnings
 	$(CARGO) build --locked --features zenoh
 	$(VENV)-zenoh/bin/python -m unittest discover -s tests/zenoh -p 'test_*.py' -v
 
