@@ -9,7 +9,7 @@ use windhover::config::Config;
 use windhover::estimate::{Bound, BoundTruth, Estimator, EstimatorOutput, PaperEstimator, Site};
 use windhover::geo::{Ground, wrap_angle};
 use windhover::io::clock::HostClock;
-use windhover::msg::{Stamped, TargetEstimate, TrackStatus};
+use windhover::msg::{FrameObservations, MarkerId, Stamped, TargetEstimate, TrackStatus};
 use windhover::simulate::{Sample, Scenario, SensorSuite, World};
 use windhover::time::{MonoTime, Span};
 
@@ -102,40 +102,56 @@ fn truth_at(world: &World, t: MonoTime, gps_delay_s: f64) -> BoundTruth {
     }
 }
 
-/// The configuration whose intensities of motion are those of the true motion, from its increments
-/// over about as long as the filter remembers (0.2 s with ground features, else 0.5 s), and whose
-/// noise figures are the true ones.
-fn told_the_truth(world: &World) -> Config {
-    let step_s = if world.scenario().camera.features > 0 { 0.2 } else { 0.5 };
+/// Intensities of motion: a target's speed and yaw rate, the helicopter's rates about its roll and pitch axes
+/// and about its yaw axis, its force across and along the rotor axis; units²/s.
+type Intensities = [f64; 6];
+
+/// Limits of the scale at which intensities are taken, s.
+const SCALES_S: (f64, f64) = (0.1, 5.0);
+/// Scale at which the filter learns the motion of the helicopter, and the bound is begun, s.
+const LEARNT_OVER_S: f64 = 0.4;
+
+/// Intensities of the true motion, each by its increments over its own `scale`.
+fn intensities(world: &World, scales_s: &[f64; 6]) -> Intensities {
+    let scenario = world.scenario();
+    let components = |t: MonoTime| -> [f64; 8] {
+        let (vehicle, own) = (world.vehicle(0, t), world.ownship(t));
+        let drag = own.velocity_ned_mps * scenario.helicopter.drag_per_s;
+        let felt = own.acceleration_ned_mps2 + drag - Vector3::z() * 9.806_65;
+        let (force, rate) = (own.ned_from_body.inverse() * felt, own.body_rate_radps);
+        [vehicle.speed_mps, vehicle.yaw_rate_radps, rate.x, rate.y, rate.z, force.x, force.y, force.z]
+    };
+    let walk = |kind: usize, places: &[usize]| {
+        let step_s = scales_s[kind];
+        let times =
+            (0..).map(|k| BURN_S + 0.1 * f64::from(k)).take_while(|t| t + step_s < scenario.duration_s);
+        let (sum, n) = times.fold((0.0, 0.0), |(sum, n), t| {
+            let (a, b) = (components(world.time(t)), components(world.time(t + step_s)));
+            (sum + places.iter().map(|i| (b[*i] - a[*i]).powi(2)).sum::<f64>(), n + places.len() as f64)
+        });
+        sum / f64::max(n, 1.0) / step_s
+    };
+    // A vehicle at rest has no intensity at all; a figure must be positive.
+    [
+        walk(0, &[0]).max(4e-4),
+        walk(1, &[1]).max(1e-4),
+        walk(2, &[2, 3]).max(1e-8),
+        walk(3, &[4]).max(1e-8),
+        walk(4, &[5, 6]).max(1e-8),
+        walk(5, &[7]).max(1e-8),
+    ]
+}
+
+/// The configuration with these intensities and the true noise figures.
+fn told_the_truth(world: &World, q: &Intensities) -> Config {
     let scenario = world.scenario();
     let mut config = scenario.config.clone();
-    let times = || (0..).map(|k| BURN_S + step_s * f64::from(k)).take_while(|t| *t < scenario.duration_s);
-    let rms = |increment: &dyn Fn(f64) -> f64| {
-        let (sum, n) = times().fold((0.0, 0.0), |(s, n), t| (s + increment(t).powi(2), n + 1.0));
-        f64::sqrt(sum / f64::max(n, 1.0))
-    };
-    let walk = |value: &dyn Fn(MonoTime) -> f64| {
-        rms(&|t| value(world.time(t + step_s)) - value(world.time(t))) / step_s.sqrt()
-    };
     let e = &mut config.estimator;
-    let vehicle = |t| world.vehicle(0, t);
-    // A vehicle at rest has no intensity at all; a figure must be positive.
-    e.target_speed_walk = walk(&|t| vehicle(t).speed_mps).max(0.02);
-    e.target_yaw_rate_walk = walk(&|t| vehicle(t).yaw_rate_radps).max(0.01);
-    let rate = |axis: usize| walk(&|t| world.ownship(t).body_rate_radps[axis]);
-    e.tilt_rate_walk = (0.5 * (rate(0).powi(2) + rate(1).powi(2))).sqrt();
-    e.yaw_rate_walk = rate(2);
-    let force = |axis: usize| {
-        walk(&|t| {
-            let own = world.ownship(t);
-            let drag = own.velocity_ned_mps * scenario.helicopter.drag_per_s;
-            let felt = own.acceleration_ned_mps2 + drag - Vector3::z() * 9.806_65;
-            (own.ned_from_body.inverse() * felt)[axis]
-        })
-    };
+    (e.target_speed_walk, e.target_yaw_rate_walk) = (q[0].sqrt(), q[1].sqrt());
+    (e.tilt_rate_walk, e.yaw_rate_walk) = (q[2].sqrt(), q[3].sqrt());
     // A Gauss–Markov process of variance s² walks by 2 s²/τ.
-    let sigma = |walk: f64| walk * (0.5 * e.force_tau_s).sqrt();
-    (e.side_force_mps2, e.thrust_mps2) = (sigma((force(0) * force(1)).sqrt()), sigma(force(2)));
+    let sigma = |q: f64| (q * 0.5 * e.force_tau_s).sqrt();
+    (e.side_force_mps2, e.thrust_mps2) = (sigma(q[4]), sigma(q[5]));
     let (gps, compass) = (&scenario.gps, &scenario.compass);
     (e.marker_noise_px, e.feature_sigma_factor) = (0.0, 1.0);
     (config.gps.bias_sigma_m, config.gps.noise_m) = (gps.bias_sigma_m, gps.noise_m);
@@ -143,6 +159,14 @@ fn told_the_truth(world: &World) -> Config {
     config.compass.heading_noise_deg = compass.heading_noise_deg;
     config.compass.tilt_noise_deg = compass.tilt_noise_deg;
     config
+}
+
+/// Whether a frame shows a marker of a target.
+fn shows(seen: &FrameObservations, config: &Config, target: usize) -> bool {
+    seen.markers.iter().any(|detection| match detection.marker {
+        MarkerId::Disc { target: of, .. } => of == target,
+        MarkerId::Tag { id, .. } => config.target[target].marker.iter().any(|marker| marker.id == Some(id)),
+    })
 }
 
 /// Mean variances of the bound over a run, of every target.
@@ -158,6 +182,12 @@ impl BoundScore {
         self.variance += covariance.diagonal();
     }
 
+    /// Over how long a filter this good remembers speed and yaw rate: `4/3 P/q`.
+    fn scales_s(&self, q: &Intensities) -> [f64; 2] {
+        let p = [self.variance[3], self.variance[4]].map(|sum| sum / self.frames.max(1.0));
+        std::array::from_fn(|i| (4.0 / 3.0 * p[i] / q[i]).clamp(SCALES_S.0, SCALES_S.1))
+    }
+
     fn figures(&self) -> Figures {
         let rms = |i: usize| (self.variance[i] / self.frames.max(1.0)).sqrt();
         let none = f64::NAN;
@@ -165,7 +195,9 @@ impl BoundScore {
     }
 }
 
-/// The bound over a flight: its measurements in order of when they were true.
+/// The bound over a flight: its measurements in order of when they were true. Motion is smoother than a walk,
+/// so the walk that describes it depends on the scale: that of the helicopter is taken over 0.4 s, as the filter
+/// learns it, that of vehicles over the bound's own memory of the component, found by computing it again.
 fn bound(world: &Arc<World>, site: &Site) -> Figures {
     let mut suite = SensorSuite::new(Arc::clone(world));
     let delay_s = suite.gps_latency_error().s();
@@ -180,9 +212,25 @@ fn bound(world: &Arc<World>, site: &Site) -> Figures {
         taken.push((t, sample, seen));
     }
     taken.sort_by_key(|(t, ..)| *t);
-    let mut bound = Bound::new(&told_the_truth(world), site);
+    let mut scales_s = [LEARNT_OVER_S; 6];
     let mut score = BoundScore::default();
-    for (t, sample, seen) in &taken {
+    for _ in 0..PASSES {
+        let q = intensities(world, &scales_s);
+        score = bound_pass(world, site, &told_the_truth(world, &q), &taken);
+        scales_s[..2].copy_from_slice(&score.scales_s(&q));
+    }
+    score.figures()
+}
+
+/// The measurements of a flight, when each was true, and what the frames showed.
+type Taken = Vec<(MonoTime, Sample, Option<FrameObservations>)>;
+/// Times the bound is computed until the scales of the motion fit it.
+const PASSES: usize = 4;
+
+fn bound_pass(world: &World, site: &Site, config: &Config, taken: &Taken) -> BoundScore {
+    let mut bound = Bound::new(config, site);
+    let mut score = BoundScore::default();
+    for (t, sample, seen) in taken {
         // A fix enters where its stamp puts it, with the delay that is to be learnt.
         let truth = truth_at(world, *t, 0.0);
         match sample {
@@ -193,7 +241,10 @@ fn bound(world: &Arc<World>, site: &Site) -> Figures {
                     bound.frame(*t, seen, &truth);
                 }
                 let scored = world.seconds(*t) >= BURN_S;
-                for target in (0..world.vehicles()).filter(|_| scored) {
+                let shown = |target: &usize| {
+                    seen.as_ref().is_some_and(|seen| shows(seen, &world.scenario().config, *target))
+                };
+                for target in (0..world.vehicles()).filter(|_| scored).filter(shown) {
                     if let Some(covariance) = bound.target(target) {
                         score.add(&covariance);
                     }
@@ -201,7 +252,7 @@ fn bound(world: &Arc<World>, site: &Site) -> Figures {
             }
         }
     }
-    score.figures()
+    score
 }
 
 /// rel m, heading deg, speed, yaw rate, NEES of three, of five, of position, coverage.
@@ -229,6 +280,7 @@ fn summary(runs: &[Figures]) -> String {
 
 struct Run {
     filter: Figures,
+    in_view: Figures,
     smoothed: Figures,
     paper: Figures,
     bound: Figures,
@@ -250,6 +302,7 @@ fn run(scenario: &Scenario, seed: u64, verbose: bool) -> Run {
     let mut suite = SensorSuite::new(Arc::clone(&world));
     let (mut out, mut paper_out) = (Vec::new(), Vec::new());
     let (mut f, mut s, mut p) = (Score::default(), Score::default(), Score::default());
+    let mut in_view = Score::default();
     let (mut busy, mut frames, mut resets) = (Span::ZERO, 0usize, 0usize);
     let offset = Span::from_ms(config.camera.exposure_offset_ms);
     let error = suite.gps_latency_error().ms();
@@ -284,7 +337,12 @@ fn run(scenario: &Scenario, seed: u64, verbose: bool) -> Run {
         }
         for output in out.drain(..) {
             match output {
-                EstimatorOutput::Estimate(e) => f.add(&e, &world),
+                EstimatorOutput::Estimate(e) => {
+                    f.add(&e, &world);
+                    if shows(suite.observations(), config, e.target) {
+                        in_view.add(&e, &world);
+                    }
+                }
                 EstimatorOutput::Smoothed(e) => s.add(&e, &world),
                 EstimatorOutput::Reset { .. } | EstimatorOutput::Anchored { .. } => resets += 1,
                 EstimatorOutput::Ownship(_) | EstimatorOutput::Fusion(_) => {}
@@ -296,6 +354,7 @@ fn run(scenario: &Scenario, seed: u64, verbose: bool) -> Run {
     }
     Run {
         filter: f.figures(),
+        in_view: in_view.figures(),
         smoothed: s.figures(),
         paper: p.figures(),
         bound: bound(&world, &site),
@@ -345,9 +404,16 @@ fn main() {
         let results: Vec<Run> = (0..runs).map(|seed| run(&scenario, seed + 1, verbose)).collect();
         let of = |pick: fn(&Run) -> Figures| summary(&results.iter().map(pick).collect::<Vec<_>>());
         println!("{name:<18} filter    {}", of(|r| r.filter));
+        println!("{name:<18} in view   {}", of(|r| r.in_view));
         println!("{name:<18} smoothed  {}", of(|r| r.smoothed));
         println!("{name:<18} paper     {}", of(|r| r.paper));
         println!("{name:<18} bound     {}", of(|r| r.bound));
+        let ratio = |i: usize| {
+            let rms =
+                |pick: fn(&Run) -> Figures| results.iter().map(|r| pick(r).0[i].powi(2)).sum::<f64>().sqrt();
+            rms(|r| r.in_view) / rms(|r| r.bound)
+        };
+        println!("{name:<18} of the bound, in view: {:.3} {:.3} {:.3}", ratio(1), ratio(2), ratio(3));
         let n = results.len() as f64;
         let mean = |pick: fn(&Run) -> f64| results.iter().map(pick).sum::<f64>() / n;
         println!(

@@ -68,7 +68,7 @@ impl Default for EstimatorConfig {
         Self {
             history_ms: 1000.0,
             smoother_lag_ms: 500.0,
-            lost_after_s: 8.0,
+            lost_after_s: 30.0,
             learn: true,
             learn_s: 1.0,
             gate_probability: 0.999,

@@ -44,7 +44,7 @@ pub enum EstimatorOutput {
 /// The joint filter with its history of measurements.
 #[derive(Clone, Debug)]
 pub struct Estimator {
-    core: Core,
+    pub(super) core: Core,
     history: History<AnyMeasurement, State>,
     /// Compass readings heard before there was a state.
     compass: VecDeque<Stamped<AttitudeSample>>,

@@ -35,7 +35,7 @@ pub(super) struct Learnt {
 }
 
 /// Limits of what is learnt, as factors on the configured standard deviation.
-pub(super) const LEAST: f64 = 0.05;
+pub(super) const LEAST: f64 = 0.01;
 pub(super) const MOST: f64 = 5.0;
 
 /// The configured values and how fast to leave them.
@@ -105,8 +105,10 @@ impl State {
 
     /// Fits the targets' intensities. Call once a frame, after its fusion.
     ///
-    /// The increments looked at span the filter's own memory of the component, `2 P/q`: real motion is
-    /// smoother than a random walk, and the intensity that serves is the one at that scale.
+    /// The increments looked at span the filter's own memory of the component: real motion is smoother than a random
+    /// walk, and the intensity that serves is the one at that scale. A filter of position and its rate trails a
+    /// rate that changes by a per second by `a P/q`, and noise makes up a quarter of P; so P is the squared error
+    /// where `q = a² T` is taken from increments over `T = 4/3 P/q`.
     pub(super) fn learn_targets(&mut self, learning: &Learning) {
         let now = self.t;
         let since_s = (now - self.learnt.t_target).s().clamp(0.0, 0.2);
@@ -127,9 +129,11 @@ impl State {
     /// Fits the walk of target `i`'s speed (`k` = 0) or yaw rate (`k` = 1).
     fn learn_target(&mut self, learning: &Learning, i: usize, k: usize, gain: f64) {
         let (column, row) = (self.target_at(i) + 3 + k, at::TARGET * i + 3 + k);
-        let (target, var) = (&self.targets[i], self.cov.at(column, column));
+        let var = self.cov.at(column, column);
         let q = self.learnt.target_q[i][k];
-        let memory_s = (2.0 * var / q).clamp(SHORTEST_S, learning.interval.s());
+        let memory_s = (LAG * var / q).clamp(SHORTEST_S, learning.interval.s());
+        self.targets[i].memory_s[k] = memory_s;
+        let target = &self.targets[i];
         // A target started again since then has nothing in common with its copy.
         let usable = self.echoes.iter().filter(|e| e.live && e.t < self.t && e.t >= target.started);
         let misfit = |e: &&Echo| ((self.t - e.t).s() - memory_s).abs();
@@ -193,8 +197,11 @@ pub(super) const MOVING: f64 = 20.0;
 /// Share of an increment that measurements tell, at the least, as the fit's step takes it.
 const LEAST_TOLD: f64 = 0.1;
 
+/// Span of the increments looked at over `P/q`.
+const LAG: f64 = 4.0 / 3.0;
+
 /// Shortest increment looked at, s.
-const SHORTEST_S: f64 = 0.1;
+pub(super) const SHORTEST_S: f64 = 0.1;
 
 /// Variance of `x_now − decay · x_then`.
 fn increment(echo: &Echo, row: usize, var_now: f64, column: usize, decay: f64) -> f64 {
@@ -231,6 +238,5 @@ pub(super) fn blend_factor(value: &mut f64, misfit: f64, samples: f64) {
     }
 }
 
-/// Limits of a factor on the variance of pixels: below half the sigma assumed, what is left out of the model
-/// (stamps, lens, bending of the model) counts for more than noise.
-const FACTORS: (f64, f64) = (0.25, 25.0);
+/// Limits of a factor on the variance of pixels: from a fifth of the sigma assumed to five times as much.
+const FACTORS: (f64, f64) = (0.04, 25.0);

@@ -20,6 +20,8 @@ mod track;
 mod update;
 mod vision;
 mod warm;
+#[cfg(test)]
+mod tests;
 
 pub use bound::{Bound, BoundTruth};
 pub use filter::{Estimator, EstimatorOutput};

@@ -11,12 +11,10 @@ use crate::config::TargetModel;
 use crate::geo::skew;
 use crate::time::MonoTime;
 
+use super::learn::SHORTEST_S;
 use super::matrix::Grid;
 use super::models::Models;
 use super::state::{GRAVITY, State, at};
-
-/// Time out of sight after which what was learnt of a vehicle's driving fades, s.
-const FORGET_S: f64 = 1.0;
 
 /// Longest step, seconds: the linearisation holds over it.
 const MAX_STEP_S: f64 = 0.05;
@@ -191,16 +189,20 @@ impl State {
         add_walk(p, s + 2, s + 4, yaw_rate_q, dt);
     }
 
-    /// How target `i` walks at present: as it was learnt to while it is seen. What was learnt holds for
-    /// about a second of driving, and out of sight it may do again whatever is configured.
+    /// How target `i` walks at present: as it was learnt to while it is seen. What was learnt is true at the scale
+    /// of the filter's memory T; motion is smoother than a walk, so that over a longer time t out of sight its
+    /// increments grow as `q t²/T`, a walk of intensity `2 q t/T`, until it may do whatever is configured.
     fn present_walks(&self, i: usize, models: &Models) -> [f64; 2] {
-        let away_s = (self.t - self.targets[i].last_seen).s();
+        let target = &self.targets[i];
+        let away_s = (self.t - target.last_seen).s();
         let learnt = self.learnt.target_q[i];
         if away_s < super::track::BLINK_S {
             return learnt;
         }
-        let forgotten = 1.0 - (-away_s / FORGET_S).exp();
-        std::array::from_fn(|k| learnt[k] + forgotten * (models.target_walks[k] - learnt[k]).max(0.0))
+        std::array::from_fn(|k| {
+            let grown = learnt[k] * (2.0 * away_s / target.memory_s[k].max(SHORTEST_S)).max(1.0);
+            grown.min(models.target_walks[k]).max(learnt[k])
+        })
     }
 
     /// Intensities of target `i`'s speed and yaw rate walks. A car turns only as it rolls: its yaw

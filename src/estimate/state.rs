@@ -110,12 +110,16 @@ pub(super) struct Target {
     pub(super) seen: u32,
     /// Sliding mean of the test that it stands still; see `learn_rest`.
     pub(super) motion: f64,
+    /// Over how long its speed's and its yaw rate's increments were last looked at, s.
+    pub(super) memory_s: [f64; 2],
     /// When the present track was (last) started: nothing ties it to copies from before.
     pub(super) started: MonoTime,
     /// When and where (north, east) it was first seen since it was last unknown.
     pub(super) first_seen: (MonoTime, [f64; 2]),
     /// Frames in a row in which its markers lay outside the gate.
     pub(super) rejected: u32,
+    /// Whether its place was read off its markers anew, and nothing has confirmed it since.
+    pub(super) placed_anew: bool,
 }
 
 /// One ground feature.

@@ -33,6 +33,8 @@ pub(super) fn started(mean: [f64; at::TARGET], t: MonoTime) -> Target {
         seen: 1,
         rejected: 0,
         motion: MOVING,
+        placed_anew: false,
+        memory_s: [0.0; 2],
         started: t,
         first_seen,
     }

@@ -7,7 +7,7 @@ use crate::geo::{locate, skew, wrap_angle};
 use crate::msg::{Disposition, FeatureTrack, FrameObservations, FusionSource, MarkerDetection, TrackStatus};
 
 use super::core::Core;
-use super::learn::blend_factor;
+use super::learn::{MOVING, blend_factor};
 use super::models::Models;
 use super::state::{Own, State, Target, at};
 use super::track::{FRAMES_TO_START, started, started_again};
@@ -97,13 +97,18 @@ impl Core {
         let target = &mut self.state.targets[index];
         if good > 0 {
             target.rejected = 0;
+            target.placed_anew = false;
             target.seen = target.seen.saturating_add(1);
             target.last_seen = t;
         } else {
             target.rejected += 1;
             let patience = if target.status == TrackStatus::Tracking { restart_after } else { 2 };
             if target.rejected >= patience {
-                self.start_target(index, markers, None);
+                if rests || target.placed_anew || target.status == TrackStatus::Acquiring {
+                    self.start_target(index, markers, None);
+                } else {
+                    self.place_anew(index, markers);
+                }
                 return;
             }
             self.state.wake(&self.learning, index);
@@ -186,6 +191,39 @@ impl Core {
         let heading_var = if heading_known { 1.0 } else { UNKNOWN_HEADING.powi(2) };
         let (speed_var, rate_var) = if moving { (9.0, 1.0) } else { (0.0, 0.0) };
         self.state.renew(start, &[900.0, 900.0, heading_var, speed_var, rate_var]);
+        self.fuse_ungated(index, markers);
+        self.state.settle(index);
+    }
+
+    /// A track that comes back elsewhere than expected: place and heading are what its markers show, while speed and
+    /// yaw rate are still about what they were. Where that does not hold either, the track starts afresh.
+    fn place_anew(&mut self, index: usize, markers: &[MarkerDetection]) {
+        let before = self.state.targets[index];
+        let Some((mut mean, true)) = guess(&self.state.own, &self.models, index, markers) else {
+            self.start_target(index, markers, None);
+            return;
+        };
+        mean[3..].copy_from_slice(&before.mean[3..]);
+        let (s, t) = (self.state.target_at(index), self.state.t);
+        let motion: [f64; 2] = std::array::from_fn(|k| {
+            self.state.cov.at(s + 3 + k, s + 3 + k) + ANEW_S * self.models.target_walks[k]
+        });
+        self.state.targets[index] = Target {
+            mean,
+            placed_anew: true,
+            rejected: 0,
+            last_seen: t,
+            started: t,
+            motion: MOVING,
+            ..before
+        };
+        self.state.learnt.target_q[index] = self.learning.start.target_q[index];
+        self.state.renew(s, &[900.0, 900.0, 1.0, motion[0], motion[1]]);
+        self.fuse_ungated(index, markers);
+        self.state.settle(index);
+    }
+
+    fn fuse_ungated(&mut self, index: usize, markers: &[MarkerDetection]) {
         for detection in markers {
             if let Some((t, marker)) = self.models.find(detection.marker)
                 && t == index
@@ -193,7 +231,6 @@ impl Core {
                 self.fuse_marker(index, marker, detection, false);
             }
         }
-        self.state.settle(index);
     }
 
     /// Ground features: each a point of the ground that stays where it is.
@@ -281,6 +318,8 @@ const LEARN_RATIO: f64 = 4.0;
 const MARKER_SAMPLES: f64 = 100.0;
 const FEATURE_SAMPLES: f64 = 400.0;
 
+/// How long a track that is placed anew may have driven as configured since its motion was known, s.
+const ANEW_S: f64 = 1.0;
 /// Heading quite unknown, one sigma of a uniform circle, rad.
 const UNKNOWN_HEADING: f64 = 1.8;
 /// Farthest that a ray is followed to the ground, m.
