@@ -141,7 +141,7 @@ impl Scene {
             self.filter.attitude(&Stamped { t_valid: t, t_recv: t, seq, value: compass }, &mut out);
             let value = FrameObservations { frame: self.step, markers: self.markers(), features: Vec::new() };
             self.filter.frame(&Stamped { t_valid: t, t_recv: t, seq: seq + 1, value }, &mut out);
-            if self.step % 3 == 0 {
+            if self.step.is_multiple_of(3) {
                 let value = GnssEpoch {
                     fix: FixKind::ThreeD,
                     lat_deg: Some(47.0),
