@@ -18,6 +18,10 @@ use crate::time::{MonoTime, Span};
 /// Messages are put in order of their log time over this span: writers of several threads do not
 /// keep it exactly.
 const REORDER: Span = Span::from_ns(1_000_000_000);
+/// Unless they take more memory than this, in bytes: a second of raw colour frames fits twice.
+const REORDER_BYTES: usize = 1 << 28;
+/// Memory of a message beside its bytes, near enough for a limit.
+const MESSAGE_COST: usize = 256;
 
 /// One message of a capture: as recorded, and as the event it stands for, if any.
 #[derive(Clone, Debug)]
@@ -32,6 +36,7 @@ pub struct CaptureItem {
 pub struct CaptureReader {
     reader: McapReader,
     waiting: BinaryHeap<Waiting>,
+    waiting_bytes: usize,
     newest: MonoTime,
     read: u64,
     seq: u64,
@@ -74,6 +79,7 @@ impl CaptureReader {
         Ok(Self {
             reader: McapReader::open(path)?,
             waiting: BinaryHeap::new(),
+            waiting_bytes: 0,
             newest: MonoTime::from_ns(i64::MIN),
             read: 0,
             seq: 0,
@@ -98,10 +104,12 @@ impl CaptureReader {
         let body = match self.body(raw) {
             Ok(body) => body?,
             Err(error) => {
-                self.warnings.push(format!(
-                    "a message on {} at {:?} is not {}: {error}",
-                    raw.channel.topic, raw.log_time, raw.channel.schema_name
-                ));
+                let (channel, at) = (&raw.channel, raw.log_time);
+                let text = format!(
+                    "a message on {} at {at:?} is not {}: {error}",
+                    channel.topic, channel.schema.name
+                );
+                mcap_read::warn(&mut self.warnings, text);
                 return None;
             }
         };
@@ -137,7 +145,7 @@ impl CaptureReader {
 
 /// A frame out of either image schema.
 fn frame(raw: &RawMessage, index: u32) -> Result<FramePayload, prost::DecodeError> {
-    if raw.channel.schema_name == "foxglove.RawImage" {
+    if raw.channel.schema.name == "foxglove.RawImage" {
         let image = foxglove::RawImage::decode(&raw.data[..])?;
         return Ok(FramePayload {
             index,
@@ -183,14 +191,17 @@ impl Iterator for CaptureReader {
 
     fn next(&mut self) -> Option<CaptureItem> {
         loop {
-            let due = self.waiting.peek().is_some_and(|first| self.newest - first.raw.log_time >= REORDER);
+            let due = self.waiting_bytes > REORDER_BYTES
+                || self.waiting.peek().is_some_and(|first| self.newest - first.raw.log_time >= REORDER);
             if !due && let Some(raw) = self.reader.next() {
                 self.newest = self.newest.max(raw.log_time);
+                self.waiting_bytes += raw.data.len() + MESSAGE_COST;
                 self.waiting.push(Waiting { raw, order: self.read });
                 self.read += 1;
                 continue;
             }
             let raw = self.waiting.pop()?.raw;
+            self.waiting_bytes -= raw.data.len() + MESSAGE_COST;
             let event = self.event(&raw);
             return Some(CaptureItem { raw, event });
         }

@@ -2,18 +2,28 @@
 //!
 //! The reader walks the file's records itself, so that damage costs only the record it hit: a chunk
 //! that fails its checksum is skipped, a cut file ends at its last whole record, and each is told as
-//! a warning.
+//! a warning. No length is believed beyond what is left of the file and the limits of
+//! [`mcap_record`](super::mcap_record), and what a file defines is kept once and within a limit: a
+//! hostile file costs at most some hundreds of megabytes while it is read.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::fs::File;
-use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use mcap::records::{Record as McapRecord, op};
-use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
+use super::mcap_record::{RECORD_HEAD, longest, parse, sized_u32, split, unpack_chunk};
 use crate::time::MonoTime;
+
+/// Schemas and channels of a file are kept up to so many bytes: a thousand channels of this program
+/// take a tenth of it.
+const MAX_DEFINITIONS: usize = 1 << 26;
+/// Memory that a definition takes beside its bytes, near enough for a limit.
+const DEFINITION_COST: usize = 256;
+/// Longest attachment that is read: a configuration, not a film.
+const MAX_ATTACHMENT: u64 = 1 << 24;
 
 /// Why a recording could not be read at all.
 #[derive(Debug, thiserror::Error)]
@@ -40,6 +50,17 @@ pub enum ReadError {
     },
 }
 
+/// A schema of a recording.
+#[derive(Clone, PartialEq, Eq, Debug, Default)]
+pub struct SchemaInfo {
+    /// Its name; empty stands for no schema.
+    pub name: String,
+    /// How it is written, e.g. `protobuf`.
+    pub encoding: String,
+    /// The schema.
+    pub data: Vec<u8>,
+}
+
 /// A channel of a recording: topic and schema.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct ChannelInfo {
@@ -47,12 +68,8 @@ pub struct ChannelInfo {
     pub topic: String,
     /// Encoding of its messages.
     pub message_encoding: String,
-    /// Name of its schema; empty where it has none.
-    pub schema_name: String,
-    /// Encoding of its schema.
-    pub schema_encoding: String,
-    /// The schema.
-    pub schema_data: Vec<u8>,
+    /// Its schema, shared by all channels that have it.
+    pub schema: Arc<SchemaInfo>,
     /// What else its writer said of it.
     pub metadata: BTreeMap<String, String>,
 }
@@ -96,7 +113,6 @@ pub fn segments_of(path: &Path) -> Result<Vec<PathBuf>, ReadError> {
 pub struct McapReader {
     files: VecDeque<PathBuf>,
     current: Option<OpenFile>,
-    ready: VecDeque<RawMessage>,
     warnings: Vec<String>,
     bytes_total: u64,
     bytes_done: u64,
@@ -107,8 +123,20 @@ struct OpenFile {
     input: BufReader<File>,
     position: u64,
     length: u64,
-    schemas: HashMap<u16, (String, String, Vec<u8>)>,
+    definitions: Definitions,
+    /// The chunk being read: its records, and how far.
+    chunk: Option<(Vec<u8>, usize)>,
+}
+
+/// Schemas and channels of a file, by number.
+#[derive(Default)]
+struct Definitions {
+    schemas: HashMap<u16, Arc<SchemaInfo>>,
     channels: HashMap<u16, Arc<ChannelInfo>>,
+    /// Bytes taken by everything ever defined; what is said again does not count.
+    bytes: usize,
+    /// Whether something was left out because that was too much.
+    overfull: bool,
 }
 
 /// One record's frame: operation code and length of its body.
@@ -117,22 +145,34 @@ struct Frame {
     length: u64,
 }
 
+/// Warnings kept until they are taken; a wreck has more than anybody reads.
+const MOST_WARNINGS: usize = 100;
+
+/// Adds a warning, or once that further ones are not told.
+pub(super) fn warn(warnings: &mut Vec<String>, text: String) {
+    match warnings.len() {
+        ..MOST_WARNINGS => warnings.push(text),
+        MOST_WARNINGS => warnings.push("there is more damage than is listed here".into()),
+        _ => {}
+    }
+}
+
+/// What reading a record gave.
+enum Step {
+    Message(RawMessage),
+    Other,
+    End,
+}
+
 const MAGIC_LENGTH: u64 = 8;
-const FRAME_LENGTH: u64 = 9;
 
 impl McapReader {
     /// Opens a file, or a directory of segments.
     pub fn open(path: &Path) -> Result<Self, ReadError> {
         let files = segments_of(path)?;
         let bytes_total = files.iter().filter_map(|f| f.metadata().ok()).map(|m| m.len()).sum();
-        let mut reader = Self {
-            files: files.into(),
-            current: None,
-            ready: VecDeque::new(),
-            warnings: Vec::new(),
-            bytes_total,
-            bytes_done: 0,
-        };
+        let mut reader =
+            Self { files: files.into(), current: None, warnings: Vec::new(), bytes_total, bytes_done: 0 };
         // The first file must be one, so that a wrong path is an error and not an empty recording.
         let first = reader.files.pop_front().ok_or_else(|| ReadError::Empty { path: path.to_owned() })?;
         reader.current = Some(OpenFile::open(first)?);
@@ -156,7 +196,7 @@ impl McapReader {
                     self.current = Some(file);
                     return true;
                 }
-                Err(error) => self.warnings.push(error.to_string()),
+                Err(error) => warn(&mut self.warnings, error.to_string()),
             }
         }
         false
@@ -168,18 +208,19 @@ impl Iterator for McapReader {
 
     fn next(&mut self) -> Option<RawMessage> {
         loop {
-            if let Some(message) = self.ready.pop_front() {
-                return Some(message);
-            }
             let Some(file) = &mut self.current else {
                 if self.next_file() {
                     continue;
                 }
                 return None;
             };
-            if !file.read_record(&mut self.ready, &mut self.warnings) {
-                self.bytes_done += file.length;
-                self.current = None;
+            match file.step(&mut self.warnings) {
+                Step::Message(message) => return Some(message),
+                Step::Other => {}
+                Step::End => {
+                    self.bytes_done += file.length;
+                    self.current = None;
+                }
             }
         }
     }
@@ -195,30 +236,24 @@ impl OpenFile {
         if input.read_exact(&mut magic).is_err() || magic != *mcap::MAGIC {
             return Err(ReadError::NotMcap { path });
         }
-        Ok(Self {
-            path,
-            input,
-            position: MAGIC_LENGTH,
-            length,
-            schemas: HashMap::new(),
-            channels: HashMap::new(),
-        })
+        let definitions = Definitions::default();
+        Ok(Self { path, input, position: MAGIC_LENGTH, length, definitions, chunk: None })
     }
 
     /// The next record's frame; `None` at the end, told as a warning where the file is cut.
     fn read_frame(&mut self, warnings: &mut Vec<String>) -> Option<Frame> {
-        let left = self.length - self.position;
-        let mut head = [0; FRAME_LENGTH as usize];
-        if left < FRAME_LENGTH || self.input.read_exact(&mut head).is_err() {
-            warnings.push(self.cut());
+        let left = self.length.saturating_sub(self.position);
+        let mut head = [0; RECORD_HEAD];
+        if left < RECORD_HEAD as u64 || self.input.read_exact(&mut head).is_err() {
+            warn(warnings, self.cut());
             return None;
         }
-        self.position += FRAME_LENGTH;
+        self.position += RECORD_HEAD as u64;
         let mut length = [0; 8];
         length.copy_from_slice(&head[1..]);
         let frame = Frame { op: head[0], length: u64::from_le_bytes(length) };
         if frame.length > self.length - self.position {
-            warnings.push(self.cut());
+            warn(warnings, self.cut());
             return None;
         }
         Some(frame)
@@ -228,108 +263,147 @@ impl OpenFile {
         format!("{} is cut off at byte {}: read to its last whole record", self.path.display(), self.position)
     }
 
-    fn damaged(&self, what: &str, error: &dyn std::fmt::Display) -> String {
-        format!(
-            "{}: {what} before byte {} is damaged and skipped: {error}",
-            self.path.display(),
-            self.position
-        )
+    fn damaged(&self, what: &str) -> String {
+        format!("{}: {what} before byte {} is damaged and skipped", self.path.display(), self.position)
     }
 
-    /// Reads one record; false at the end of what can be read.
-    fn read_record(&mut self, ready: &mut VecDeque<RawMessage>, warnings: &mut Vec<String>) -> bool {
-        let Some(frame) = self.read_frame(warnings) else { return false };
+    fn skip(&mut self, bytes: u64) -> Option<()> {
+        self.input.seek_relative(i64::try_from(bytes).ok()?).ok()?;
+        self.position += bytes;
+        Some(())
+    }
+
+    fn read(&mut self, bytes: u64) -> Option<Vec<u8>> {
+        let mut body = vec![0; usize::try_from(bytes).ok()?];
+        self.input.read_exact(&mut body).ok()?;
+        self.position += bytes;
+        Some(body)
+    }
+
+    /// Reads one record, of the chunk that is open or of the file.
+    fn step(&mut self, warnings: &mut Vec<String>) -> Step {
+        if let Some((records, at)) = self.chunk.take() {
+            return self.step_in_chunk(records, at, warnings);
+        }
+        let Some(frame) = self.read_frame(warnings) else { return Step::End };
         if frame.op == op::DATA_END || frame.op == op::FOOTER {
-            return false;
+            return Step::End;
         }
         let wanted = matches!(frame.op, op::SCHEMA | op::CHANNEL | op::MESSAGE | op::CHUNK);
-        if !wanted {
-            self.position += frame.length;
-            return self.input.seek_relative(frame.length as i64).is_ok();
+        let believed = frame.length <= longest(frame.op);
+        if !wanted || !believed {
+            if !believed {
+                warn(warnings, self.damaged("a record longer than is believed"));
+            }
+            return self.skip(frame.length).map_or(Step::End, |()| Step::Other);
         }
-        let mut body = vec![0; frame.length as usize];
-        if let Err(error) = self.input.read_exact(&mut body) {
-            warnings.push(self.damaged("a record", &error));
-            return false;
-        }
-        self.position += frame.length;
+        let Some(body) = self.read(frame.length) else {
+            warn(warnings, self.damaged("a record"));
+            return Step::End;
+        };
         if frame.op == op::CHUNK {
-            match unpack_chunk(&body) {
-                Ok(records) => records.into_iter().for_each(|record| self.take(record, ready)),
-                Err(error) => warnings.push(self.damaged("a chunk", &error)),
+            match chunk_records(&body) {
+                Some(records) => self.chunk = Some((records, 0)),
+                None => warn(warnings, self.damaged("a chunk")),
             }
-        } else {
-            match mcap::parse_record(frame.op, &body) {
-                Ok(record) => self.take(record, ready),
-                Err(error) => warnings.push(self.damaged("a record", &error)),
-            }
+            return Step::Other;
         }
-        true
+        self.take(frame.op, &body, warnings)
     }
 
-    fn take(&mut self, record: McapRecord<'_>, ready: &mut VecDeque<RawMessage>) {
-        match record {
-            McapRecord::Schema { header, data } => {
-                self.schemas.insert(header.id, (header.name, header.encoding, data.into_owned()));
-            }
-            McapRecord::Channel(channel) => {
-                let (schema_name, schema_encoding, schema_data) =
-                    self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-                let info = ChannelInfo {
-                    topic: channel.topic,
-                    message_encoding: channel.message_encoding,
-                    schema_name,
-                    schema_encoding,
-                    schema_data,
-                    metadata: channel.metadata,
-                };
-                self.channels.insert(channel.id, Arc::new(info));
-            }
-            McapRecord::Message { header, data } => {
-                if let Some(channel) = self.channels.get(&header.channel_id) {
-                    ready.push_back(RawMessage {
-                        channel: Arc::clone(channel),
-                        log_time: host_time(header.log_time),
-                        publish_time: host_time(header.publish_time),
-                        sequence: header.sequence,
-                        data: data.into_owned(),
-                    });
-                }
-            }
-            _ => {}
+    fn step_in_chunk(&mut self, records: Vec<u8>, at: usize, warnings: &mut Vec<String>) -> Step {
+        let rest = &records[at..];
+        if rest.is_empty() {
+            return Step::Other;
         }
+        let Some((code, body, after)) = split(rest) else {
+            warn(warnings, self.damaged("the end of a chunk"));
+            return Step::Other;
+        };
+        let step = self.take(code, body, warnings);
+        let next = records.len() - after.len();
+        self.chunk = Some((records, next));
+        step
+    }
+
+    fn take(&mut self, code: u8, body: &[u8], warnings: &mut Vec<String>) -> Step {
+        if !matches!(code, op::SCHEMA | op::CHANNEL | op::MESSAGE) {
+            return Step::Other;
+        }
+        let Some(record) = parse(code, body) else {
+            warn(warnings, self.damaged("a record"));
+            return Step::Other;
+        };
+        if let McapRecord::Message { header, data } = record {
+            let Some(channel) = self.definitions.channels.get(&header.channel_id) else { return Step::Other };
+            return Step::Message(RawMessage {
+                channel: Arc::clone(channel),
+                log_time: host_time(header.log_time),
+                publish_time: host_time(header.publish_time),
+                sequence: header.sequence,
+                data: data.into_owned(),
+            });
+        }
+        if !self.definitions.learn(record, body.len()) && !self.definitions.overfull {
+            self.definitions.overfull = true;
+            let path = self.path.display();
+            warn(
+                warnings,
+                format!("{path} defines more schemas and channels than is believed: the rest is left out"),
+            );
+        }
+        Step::Other
     }
 }
 
-/// Largest chunk unpacked: beyond it a size is damage, not data.
-const CHUNK_LIMIT: usize = 1 << 28;
-
-/// Unpacks the body of a chunk record whole, its checksum verified before anything of it is used.
-fn unpack_chunk(body: &[u8]) -> Result<Vec<McapRecord<'static>>, mcap::McapError> {
-    let options = LinearReaderOptions::default()
-        .with_skip_start_magic(true)
-        .with_skip_end_magic(true)
-        .with_prevalidate_chunk_crcs(true)
-        .with_record_length_limit(CHUNK_LIMIT);
-    let mut reader = LinearReader::new_with_options(options);
-    let mut frame = vec![op::CHUNK];
-    frame.extend_from_slice(&(body.len() as u64).to_le_bytes());
-    let mut left = frame.as_slice().chain(body);
-    let mut records = Vec::new();
-    while let Some(event) = reader.next_event() {
-        match event? {
-            LinearReadEvent::ReadRequest(need) => {
-                let read = left.read(reader.insert(need.min(CHUNK_LIMIT)))?;
-                reader.notify_read(read);
-            }
-            LinearReadEvent::Record { opcode, data } => {
-                if matches!(opcode, op::SCHEMA | op::CHANNEL | op::MESSAGE) {
-                    records.push(mcap::parse_record(opcode, data)?.into_owned());
+impl Definitions {
+    /// Takes a schema or channel whose record has so many bytes; false where there is no room for it.
+    fn learn(&mut self, record: McapRecord<'_>, bytes: usize) -> bool {
+        let room = self.bytes.saturating_add(bytes + DEFINITION_COST) <= MAX_DEFINITIONS;
+        match record {
+            McapRecord::Schema { header, data } => {
+                let same = |s: &Arc<SchemaInfo>| {
+                    s.name == header.name && s.encoding == header.encoding && s.data == *data
+                };
+                if self.schemas.get(&header.id).is_some_and(same) {
+                    return true;
+                }
+                if room {
+                    let data = data.into_owned();
+                    let schema = SchemaInfo { name: header.name, encoding: header.encoding, data };
+                    self.schemas.insert(header.id, Arc::new(schema));
                 }
             }
+            McapRecord::Channel(channel) => {
+                let schema = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
+                let info = ChannelInfo {
+                    topic: channel.topic,
+                    message_encoding: channel.message_encoding,
+                    schema,
+                    metadata: channel.metadata,
+                };
+                if self.channels.get(&channel.id).is_some_and(|known| **known == info) {
+                    return true;
+                }
+                if room {
+                    self.channels.insert(channel.id, Arc::new(info));
+                }
+            }
+            _ => return true,
         }
+        if room {
+            self.bytes += bytes + DEFINITION_COST;
+        }
+        room
     }
-    Ok(records)
+}
+
+/// The records of a chunk record, its checksum verified before anything of it is used.
+fn chunk_records(body: &[u8]) -> Option<Vec<u8>> {
+    match parse(op::CHUNK, body)? {
+        McapRecord::Chunk { header, data } => unpack_chunk(&header, &data),
+        _ => None,
+    }
 }
 
 /// MCAP times are unsigned; what does not fit is the end of time.
@@ -359,16 +433,14 @@ impl OpenFile {
             if frame.op == op::FOOTER {
                 return None;
             }
-            if frame.op == op::ATTACHMENT {
-                let mut body = vec![0; frame.length as usize];
-                self.input.read_exact(&mut body).ok()?;
+            if frame.op == op::ATTACHMENT && frame.length <= MAX_ATTACHMENT {
+                let body = self.read(frame.length)?;
                 if let Some(data) = attachment_named(&body, name) {
                     return Some(data.to_vec());
                 }
             } else {
-                self.input.seek(SeekFrom::Current(i64::try_from(frame.length).ok()?)).ok()?;
+                self.skip(frame.length)?;
             }
-            self.position += frame.length;
         }
         None
     }
@@ -382,10 +454,4 @@ fn attachment_named<'a>(body: &'a [u8], name: &str) -> Option<&'a [u8]> {
     let length = usize::try_from(u64::from_le_bytes(rest.get(..8)?.try_into().ok()?)).ok()?;
     let data = rest.get(8..8usize.checked_add(length)?)?;
     (found == name.as_bytes()).then_some(data)
-}
-
-fn sized_u32(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
-    let length = u32::from_le_bytes(bytes.get(..4)?.try_into().ok()?) as usize;
-    let rest = bytes.get(4..)?;
-    Some((rest.get(..length)?, rest.get(length..)?))
 }

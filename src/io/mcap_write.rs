@@ -4,11 +4,12 @@ use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
 use std::io::{BufWriter, Seek, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use mcap::records::MessageHeader;
 use mcap::{Attachment, Compression, WriteOptions};
 
-use super::mcap_read::ChannelInfo;
+use super::mcap_read::{ChannelInfo, SchemaInfo};
 use super::records::Record;
 use crate::time::{MonoTime, Span};
 
@@ -80,9 +81,11 @@ impl<W: Write + Seek> McapWriter<W> {
         let channel = self.channel(key, || ChannelInfo {
             topic: record.topic.to_string(),
             message_encoding: "protobuf".into(),
-            schema_name: record.schema.name().into(),
-            schema_encoding: "protobuf".into(),
-            schema_data: record.schema.descriptor(),
+            schema: Arc::new(SchemaInfo {
+                name: record.schema.name().into(),
+                encoding: "protobuf".into(),
+                data: record.schema.descriptor(),
+            }),
             metadata: BTreeMap::new(),
         })?;
         let sequence = self.sequence;
@@ -93,7 +96,7 @@ impl<W: Write + Seek> McapWriter<W> {
 
     /// Writes a message of another recording as it is, with its sequence number and its channel's metadata.
     pub fn copy(&mut self, message: &super::mcap_read::RawMessage) -> Result<(), WriteError> {
-        let key = (message.channel.topic.as_str(), message.channel.schema_name.as_str());
+        let key = (message.channel.topic.as_str(), message.channel.schema.name.as_str());
         let channel = self.channel(key, || (*message.channel).clone())?;
         let header = header(channel, message.sequence, message.log_time, message.publish_time);
         self.write_message(&header, message.log_time, &message.data)
@@ -105,10 +108,10 @@ impl<W: Write + Seek> McapWriter<W> {
             return Ok(*id);
         }
         let info = info();
-        let schema = if info.schema_name.is_empty() {
+        let schema = if info.schema.name.is_empty() {
             0
         } else {
-            self.writer.add_schema(&info.schema_name, &info.schema_encoding, &info.schema_data)?
+            self.writer.add_schema(&info.schema.name, &info.schema.encoding, &info.schema.data)?
         };
         let id = self.writer.add_channel(schema, &info.topic, &info.message_encoding, &info.metadata)?;
         self.channels.insert(owned, id);

@@ -7,6 +7,7 @@ pub mod device;
 pub mod link;
 pub mod import;
 pub mod mcap_read;
+pub mod mcap_record;
 pub mod mcap_write;
 pub mod notify;
 pub mod power;

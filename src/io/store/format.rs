@@ -2,25 +2,21 @@
 //!
 //! The `mcap` crate writes whole files; a segment here must be cut into appends that are durable
 //! one by one, say its schemas more than once and be put together again from what is left of it.
-//! Reading goes through `mcap::parse_record`.
+//! Reading goes through [`mcap_record`](crate::io::mcap_record).
 
 use std::collections::BTreeMap;
-use std::io::{Read, Write};
+use std::io::Write;
 
 use mcap::records::{ChunkHeader, ChunkIndex, op};
 use serde::{Deserialize, Serialize};
+
+use crate::io::mcap_record::RECORD_HEAD;
 
 /// First and last bytes of every MCAP file.
 pub const MAGIC: [u8; 8] = [0x89, b'M', b'C', b'A', b'P', 0x30, b'\r', b'\n'];
 
 /// Private record (op codes from 0x80 on are for applications) that fills an append up to a page.
 pub const PADDING: u8 = 0xF0;
-
-/// Bytes before a record's body: op code and length.
-pub const RECORD_HEAD: usize = 9;
-
-/// Largest chunk that is believed, uncompressed: a hole must not make a reader allocate the moon.
-pub const MAX_CHUNK_BYTES: u64 = 1 << 30;
 
 /// How chunks are compressed.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
@@ -199,27 +195,6 @@ pub fn put_packed_chunk(out: &mut Vec<u8>, header: &ChunkHeader, packed: &[u8]) 
     });
 }
 
-/// The records inside a chunk; `None` where it cannot be unpacked or its checksum is wrong.
-pub fn unpack_chunk(header: &ChunkHeader, packed: &[u8]) -> Option<Vec<u8>> {
-    if header.uncompressed_size > MAX_CHUNK_BYTES {
-        return None;
-    }
-    let size = header.uncompressed_size as usize;
-    let records = match header.compression.as_str() {
-        "" => packed.to_vec(),
-        "lz4" => {
-            let mut out = Vec::with_capacity(size);
-            lz4::Decoder::new(packed).ok()?.take(size as u64 + 1).read_to_end(&mut out).ok()?;
-            out
-        }
-        "zstd" => zstd::bulk::decompress(packed, size).ok()?,
-        _ => return None,
-    };
-    let whole = records.len() == size
-        && (header.uncompressed_crc == 0 || crc32fast::hash(&records) == header.uncompressed_crc);
-    whole.then_some(records)
-}
-
 /// Appends a MessageIndex record: (log time, offset in the uncompressed chunk) of one channel.
 pub fn put_message_index(out: &mut Vec<u8>, channel: u16, entries: &[(u64, u64)]) {
     put_record(out, op::MESSAGE_INDEX, |b| {
@@ -297,6 +272,7 @@ pub fn pad_to_page(out: &mut Vec<u8>, start: u64, page: u64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::io::mcap_record::unpack_chunk;
 
     #[test]
     fn chunks_go_there_and_back_and_damage_shows() {

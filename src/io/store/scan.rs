@@ -8,14 +8,12 @@ use std::path::Path;
 
 use mcap::records::{ChunkIndex, Record, op};
 
-use super::format::{self, MAGIC, RECORD_HEAD};
+use super::format::{self, MAGIC};
 use super::record::Definitions;
 use super::segment::PAGE;
 use super::summary::{PlacedChunk, Summary, TopicStats};
 use super::volume::{StoreError, StoreResult};
-
-/// Longest record but a chunk that is believed.
-const MAX_SMALL_RECORD: u64 = 16 << 20;
+use crate::io::mcap_record::{MAX_CHUNK_BYTES, RECORD_HEAD, longest, parse, split, unpack_chunk};
 
 /// What a sealed segment says of itself.
 #[derive(Clone, Debug, Default)]
@@ -97,9 +95,8 @@ impl SegmentFile {
     fn record(&self, offset: u64) -> Option<(u8, Vec<u8>)> {
         let head = self.read(offset, RECORD_HEAD as u64).ok()?;
         let length = u64::from_le_bytes(head[1..].try_into().ok()?);
-        let limit = if head[0] == op::CHUNK { format::MAX_CHUNK_BYTES } else { MAX_SMALL_RECORD };
         let room = self.length.checked_sub(offset + RECORD_HEAD as u64)?;
-        if length > room.min(limit) {
+        if length > room.min(longest(head[0])) {
             return None;
         }
         Some((head[0], self.read(offset + RECORD_HEAD as u64, length).ok()?))
@@ -115,7 +112,7 @@ impl SegmentFile {
         let summary_start = u64::from_le_bytes(tail[9..17].try_into().ok()?);
         let crc = u32::from_le_bytes(tail[25..29].try_into().ok()?);
         let covered = self.length.checked_sub(12)?.checked_sub(summary_start)?;
-        if summary_start == 0 || covered > format::MAX_CHUNK_BYTES {
+        if summary_start == 0 || covered > MAX_CHUNK_BYTES {
             return None;
         }
         let bytes = self.read(summary_start, covered).ok()?;
@@ -124,12 +121,12 @@ impl SegmentFile {
         }
         let mut sealed = SealedSegment { summary_start, ..SealedSegment::default() };
         let mut rest = &bytes[..];
-        while let Some((code, body, after)) = split_record(rest) {
-            match mcap::parse_record(code, body).ok()? {
+        while let Some((code, body, after)) = split(rest) {
+            match parse(code, body)? {
                 Record::ChunkIndex(index) => sealed.chunks.push(index),
                 Record::MetadataIndex(index) if index.name == "windhover" => {
                     let (_, body) = self.record(index.offset)?;
-                    if let Ok(Record::Metadata(m)) = mcap::parse_record(op::METADATA, &body) {
+                    if let Some(Record::Metadata(m)) = parse(op::METADATA, &body) {
                         sealed.metadata = m.metadata;
                     }
                 }
@@ -150,8 +147,8 @@ impl SegmentFile {
             }
             let bytes = self.read(start, chunk.message_index_length).ok()?;
             let mut rest = &bytes[..];
-            while let Some((code, body, after)) = split_record(rest) {
-                if let Ok(Record::MessageIndex(index)) = mcap::parse_record(code, body) {
+            while let Some((code, body, after)) = split(rest) {
+                if let Some(Record::MessageIndex(index)) = parse(code, body) {
                     let channel = sealed.definitions.channels.get(&index.channel_id)?;
                     let stats = topics.entry(channel.topic.clone()).or_default();
                     index.records.iter().for_each(|entry| stats.add(entry.log_time));
@@ -168,9 +165,9 @@ impl SegmentFile {
         if code != op::CHUNK {
             return None;
         }
-        match mcap::parse_record(code, &body).ok()? {
+        match parse(code, &body)? {
             Record::Chunk { header, data } if header.uncompressed_crc != 0 => {
-                let records = format::unpack_chunk(&header, &data)?;
+                let records = unpack_chunk(&header, &data)?;
                 Some((header, records))
             }
             _ => None,
@@ -242,7 +239,7 @@ impl SegmentFile {
                 salvage.head_whole = true;
                 return at;
             }
-            match parse_small(code, &body) {
+            match parse(code, &body) {
                 Some(Record::Attachment { header, data, .. }) if header.name == "config.toml" => {
                     let names = (&*header.name, &*header.media_type);
                     salvage.head.attachment(place, names, header.log_time, data.len() as u64);
@@ -290,7 +287,7 @@ impl SegmentFile {
         let mut at = chunk.offset + chunk.length;
         for (channel, entries) in &chunk.messages {
             let (code, body) = self.record(at)?;
-            match parse_small(code, &body)? {
+            match parse(code, &body)? {
                 Record::MessageIndex(index) if index.channel_id == *channel => {
                     let same = index.records.len() == entries.len()
                         && index.records.iter().zip(entries).all(|(a, b)| (a.log_time, a.offset) == *b);
@@ -312,26 +309,11 @@ impl SegmentFile {
     }
 }
 
-/// `mcap::parse_record`, which trusts an attachment to be longer than its checksum.
-fn parse_small(code: u8, body: &[u8]) -> Option<Record<'_>> {
-    if code == op::ATTACHMENT && body.len() < 36 {
-        return None;
-    }
-    mcap::parse_record(code, body).ok()
-}
-
-/// Op code, body and what follows the first record of `bytes`.
-pub fn split_record(bytes: &[u8]) -> Option<(u8, &[u8], &[u8])> {
-    let length = u64::from_le_bytes(bytes.get(1..RECORD_HEAD)?.try_into().ok()?);
-    let end = RECORD_HEAD.checked_add(usize::try_from(length).ok()?)?;
-    Some((bytes[0], bytes.get(RECORD_HEAD..end)?, &bytes[end..]))
-}
-
 /// Calls `visit` with each record of an unpacked chunk and its offset.
 pub fn for_each_record(records: &[u8], mut visit: impl FnMut(u64, Record<'_>)) {
     let mut rest = records;
-    while let Some((code, body, after)) = split_record(rest) {
-        if let Ok(record) = mcap::parse_record(code, body) {
+    while let Some((code, body, after)) = split(rest) {
+        if let Some(record) = parse(code, body) {
             visit((records.len() - rest.len()) as u64, record);
         }
         rest = after;
