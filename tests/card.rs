@@ -1,6 +1,10 @@
-//! The store on cards of its own: full, read-only, taken out, put back. A card is a tmpfs, which takes
-//! the right to mount; without it these tests say so and pass.
+//! The store on cards of its own: full, read-only, failing, taken out, put back, not permitted. A card is
+//! a tmpfs, or an ext4 on a loop device where it has to fail as devices do; both take the right to mount,
+//! and without it these tests say so and pass.
 
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::mpsc::Receiver;
@@ -12,7 +16,7 @@ use windhover::io::capture::CaptureReader;
 use windhover::io::clock::HostClock;
 use windhover::io::store::flight::{self, FLIGHTS};
 use windhover::io::store::volume::Volume;
-use windhover::io::store::{Recording, Store, StoreHandle, StoreNotice};
+use windhover::io::store::{Recording, Store, StoreHandle, StoreNotice, inspect};
 use windhover::msg::{Event, EventBody};
 use windhover::time::MonoTime;
 
@@ -106,6 +110,156 @@ fn heard(card: &Path) -> Vec<String> {
         .collect()
 }
 
+/// An ext4 on a loop device, on a file whose own file system can be filled: then writes that the card's
+/// file system had promised fail at the device, as those of worn flash do.
+struct FailingCard {
+    slot: Slot,
+    below: Slot,
+}
+
+impl FailingCard {
+    fn new() -> Option<Self> {
+        let (slot, below) = (Slot::new()?, Slot::new()?);
+        let card = Self { slot, below };
+        std::fs::File::create(card.image()).unwrap().set_len(96 << 20).unwrap();
+        let made = quietly(Command::new("mkfs.ext4").args(["-q", "-F", "-m", "1"]).arg(card.image()));
+        card.slot.take_out();
+        if !made || !card.put_in() {
+            println!("SKIPPED: no mkfs.ext4 or no loop device here");
+            return None;
+        }
+        Some(card)
+    }
+
+    fn image(&self) -> PathBuf {
+        self.below.path().join("card.img")
+    }
+
+    /// As the unit var-lib-windhover.mount does: checked, then mounted.
+    fn put_in(&self) -> bool {
+        quietly(Command::new("e2fsck").arg("-p").arg(self.image()));
+        let options = ["-o", "loop,noatime,nodev,nosuid,noexec,errors=remount-ro"];
+        let image = self.image();
+        quietly(Command::new("mount").args(options).arg(image).arg(self.slot.path()))
+    }
+
+    /// Lets everything fail that needs a block not written before.
+    fn fail(&self) {
+        let filled = std::fs::write(self.below.path().join("ballast"), vec![1; 128 << 20]);
+        assert!(filled.is_err(), "64 MB hold no 128");
+    }
+
+    fn mend(&self) {
+        std::fs::remove_file(self.below.path().join("ballast")).unwrap();
+    }
+
+    /// Waits until nothing uses the device any more: until then it is not out.
+    fn let_go(&self) {
+        for _ in 0..300 {
+            let used = Command::new("losetup").arg("-j").arg(self.image()).output().unwrap();
+            if used.stdout.is_empty() {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
+        panic!("the store holds on to a card that was taken out");
+    }
+}
+
+impl Drop for FailingCard {
+    fn drop(&mut self) {
+        // The loop device goes before what it lies on.
+        while quietly(Command::new("umount").arg("-l").arg(self.slot.path())) {}
+    }
+}
+
+#[test]
+fn a_device_that_refuses_writes_stops_recording_and_the_same_card_comes_back() {
+    let Some(device) = FailingCard::new() else { return };
+    let (card, clock) = (device.slot.path(), HostClock::start());
+    let (store, notices) = start(&card, clock);
+    let handle = store.handle();
+    expect(&notices, "recording_started");
+    expect(&notices, "index_ready");
+    say(&handle, clock.now(), "before");
+    let acknowledged = handle.status().last_commit_ns;
+    while handle.status().last_commit_ns == acknowledged {
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    device.fail();
+    // Bytes that do not pack, until one write has come to a block that is not there.
+    let mut noise = 1u64;
+    let stopped = loop {
+        let words = std::iter::repeat_with(|| {
+            noise = noise.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            noise.to_le_bytes()
+        });
+        let bytes: Vec<u8> = words.take(16 << 10).flatten().collect();
+        handle.event(&Event { t_recv: clock.now(), seq: 0, body: EventBody::CompassBytes(bytes) });
+        match notices.recv_timeout(Duration::from_millis(50)) {
+            Ok(notice) if notice.name() == "recording_stopped" => break notice.to_string(),
+            _ => {}
+        }
+    };
+    assert!(stopped.contains("NOT RECORDING"), "{stopped}");
+    // Which of them depends on what the file system was writing when the device refused.
+    let refusals = ["Input/output error", "No space left on device", "Read-only file system"];
+    assert!(refusals.iter().any(|words| stopped.contains(words)), "{stopped}");
+    let (free, _) = Volume::new(&card).space().unwrap();
+    assert!(free > 20 << 20, "the card's own file system has room: {free} bytes");
+    say(&handle, clock.now(), "meanwhile");
+    // The pilot takes it out, cleans its contacts, and puts it back.
+    device.slot.take_out();
+    device.let_go();
+    device.mend();
+    assert!(device.put_in());
+    while handle.status().recording != Recording::On {
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    say(&handle, clock.now(), "after");
+    store.stop();
+    let heard = heard(&card);
+    assert!(heard.contains(&"before".to_owned()) && heard.contains(&"after".to_owned()), "{heard:?}");
+    let (flights, errors) = inspect::list(&card).unwrap();
+    assert!(errors.is_empty() && !flights.is_empty(), "{errors:?}");
+}
+
+/// The store as somebody else runs it: root may write everywhere.
+#[test]
+fn a_card_of_somebody_else_is_told_and_used_once_it_is_handed_over() {
+    let Some(slot) = Slot::new() else { return };
+    let tests = std::env::current_exe().unwrap();
+    let built = tests.parent().and_then(Path::parent).unwrap().join("examples/store_load");
+    if !built.exists() {
+        println!("SKIPPED: {} is not built (cargo build --example store_load)", built.display());
+        return;
+    }
+    // Where nobody may look and execute.
+    std::fs::set_permissions(slot.0.path(), Permissions::from_mode(0o755)).unwrap();
+    let program = slot.0.path().join("store_load");
+    std::fs::copy(built, &program).unwrap();
+    std::fs::set_permissions(slot.path(), Permissions::from_mode(0o700)).unwrap();
+    const NOBODY: u32 = 65_534;
+    let child = Command::new(&program)
+        .arg(slot.path())
+        .args(["--seconds", "8", "--fps", "0", "--floor-mb", "8"])
+        .uid(NOBODY)
+        .gid(NOBODY)
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    std::thread::sleep(Duration::from_secs(3));
+    assert_eq!(std::fs::read_dir(slot.path()).unwrap().count(), 0);
+    // What windhover-card.service does after a mount.
+    std::os::unix::fs::chown(slot.path(), Some(NOBODY), Some(NOBODY)).unwrap();
+    let output = child.wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&output.stdout);
+    let stopped = said.lines().find(|l| l.starts_with("recording_stopped")).expect(&said);
+    assert!(stopped.contains("Permission denied"), "{stopped}");
+    assert!(said.contains("recording_resumed"), "{said}");
+    assert!(!heard(&slot.path()).is_empty(), "{said}");
+}
+
 #[test]
 fn a_full_card_stops_recording_until_space_appears() {
     let Some(slot) = Slot::new() else { return };
@@ -114,6 +268,7 @@ fn a_full_card_stops_recording_until_space_appears() {
     let handle = store.handle();
     expect(&notices, "recording_started");
     say(&handle, clock.now(), "before");
+    handle.put_state("warm", vec![1]);
     // Something else fills the card to the last page.
     let ballast = card.join("ballast");
     let filled = std::fs::write(&ballast, vec![1; 128 << 20]);
@@ -125,9 +280,14 @@ fn a_full_card_stops_recording_until_space_appears() {
     expect(&notices, "recording_resumed");
     say(&handle, clock.now(), "after");
     expect(&notices, "recording_dropout");
+    handle.put_state("warm", vec![2]);
     store.stop();
     assert_eq!(flight::flight_names(&card).unwrap().len(), 1, "the same flight goes on");
     assert_eq!(heard(&card), ["before", "after"]);
+    // What a restart finds is what the flight learnt last, after it went on.
+    let (store, _) = start(&card, clock);
+    assert_eq!(store.handle().state("warm", Duration::from_secs(30)), Some(vec![2]));
+    store.stop();
 }
 
 #[test]

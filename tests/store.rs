@@ -77,7 +77,8 @@ fn the_command_line_tends_flights() {
     let shown = stdout(&windhover(root, &["show", "boot-1", "--json"]));
     let shown: serde_json::Value = serde_json::from_str(&shown).unwrap();
     assert_eq!((shown["estimates"].as_u64(), shown["closed"].as_bool()), (Some(30), Some(true)));
-    stdout(&windhover(root, &["show", "boot-2"]));
+    let shown = stdout(&windhover(root, &["show", "boot-2"]));
+    assert!(shown.contains(" 10000 cycles lasts") && shown.contains("100000 cycles lasts"), "{shown}");
     stdout(&windhover(root, &["rebuild"]));
     let verified = windhover(root, &["verify"]);
     assert!(verified.status.success(), "{}", String::from_utf8_lossy(&verified.stdout));

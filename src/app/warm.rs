@@ -134,6 +134,9 @@ pub fn wait_for(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::StoreConfig;
+    use crate::io::store::Store;
+    use crate::io::store::volume::Volume;
     use crate::msg::{WarmArrival, WarmSite};
 
     fn origin() -> Origin {
@@ -166,6 +169,38 @@ mod tests {
         assert_eq!(age, Span::from_s(3.0));
         assert_eq!(taken.arrivals[0].t_ns, at(1999.0 + year).ns());
         assert_eq!(taken.arrivals[0].offset_ns, at(1500.0 + year).ns());
+    }
+
+    /// The card outlives the boot, the clock does not: it begins anew, here at a minute.
+    #[test]
+    fn a_state_on_the_card_is_taken_by_the_next_run_of_this_boot_only() {
+        let dir = tempfile::tempdir().expect("a scratch directory");
+        let start = || {
+            let path = dir.path().display().to_string();
+            let config = StoreConfig { path, free_floor_mb: 0, free_target_mb: 0, ..StoreConfig::default() };
+            let volume = Volume::new(dir.path());
+            Store::start_on(volume, &config, String::new(), HostClock::start())
+        };
+        let kept = |store: &Store| store.handle().state(STATE, Duration::from_secs(30)).expect("it is kept");
+        let (store, _notices) = start();
+        save(&store.handle(), &origin(), at(1999.0), &state());
+        save(&store.handle(), &origin(), at(2000.0), &state());
+        store.stop();
+        let (store, _notices) = start();
+        let after_restart = kept(&store);
+        assert_eq!(origin().take_back(&after_restart, at(2003.0)), Ok((state(), Span::from_s(3.0))));
+        store.stop();
+        let (store, _notices) = start();
+        let booted =
+            Origin { boot_id: Some("c".into()), host_from_monotonic: Span::from_s(2940.0), ..origin() };
+        assert_eq!(booted.take_back(&kept(&store), at(3000.0)), Err(Stale::AnotherBoot));
+        // What this boot then learns is this boot's, and the old one's is gone.
+        save(&store.handle(), &booted, at(3001.0), &state());
+        store.stop();
+        let (store, _notices) = start();
+        assert_eq!(booted.take_back(&kept(&store), at(3004.0)).map(|(_, age)| age), Ok(Span::from_s(3.0)));
+        assert_eq!(origin().take_back(&kept(&store), at(2003.0)), Err(Stale::AnotherBoot));
+        store.stop();
     }
 
     #[test]

@@ -266,6 +266,10 @@ impl Recorder {
     }
 
     fn try_open(&mut self) -> StoreResult<()> {
+        if self.device.is_some() && self.volume.device().ok() != self.device {
+            // A file that stays open, the lock's too, keeps a card that was taken out busy.
+            self.lock = None;
+        }
         if self.settings.config.require_mount {
             require_mount(&self.volume)?;
         }
