@@ -268,3 +268,21 @@ fn json_has_the_fields_agreed() {
     assert_eq!(json["image"], "blank.png");
     assert!(json["ms"].as_f64().is_some() && json["detections"] == Value::Array(Vec::new()));
 }
+
+#[test]
+fn a_log_in_which_nothing_is_understood_is_an_error() {
+    let dir = scratch();
+    let noise: Vec<u8> = (0..20_000u32).map(|k| (k.wrapping_mul(2_654_435_761) >> 13) as u8).collect();
+    let logs: [(&str, &[u8]); 3] =
+        [("noise.log", &noise), ("empty.log", b""), ("text.log", b"dear diary,\r\ntoday we flew.\r\n")];
+    for (log, bytes) in logs {
+        std::fs::write(dir.path().join(log), bytes).expect("writable");
+        for device in ["gps", "compass"] {
+            let run = windhover(&["decode", device, log, "--json"], dir.path());
+            assert_eq!(run.status.code(), Some(1), "{device} {log}");
+            let said = said(&run);
+            assert!(said.contains(log) && said.contains("nothing in it is understood"), "{said}");
+            assert!(said.contains("0 used"), "the counts are told all the same: {said}");
+        }
+    }
+}

@@ -13,6 +13,8 @@ use crate::msg::{FixKind, GnssEpoch};
 use crate::time::{MonoTime, NS_PER_S, UtcTime};
 
 /// Decode a raw serial log: what the receiver or compass said, and what was refused.
+///
+/// A log in which nothing is understood is an error.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
   windhover decode gps gps.log
@@ -88,6 +90,13 @@ impl Format {
 
 pub(super) fn run(args: &Args) -> CliResult {
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
+    let (file, likely) = match &args.device {
+        Device::Gps(gps) => (&gps.file, "a GPS receiver's log, recorded at the right speed"),
+        Device::Compass(compass) if compass.format.is_some() => {
+            (&compass.file, "of the format that --format says")
+        }
+        Device::Compass(compass) => (&compass.file, "a compass's log, recorded at the right speed"),
+    };
     let counts = match &args.device {
         Device::Gps(gps) => {
             // One format today; the option is there so that scripts need not change with a second.
@@ -102,6 +111,12 @@ pub(super) fn run(args: &Args) -> CliResult {
     match counts {
         Ok(counts) => {
             eprintln!("{counts}");
+            if counts.understood_nothing() {
+                let file = file.display();
+                return Err(CliError::failed(format!(
+                    "{file}: nothing in it is understood: is it {likely}?"
+                )));
+            }
             Ok(())
         }
         // Whoever read the output has seen enough.

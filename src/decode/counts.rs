@@ -62,6 +62,12 @@ impl DecodeCounts {
         *self.refused.entry(why).or_insert(0) += 1;
     }
 
+    /// Whether nothing at all was a sound sentence or packet: bytes of another device, another speed
+    /// or another format.
+    pub const fn understood_nothing(&self) -> bool {
+        self.used == 0 && self.ignored == 0
+    }
+
     /// How often something was refused for this reason.
     pub fn refused(&self, why: Refusal) -> u64 {
         self.refused.get(&why).copied().unwrap_or(0)
