@@ -187,6 +187,7 @@ impl Brain<'_> {
             shown.health = Some(health.clone());
             shown.figures.clone()
         });
+        self.outlets.figures(figures.by_name());
         self.around.log.write(health::line(health, self.config, Some(&figures)));
         if let (Some(state), Some(store)) = (self.pipeline.warm_state(), self.outlets.slot().get()) {
             warm::save(&store, &self.origin, health.t, &state);

@@ -1,6 +1,7 @@
 //! The health line: everything an operator wants to see, once a second, on one line.
 
 use crate::config::{Config, LogLevel};
+use crate::io::records::DaemonFigures;
 use crate::msg::{FixKind, TrackStatus};
 use crate::pipeline::{Health, SourceHealth, TargetHealth};
 use crate::time::Span;
@@ -41,6 +42,39 @@ pub struct CardFigures {
     pub sync_p99: Option<Span>,
     /// Messages that could not be kept since the start.
     pub dropped: u64,
+}
+
+/// A figure by its name, and the decimals it is told with.
+type Number = (&'static str, Option<f64>, usize);
+
+impl Figures {
+    /// Latency, card, computer, in this order; nothing where it is not known.
+    fn numbers(&self) -> [Number; 9] {
+        let ms = |span: Option<Span>| span.map(|span| span.ms());
+        let dropped = (self.card.dropped > 0).then_some(self.card.dropped as f64);
+        [
+            ("latency_p50_ms", ms(self.latency_p50), 1),
+            ("latency_p99_ms", ms(self.latency_p99), 1),
+            ("card_free_mb", self.card.free_mb, 0),
+            ("card_sync_p99_ms", ms(self.card.sync_p99), 1),
+            ("card_dropped", dropped, 0),
+            ("temp_c", self.temperature_c, 1),
+            ("supply_v", self.voltage_v, 2),
+            ("cpu_pct", self.cpu_percent, 0),
+            ("mem_mb", self.memory_mb, 0),
+        ]
+    }
+
+    /// As the flight's health messages have them: figures and words by name.
+    pub fn by_name(&self) -> DaemonFigures {
+        let known = self.numbers().into_iter().filter_map(|(name, value, _)| Some((name.to_owned(), value?)));
+        let words = [("card", &self.card.state), ("link", &self.link)];
+        let said = words.into_iter().filter(|(_, word)| !word.is_empty());
+        DaemonFigures {
+            figures: known.collect(),
+            words: said.map(|(name, word)| (name.to_owned(), word.clone())).collect(),
+        }
+    }
 }
 
 /// The health line; `figures` where a daemon runs, none in replay.
@@ -110,36 +144,40 @@ fn of_target(line: Line, name: &str, target: &TargetHealth) -> Line {
 }
 
 fn of_daemon(mut line: Line, figures: &Figures) -> Line {
-    let span = |line: Line, name: &str, span: Option<Span>| match span {
-        Some(span) => line.figure(name, span.ms(), 1),
-        None => line,
+    let told = |line: Line, numbers: &[Number]| {
+        numbers.iter().fold(line, |line, (name, value, decimals)| match value {
+            Some(value) => line.figure(*name, *value, *decimals),
+            None => line,
+        })
     };
-    let figure = |line: Line, name: &str, value: Option<f64>, decimals| match value {
-        Some(value) => line.figure(name, value, decimals),
-        None => line,
-    };
-    line = span(line, "latency_p50_ms", figures.latency_p50);
-    line = span(line, "latency_p99_ms", figures.latency_p99);
+    let numbers = figures.numbers();
+    line = told(line, &numbers[..2]);
     if !figures.card.state.is_empty() {
         line = line.with("card", figures.card.state.as_str());
     }
-    line = figure(line, "card_free_mb", figures.card.free_mb, 0);
-    line = span(line, "card_sync_p99_ms", figures.card.sync_p99);
-    if figures.card.dropped > 0 {
-        line = line.count("card_dropped", figures.card.dropped);
-    }
+    line = told(line, &numbers[2..5]);
     if !figures.link.is_empty() {
         line = line.with("link", figures.link.as_str());
     }
-    line = figure(line, "temp_c", figures.temperature_c, 1);
-    line = figure(line, "supply_v", figures.voltage_v, 2);
-    line = figure(line, "cpu_pct", figures.cpu_percent, 0);
-    figure(line, "mem_mb", figures.memory_mb, 0)
+    told(line, &numbers[5..])
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_flight_gets_what_the_line_tells() {
+        let card = CardFigures { state: "ok".into(), free_mb: Some(812.0), ..CardFigures::default() };
+        let figures = Figures { card, latency_p99: Some(Span::from_ms(31.0)), ..Figures::default() };
+        let told = figures.by_name();
+        let numbers: Vec<(&str, f64)> = told.figures.iter().map(|(name, value)| (&**name, *value)).collect();
+        assert_eq!(numbers, [("card_free_mb", 812.0), ("latency_p99_ms", 31.0)]);
+        assert_eq!(told.words.iter().map(|(a, b)| (&**a, &**b)).collect::<Vec<_>>(), [("card", "ok")]);
+        let text =
+            of_daemon(Line::new(crate::time::MonoTime::default(), LogLevel::Info, "health"), &figures).text();
+        assert!(text.contains("latency_p99_ms=31.0 card=ok card_free_mb=812"), "{text}");
+    }
 
     #[test]
     fn a_silent_source_is_a_warning() {

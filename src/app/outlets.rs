@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::config::Config;
-use crate::io::records::{Record, Recorder};
+use crate::io::records::{DaemonFigures, Record, Recorder};
 use crate::msg::{Event, GnssEpoch, MarkerDetection, Stamped};
 use crate::pipeline::Output;
 use crate::time::{MonoTime, UtcTime};
@@ -59,6 +59,11 @@ impl Outlets {
             }
         }
         store.event(event);
+    }
+
+    /// What the next health messages tell of the daemon.
+    pub fn figures(&mut self, figures: DaemonFigures) {
+        self.recorder.figures = figures;
     }
 
     /// Keeps and sends an output that followed from what was heard at `t`.

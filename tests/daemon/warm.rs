@@ -82,8 +82,17 @@ fn a_restart_in_flight_tracks_within_two_seconds_and_replays() {
     let states: Vec<wh::WarmState> = of(&second, topic::WARM_START);
     assert_eq!(states.len(), 1, "what it continued from is in the flight");
 
-    // When the second flight is replayed, then the same is estimated.
+    // And how card and computer did is in the flight, and in its report.
     let flight = flights[1].to_string_lossy().into_owned();
+    let healths: Vec<wh::Health> = of(&second, topic::HEALTH);
+    let told = healths.last().expect("once a second");
+    assert!(told.figures["card_free_mb"] > 0.0 && told.figures["mem_mb"] > 0.0, "{:?}", told.figures);
+    assert!(told.words.contains_key("card"), "{:?}", told.words);
+    bench.command(&["report", &flight, "--out", "report.html"]);
+    let page = std::fs::read_to_string(bench.path("report.html")).expect("the report");
+    assert!(page.contains("card free mb") && page.contains("card sync p99 ms"), "card and link are reported");
+
+    // When the second flight is replayed, then the same is estimated.
     bench.command(&["replay", &flight, "--out", "again.mcap"]);
     let again = messages(&bench.path("again.mcap"));
     let rows = |flight: &[RawMessage]| -> Vec<wh::TargetState> { of(flight, &topic::target_state("ugv")) };

@@ -21,8 +21,8 @@ pub(super) fn section(context: &Context<'_>) -> Option<Section> {
     let mut body = String::new();
     if names.is_empty() {
         body += &paragraph(
-            "The health messages of this recording hold no figures of card or link: it was replayed, or \
-             flown without them.",
+            "The health messages of this recording hold no figures of card or link: it was not flown by a \
+             daemon.",
         );
     }
     let mut charts = String::new();
@@ -60,7 +60,7 @@ pub(super) fn notices(context: &Context<'_>) -> Option<Section> {
         return None;
     }
     let mut body = String::from(
-        "<div class=\"scroll\"><table><thead><tr><th>time s</th><th>what</th><th>words</th></tr></thead><tbody>",
+        "<div class=\"scroll\"><table><thead><tr><th>time s</th><th class=\"words\">what</th><th class=\"words\">in words</th></tr></thead><tbody>",
     );
     for n in notices.iter().take(MOST_NOTICES) {
         let class = match n.level() {
@@ -70,7 +70,7 @@ pub(super) fn notices(context: &Context<'_>) -> Option<Section> {
         };
         let _ = write!(
             body,
-            "<tr><td>{:.2}</td><td class=\"{class}\">{}</td><td class=\"words\">{}</td></tr>",
+            "<tr><td>{:.2}</td><td class=\"words {class}\">{}</td><td class=\"words\">{}</td></tr>",
             context.flight.at(n.timestamp.as_ref()),
             escape(&n.name.replace('_', " ")),
             escape(&n.message)

@@ -35,15 +35,17 @@ figure svg{min-width:310px}.wide svg{min-width:520px}figcaption{color:var(--soft
 .wide{margin-bottom:14px;max-width:900px}.scroll{overflow-x:auto}\
 table{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums;margin:8px 0 14px}\
 th,td{text-align:right;padding:4px 12px 4px 0;border-bottom:1px solid var(--grid);white-space:nowrap}\
-th{color:var(--soft);font-weight:500}th:first-child,td:first-child{text-align:left}td.words{text-align:left;white-space:normal}\
+th{color:var(--soft);font-weight:500}th:first-child,td:first-child{text-align:left}th.words,td.words{text-align:left}td.words{white-space:normal}\
 ul{margin:6px 0 12px;padding-left:20px}li{margin:3px 0;max-width:75ch}\
 .good{color:var(--green)}.warn{color:var(--orange)}.bad{color:var(--red)}\
 .picture{position:relative}.picture img,.picture svg{display:block;width:100%;height:auto;min-width:0}\
 .picture svg{position:absolute;inset:0}\
 pre{background:var(--panel);border:1px solid var(--rule);border-radius:8px;padding:12px;overflow-x:auto;font-size:.82rem}\
 summary{cursor:pointer;color:var(--soft)}footer{color:var(--soft);font-size:.85rem;padding-top:20px;padding-bottom:40px}\
-@media print{nav{display:none}body{font-size:11pt}section{break-inside:auto}figure,.tile,tr{break-inside:avoid}\
-details{display:none}.grid{grid-template-columns:1fr 1fr}}";
+@media print{nav,#configuration{display:none}body{font-size:10pt}header,main,footer{padding:0}\
+section{padding:16px 0 4px}h2,h3,thead,p:has(+.scroll){break-after:avoid}figure,.tile,tr{break-inside:avoid}\
+.scroll{overflow:visible}table{font-size:7.5pt}th,td{padding:2px 8px 2px 0}p,li{max-width:none}\
+.grid{grid-template-columns:1fr 1fr}.wide{max-width:560px}}";
 
 /// The whole page.
 pub(super) fn page(name: &str, sections: Vec<Section>) -> String {

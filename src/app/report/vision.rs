@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::frames::Pictures;
 use super::page::{Section, figure, grid, table};
 use super::sensors::quantile;
-use super::{Context, cloud, single};
+use super::{Context, cloud, line};
 use crate::io::proto::windhover as wh;
 use crate::plot::{Ink, Mark};
 
@@ -31,7 +31,10 @@ pub(super) fn section(context: &Context<'_>, pictures: &Pictures) -> Option<Sect
         .map(|d| [flight.at(d.timestamp.as_ref()), d.features.len() as f64])
         .collect();
     if features.iter().any(|p| p[1] > 0.0) {
-        charts += &single(context, "Ground features followed", "", &features, Ink::Orange);
+        let most = features.iter().map(|p| p[1]).fold(0.0, f64::max);
+        let mut chart = context.chart("Ground features followed", "").y_range(0.0, most + 1.0);
+        chart.mark(line(&features), Ink::Orange);
+        charts += &figure(&chart.render());
     }
     charts += &quality_charts(context, pictures);
     body += &grid(&charts);

@@ -7,7 +7,7 @@ pub mod topic;
 pub mod warm;
 
 pub use inputs::{encoding_of_raw, of_event};
-pub use outputs::{Recorder, detections, health, ownship, target_state};
+pub use outputs::{DaemonFigures, Recorder, detections, health, ownship, target_state};
 pub use schema::Schema;
 
 use std::borrow::Cow;

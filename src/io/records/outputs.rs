@@ -1,5 +1,7 @@
 //! Outputs as records: our own messages, and Foxglove's where a schema exists.
 
+use std::collections::BTreeMap;
+
 use nalgebra::{UnitQuaternion, Vector3};
 use prost::Message;
 use prost_types::Timestamp;
@@ -15,16 +17,27 @@ use crate::msg::{
 use crate::pipeline::{Health, Notice, NoticeKind, Output, SourceHealth};
 use crate::time::MonoTime;
 
+/// What only a daemon knows of itself (card, link, computer), by name.
+#[derive(Clone, Default, PartialEq, Debug)]
+pub struct DaemonFigures {
+    /// Figures; the name tells the unit.
+    pub figures: BTreeMap<String, f64>,
+    /// States in a word.
+    pub words: BTreeMap<String, String>,
+}
+
 /// Turns outputs into records.
 pub struct Recorder {
     config: Config,
     datum_height_m: f64,
+    /// What the next health message tells of the daemon.
+    pub figures: DaemonFigures,
 }
 
 impl Recorder {
     /// For outputs of a pipeline with this configuration.
     pub fn new(config: &Config) -> Self {
-        Self { config: config.clone(), datum_height_m: 0.0 }
+        Self { config: config.clone(), datum_height_m: 0.0, figures: DaemonFigures::default() }
     }
 
     /// Records that every file begins with: intrinsics and the camera's mount.
@@ -85,7 +98,9 @@ impl Recorder {
                 out.push(record(topic::LOG.into(), Schema::Log, log, notice.t, &log_message(notice)));
             }
             Output::Health(now) => {
-                let message = health(now, &self.config);
+                let mut message = health(now, &self.config);
+                message.figures.extend(self.figures.figures.clone());
+                message.words.extend(self.figures.words.clone());
                 out.push(record(topic::HEALTH.into(), Schema::Health, log, now.t, &message));
             }
         }
