@@ -106,6 +106,22 @@ impl State {
         BASE + PER_MARKER * self.markers.len()
     }
 
+    /// How the state changes as everything turns about the vertical, per radian, but for what is constant.
+    fn turning(&self) -> DVector<f64> {
+        let mut out = DVector::zeros(self.size());
+        let mut put = |at: usize, v: &Vector3<f64>| {
+            out[at] = -v.y;
+            out[at + 1] = v.x;
+        };
+        put(0, &self.position);
+        put(3, &self.velocity);
+        put(6, &self.acceleration);
+        for (k, marker) in self.markers.iter().enumerate() {
+            put(BASE + PER_MARKER * k, &marker.center);
+        }
+        out
+    }
+
     /// `body_from_camera` with the estimated mounting angles.
     fn body_from_camera(&self, config: &Config) -> Rotation3<f64> {
         let [yaw, pitch, roll, ..] = self.parameters;
@@ -249,13 +265,26 @@ impl<'a> Filter<'a> {
             return false;
         }
         let change = &ph * weighted;
+        let turning = self.state.turning();
         for axis in 0..n {
             self.state.add(axis, change[axis]);
         }
         let mut p = &self.covariance - &ph * chol.solve(&ph.transpose());
         p = (&p + p.transpose()) * 0.5;
         self.covariance = p;
+        self.shear(&(self.state.turning() - turning));
         true
+    }
+
+    /// Pixels tell nothing of a turn of everything about the vertical. What earlier ones told was worked
+    /// out where the state then was; as the state moves, the direction they left open moves with it
+    /// (`P ← T P Tᵀ`, `T = I + d eᵀ`, `e` the yaw). Without this the filter believes to know a yaw that
+    /// nothing told it.
+    fn shear(&mut self, d: &DVector<f64>) {
+        let yaw = ATTITUDE + 2;
+        let column = self.covariance.column(yaw).into_owned();
+        let variance = column[yaw];
+        self.covariance += d * column.transpose() + &column * d.transpose() + d * d.transpose() * variance;
     }
 
     /// GPS position in NED: the antenna's, with the slow bias, late by the GPS parameter.

@@ -4,7 +4,7 @@ use nalgebra::Vector2;
 
 use super::grid::{Grid, extent, grids};
 use super::saddle::{FloatImage, saddles};
-use super::subpixel::refine;
+use super::subpixel::{Window, refine};
 use crate::msg::ImageView;
 
 /// Why an image gave no board.
@@ -55,11 +55,11 @@ const ATTEMPTS: [(f64, f64); 4] = [(1.4, 4.5), (2.2, 6.5), (1.0, 3.2), (0.8, 2.4
 const MOST_GRIDS: usize = 4;
 /// A corner is looked for at no more than this many pixels across; larger images are halved first.
 const COARSE_PX: usize = 1_000;
-/// Half the window of exact placement: this share of the distance to the nearest neighbour.
+/// A corner moves less than this share of the distance to the nearest neighbour when it is placed.
 const REACH_SHARE: f64 = 0.5;
 /// Half the window of exact placement unless told otherwise, pixels: what OpenCV's calibration
-/// programs use, so that figures can be compared. A window never reaches more than half-way to the
-/// next corner; a smaller one is better where squares are small and slanted.
+/// programs use, so that figures can be compared. Where squares are small or seen slantwise only the
+/// part of the window is used that lies nearer to the corner's own edges than to the next ones.
 pub const WINDOW_PX: f64 = 11.0;
 
 /// The `columns × rows` inner corners, row by row, exact to a fraction of a pixel; `None` for the few
@@ -191,10 +191,14 @@ fn place(full: &FloatImage, corners: Corners, columns: usize, window_px: f64) ->
         .map(|k| {
             let start = corners[k]?;
             let half_way = REACH_SHARE * to_nearest(&corners, columns, k);
-            let reach = half_way.min(window_px).min(full.to_border(start) - 2.0);
+            let room = window_px.min(full.to_border(start) - 2.0);
+            let window = match (to_next(&corners, columns, k, 1), to_next(&corners, columns, k, columns)) {
+                (Some(along), Some(across)) => Window::square(room).within(along, across),
+                _ => Window::square(room.min(half_way)),
+            };
             // Half a square aside is another corner.
             let close = |p: &Vector2<f64>| (p - start).norm() < half_way;
-            (reach >= 2.0).then(|| refine(full, start, reach)).flatten().filter(close)
+            (room.min(half_way) >= 2.0).then(|| refine(full, start, window)).flatten().filter(close)
         })
         .collect();
     let placed = without_strays(placed, columns);
@@ -233,6 +237,16 @@ fn without_strays(corners: Corners, columns: usize) -> Corners {
         }
     };
     (0..corners.len()).map(|k| corners[k].filter(|p| stays(k, *p))).collect()
+}
+
+/// From a corner to the next one along its row (`step` 1) or column (`step` the number of columns), the
+/// nearer of the two there are.
+fn to_next(corners: &Corners, columns: usize, k: usize, step: usize) -> Option<Vector2<f64>> {
+    let own = corners[k]?;
+    let same_row = |n: &usize| step != 1 || n / columns == k / columns;
+    let neighbours = [k.checked_sub(step), Some(k + step)].into_iter().flatten().filter(same_row);
+    let found = neighbours.filter_map(|n| Some(corners.get(n).copied().flatten()? - own));
+    found.min_by(|a, b| a.norm().total_cmp(&b.norm()))
 }
 
 /// Distance from a corner to the nearest known neighbour.

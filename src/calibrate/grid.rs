@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, VecDeque};
 use nalgebra::Vector2;
 
 use super::saddle::{FloatImage, Saddle};
+use super::subpixel::{Window, refine};
 use crate::geo::wrap_angle;
 
 /// Cell of a grid: (column, row), any origin.
@@ -161,7 +162,7 @@ fn fill(blurred: &FloatImage, grid: &mut Grid, radius: f64) {
         for cell in wanted {
             let Some((expected, spacing)) = continuation(grid, cell) else { continue };
             let reach = (0.3 * spacing).max(2.0);
-            let Some(px) = super::subpixel::refine(blurred, expected, reach.min(8.0)) else { continue };
+            let Some(px) = refine(blurred, expected, Window::square(reach.min(8.0))) else { continue };
             let close = (px - expected).norm() < 0.3 * spacing;
             if close && Saddle::at(blurred, px, radius.min(0.45 * spacing).max(2.0)).is_some() {
                 grid.insert(cell, px);

@@ -31,8 +31,8 @@ pub(super) struct Args {
     images: Vec<PathBuf>,
     #[command(flatten)]
     target: TargetArgs,
-    /// Half the window in which a chessboard's corner is placed, pixels; never more than half-way to the next
-    /// corner. The default is what OpenCV's calibration uses; smaller suits small or slanted squares
+    /// Half the window in which a chessboard's corner is placed, pixels; of it only what is nearer to the
+    /// corner's own edges than to the next ones is used. The default is what OpenCV's calibration uses
     #[arg(long, value_name = "PX", value_parser = positive, default_value_t = WINDOW_PX)]
     window: f64,
     /// Keep the third radial term at zero
