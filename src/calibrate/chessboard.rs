@@ -58,8 +58,8 @@ const COARSE_PX: usize = 1_000;
 /// A corner moves less than this share of the distance to the nearest neighbour when it is placed.
 const REACH_SHARE: f64 = 0.5;
 /// Half the window of exact placement unless told otherwise, pixels: what OpenCV's calibration
-/// programs use, so that figures can be compared. Where squares are small or seen slantwise only the
-/// part of the window is used that lies nearer to the corner's own edges than to the next ones.
+/// programs use, so that figures can be compared. Where it would reach more than half-way to the next
+/// corner, only the part is used that lies nearer to the corner's own edges than to the next ones.
 pub const WINDOW_PX: f64 = 11.0;
 
 /// The `columns × rows` inner corners, row by row, exact to a fraction of a pixel; `None` for the few
@@ -192,9 +192,11 @@ fn place(full: &FloatImage, corners: Corners, columns: usize, window_px: f64) ->
             let start = corners[k]?;
             let half_way = REACH_SHARE * to_nearest(&corners, columns, k);
             let room = window_px.min(full.to_border(start) - 2.0);
-            let window = match (to_next(&corners, columns, k, 1), to_next(&corners, columns, k, columns)) {
-                (Some(along), Some(across)) => Window::square(room).within(along, across),
-                _ => Window::square(room.min(half_way)),
+            let next = to_next(&corners, columns, k, 1).zip(to_next(&corners, columns, k, columns));
+            let window = match next {
+                _ if room <= half_way => Window::square(room),
+                Some((along, across)) => Window::square(room).within(along, across),
+                None => Window::square(half_way),
             };
             // Half a square aside is another corner.
             let close = |p: &Vector2<f64>| (p - start).norm() < half_way;
