@@ -174,6 +174,17 @@ impl Task<'_> {
         tokio::time::sleep(ROUND).await;
     }
 
+    /// Waits for what takes as long as the card does, showing life meanwhile.
+    async fn while_beating<T>(&self, work: impl Future<Output = T>) -> T {
+        let mut work = std::pin::pin!(work);
+        loop {
+            tokio::select! {
+                done = &mut work => return done,
+                () = self.round() => {}
+            }
+        }
+    }
+
     /// Looks round for a while, or until the end is asked for.
     async fn wait(&self, length: Span) {
         let end = self.around.clock.now() + length;
@@ -200,7 +211,7 @@ impl Task<'_> {
         }
         if let Some(store) = self.slot.get() {
             let opening = tokio::task::spawn_blocking(move || StoreBacklog::open(store));
-            if let Ok((backlog, run, flight)) = opening.await {
+            if let Ok((backlog, run, flight)) = self.while_beating(opening).await {
                 return (Some(Arc::new(backlog)), run, flight);
             }
         }

@@ -16,6 +16,10 @@ const READS: usize = 8192;
 ///
 /// Events leave it in the order they were heard, numbered, and with times that never go back: what
 /// the pipeline handles is what is recorded, so a recording replays to the same estimates.
+///
+/// A pipeline that is busy with a frame finds the newest ones when it comes back. From then on the oldest of
+/// these stays: were it replaced while the reads before it are handled, a pipeline that is behind on reads
+/// would never see a frame.
 #[derive(Debug)]
 pub struct Inbox {
     lanes: Mutex<Lanes>,
@@ -27,6 +31,10 @@ pub struct Inbox {
 struct Lanes {
     reads: VecDeque<(MonoTime, EventBody)>,
     frames: VecDeque<(MonoTime, RawFrame)>,
+    /// Whether the oldest frame is the next one, once the reads before it are handled.
+    pinned: bool,
+    /// Whether lost frames were told since the last frame.
+    told: bool,
     dropped: [u32; 3],
     last: Option<MonoTime>,
     next_seq: u64,
@@ -63,14 +71,15 @@ impl Inbox {
         self.filled.notify_one();
     }
 
-    /// Puts in a frame; where too many wait, the oldest goes.
+    /// Puts in a frame; where too many wait, the oldest goes that is not the next one.
     pub fn put_frame(&self, t_recv: MonoTime, frame: RawFrame) {
         let mut lanes = self.lock();
-        if lanes.frames.len() >= self.frames {
-            lanes.frames.pop_front();
+        lanes.frames.push_back((t_recv, frame));
+        if lanes.frames.len() > self.frames {
+            let goes = usize::from(lanes.pinned);
+            lanes.frames.remove(goes);
             lanes.dropped[slot(Source::Camera)] += 1;
         }
-        lanes.frames.push_back((t_recv, frame));
         drop(lanes);
         self.filled.notify_one();
     }
@@ -113,13 +122,19 @@ impl Lanes {
         let read = self.reads.front().map(|(t, _)| *t);
         let frame = self.frames.front().map(|(t, _)| *t);
         let earliest = read.into_iter().chain(frame).min()?;
-        // What was lost is told first: it was older than what is still here.
-        if let Some(lost) = (0..SOURCES.len()).find(|&i| self.dropped[i] > 0) {
+        let frame_is_next = frame.is_some_and(|t| read.is_none_or(|read| t < read));
+        self.pinned = frame.is_some();
+        // What was lost is told before what is still here; frames with the next one, not one by one.
+        let frames_due = frame.is_none() || (frame_is_next && !self.told);
+        let due = |source: Source| source != Source::Camera || frames_due;
+        if let Some(lost) = (0..SOURCES.len()).find(|&i| self.dropped[i] > 0 && due(SOURCES[i])) {
             let count = std::mem::take(&mut self.dropped[lost]);
+            self.told |= SOURCES[lost] == Source::Camera;
             return Some(self.number(earliest, EventBody::Dropped { source: SOURCES[lost], count }));
         }
-        if frame.is_some_and(|t| read.is_none_or(|read| t < read)) {
+        if frame_is_next {
             let (t, frame) = self.frames.pop_front()?;
+            (self.pinned, self.told) = (false, false);
             let payload = self.payload(frame);
             return Some(self.number(t, EventBody::Frame(payload)));
         }
@@ -213,6 +228,25 @@ mod tests {
             })
             .collect();
         assert_eq!(kept, [(0, 40), (1, 50)]);
+    }
+
+    #[test]
+    fn a_pipeline_behind_on_reads_still_sees_frames() {
+        // Given a pipeline that takes one read in the time of a frame, three reads behind.
+        let inbox = Inbox::new(2);
+        for ms in [0, 10, 20] {
+            inbox.put(at(ms), EventBody::CompassBytes(vec![0]));
+        }
+        let mut taken = Vec::new();
+        for ms in (30..300).step_by(10) {
+            inbox.put_frame(at(ms), frame(ms));
+            inbox.put(at(ms + 1), EventBody::CompassBytes(vec![0]));
+            taken.extend(inbox.take(Duration::ZERO));
+        }
+        // Then it comes to a frame all the same, and what was lost is told with it, once.
+        let frames = taken.iter().filter(|e| matches!(e.body, EventBody::Frame(_))).count();
+        let told = taken.iter().filter(|e| matches!(e.body, EventBody::Dropped { .. })).count();
+        assert!(frames >= 5 && told <= frames, "{frames} frames, {told} times told of lost ones: {taken:?}");
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use crate::config::Config;
 
 /// Keys that change in flight. A table's name stands for all its keys.
-const CHANGEABLE: [&str; 8] = [
+const CHANGEABLE: [&str; 9] = [
     "log.level",
     "daemon.answer_within_s",
     "daemon.optional",
@@ -14,6 +14,7 @@ const CHANGEABLE: [&str; 8] = [
     "power.hot_c",
     "power.voltage_file",
     "power.going_file",
+    "power.going_line",
 ];
 
 /// Keys that differ between two configurations.
@@ -57,6 +58,7 @@ pub fn merged(running: &Config, read: &Config) -> Config {
     merged.power.hot_c = read.power.hot_c;
     merged.power.voltage_file.clone_from(&read.power.voltage_file);
     merged.power.going_file.clone_from(&read.power.going_file);
+    merged.power.going_line.clone_from(&read.power.going_line);
     merged
 }
 

@@ -26,6 +26,9 @@ pub enum RunError {
     /// A task panicked; the service manager starts the daemon again.
     #[error("task {0} failed; see the log")]
     TaskFailed(&'static str),
+    /// The card took longer than there was time for.
+    #[error("the card is too slow: the end of the flight is not on it; the next start seals what is")]
+    NotWritten,
 }
 
 /// How often the health task looks round.
@@ -33,6 +36,10 @@ const ROUND: Duration = Duration::from_millis(250);
 
 /// Longest the tasks get to end; with the store's flush inside, well under two seconds.
 const ENDING: Duration = Duration::from_millis(1_600);
+
+/// Longest a slow card gets on top of that to take the end of the flight; together less than the unit's
+/// `TimeoutStopSec`.
+const WRITING: Duration = Duration::from_millis(2_400);
 
 /// Runs until asked to end.
 pub fn run(config_path: &Path) -> Result<(), RunError> {
@@ -103,16 +110,21 @@ async fn daemon(path: PathBuf, config: Config, clock: HostClock, log: &Log) -> R
             },
         }
     };
-    end(watch.into_graph(), log, why);
-    result
+    let written = end(watch.into_graph(), log, why);
+    result.and(if written { Ok(()) } else { Err(RunError::NotWritten) })
 }
 
-/// Ends the tasks: devices first, then what waits is handled, then the card is flushed.
-fn end(mut graph: Graph, log: &Log, why: &str) {
+/// Ends the tasks: devices first, then what waits is handled, then the card is flushed; whether it was.
+fn end(mut graph: Graph, log: &Log, why: &str) -> bool {
     ServiceManager.stopping(&format!("stopping: {why}"));
     log.tell(Event::Stopping, "", why);
     graph.around.stop.ask();
-    for late in graph.tasks.join(ENDING) {
-        log.tell(Event::TaskSilent, late, "did not end in time");
+    let mut late = graph.tasks.join(ENDING);
+    if late.contains(&topology::STORE.name) {
+        late = graph.tasks.join(WRITING);
     }
+    for task in &late {
+        log.tell(Event::TaskSilent, task, "did not end in time");
+    }
+    !late.contains(&topology::STORE.name)
 }

@@ -13,6 +13,7 @@ use crate::config::Config;
 use crate::io::clock::HostClock;
 use crate::io::notify::ServiceManager;
 use crate::io::power::{PowerReader, PowerState, PowerWatch};
+use crate::io::power_line::PowerLine;
 use crate::io::process;
 use crate::time::{MonoTime, Span};
 
@@ -26,6 +27,7 @@ pub(super) struct Watch {
     missing: String,
     silent: BTreeSet<&'static str>,
     power: PowerReader,
+    power_line: Option<PowerLine>,
     power_watch: PowerWatch,
     power_state: PowerState,
     second: Option<MonoTime>,
@@ -46,6 +48,7 @@ impl Watch {
             missing: String::new(),
             silent: BTreeSet::new(),
             power,
+            power_line: config.power.going_line.clone().map(PowerLine::new),
             power_watch,
             power_state: PowerState::Good,
             second: None,
@@ -112,7 +115,8 @@ impl Watch {
     }
 
     fn each_second(&mut self, since: Option<Span>) {
-        let reading = self.power.read();
+        let mut reading = self.power.read();
+        reading.line_set |= self.power_line();
         let used = HostClock::processor_time();
         let share = since.map(|since| (used - self.processor).s() / since.s() * 100.0);
         self.processor = used;
@@ -143,6 +147,24 @@ impl Watch {
             }
         }
         self.status();
+    }
+
+    /// Whether the GPIO line that tells of power going is active; one that cannot be read is told.
+    fn power_line(&mut self) -> bool {
+        let Some(line) = &mut self.power_line else { return false };
+        let log = &self.graph.around.log;
+        match line.read() {
+            Ok(reading) => {
+                if reading.opened {
+                    log.tell(Event::DeviceUp, "power_line", "read once a second");
+                }
+                reading.set
+            }
+            Err(fault) => {
+                log.tell(Event::DeviceDown, "power_line", fault.to_string());
+                false
+            }
+        }
     }
 
     /// One line for `systemctl status`.
@@ -189,6 +211,9 @@ impl Watch {
                 self.config = reload::merged(&self.config, &read);
                 log.set_level(self.config.log.level);
                 (self.power, self.power_watch) = power(&self.config);
+                // The old request ends first: a line is given to one reader.
+                self.power_line = None;
+                self.power_line = self.config.power.going_line.clone().map(PowerLine::new);
             }
         }
         if self.ready {

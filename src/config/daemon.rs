@@ -68,10 +68,26 @@ pub struct PowerConfig {
     /// value of a GPIO line in sysfs, or the flag a UPS program sets (POWERDOWNFLAG of NUT).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub going_file: Option<String>,
+    /// A GPIO line that tells at once that power is going, by its chip's character device.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub going_line: Option<GoingLine>,
     /// Temperature above which the health line is a warning, degrees Celsius.
     pub hot_c: f64,
     /// Where sysfs is.
     pub sysfs: String,
+}
+
+/// A GPIO line.
+#[derive(Clone, PartialEq, Eq, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GoingLine {
+    /// Its chip, for example `/dev/gpiochip0`.
+    pub chip: String,
+    /// Its number on the chip, as `gpioinfo` shows it.
+    pub line: u32,
+    /// Whether a low level means that power is going.
+    #[serde(default)]
+    pub active_low: bool,
 }
 
 impl Default for PowerConfig {
@@ -81,6 +97,7 @@ impl Default for PowerConfig {
             on_mains_off: false,
             voltage_file: None,
             going_file: None,
+            going_line: None,
             hot_c: 85.0,
             sysfs: "/sys".into(),
         }

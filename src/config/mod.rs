@@ -14,7 +14,7 @@ mod store;
 mod target;
 
 pub use check::ConfigError;
-pub use daemon::{DaemonConfig, Part, PowerConfig};
+pub use daemon::{DaemonConfig, GoingLine, Part, PowerConfig};
 pub use estimator::{DetectorConfig, EstimatorConfig};
 pub use link::{LinkConfig, MavlinkConfig};
 pub use log::{LogConfig, LogFormat, LogLevel};

@@ -11,6 +11,7 @@ pub mod mcap_record;
 pub mod mcap_write;
 pub mod notify;
 pub mod power;
+pub mod power_line;
 pub mod pps;
 pub mod process;
 pub mod proto;

@@ -1,7 +1,7 @@
 //! A running `windhover run`: its configuration, its lines over pseudo-terminals, its log.
 
 use std::fs::File;
-use std::io::Write;
+use std::io::{Read, Write};
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use tempfile::TempDir;
@@ -47,6 +48,11 @@ impl Line {
         self.far = Some(File::from(far));
     }
 
+    /// The far end once more, for a device that listens too.
+    pub fn far_end(&self) -> File {
+        self.far.as_ref().expect("plugged").try_clone().expect("a second handle")
+    }
+
     /// Takes the line away.
     pub fn unplug(&mut self) {
         let _ = std::fs::remove_file(&self.link);
@@ -70,6 +76,7 @@ pub fn sentence(body: &str) -> String {
 /// A hovering helicopter's receiver and compass, at the real pace, on two lines that can be shared.
 pub struct Feeder {
     stop: Arc<AtomicBool>,
+    sky: Arc<AtomicBool>,
     thread: Option<JoinHandle<(Line, Line)>>,
 }
 
@@ -80,13 +87,14 @@ impl Feeder {
 
     /// The same at a height above sea level; the bench's ground is at 33 m.
     pub fn at_height(mut gps: Line, mut compass: Line, alt_msl_m: f64) -> Self {
-        let stop = Arc::new(AtomicBool::new(false));
-        let asked = stop.clone();
+        let (stop, sky) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(true)));
+        let (asked, seen) = (stop.clone(), sky.clone());
         let thread = std::thread::spawn(move || {
             let mut n = 0u32;
             while !asked.load(Ordering::Acquire) {
                 if n.is_multiple_of(4) {
-                    gps.send(epoch(n / 4, alt_msl_m).as_bytes());
+                    let height = seen.load(Ordering::Acquire).then_some(alt_msl_m);
+                    gps.send(epoch(n / 4, height).as_bytes());
                 }
                 compass.send(sentence("C123.4P-0.5R0.3T21.0").as_bytes());
                 n += 1;
@@ -94,7 +102,12 @@ impl Feeder {
             }
             (gps, compass)
         });
-        Self { stop, thread: Some(thread) }
+        Self { stop, sky, thread: Some(thread) }
+    }
+
+    /// Whether the receiver sees satellites.
+    pub fn sky(&self, open: bool) {
+        self.sky.store(open, Ordering::Release);
     }
 
     /// Ends feeding and gives the lines back.
@@ -104,14 +117,67 @@ impl Feeder {
     }
 }
 
-/// One epoch of a 5 Hz receiver over Lisbon.
-fn epoch(n: u32, alt_msl_m: f64) -> String {
+/// One epoch of a 5 Hz receiver over Lisbon; without a fix where there is no height.
+fn epoch(n: u32, alt_msl_m: Option<f64>) -> String {
     let (seconds, tenths) = (n / 5, n % 5 * 2);
     let time = format!("1504{:02}.{tenths}", seconds % 60);
-    let rmc = sentence(&format!("GPRMC,{time},A,3842.20000,N,00911.00000,W,000.0,000.0,181126,003.4,W"));
-    let gga =
-        sentence(&format!("GPGGA,{time},3842.20000,N,00911.00000,W,1,09,0.9,{alt_msl_m:.1},M,50.0,M,,"));
-    rmc + &gga
+    let (rmc, gga) = match alt_msl_m {
+        Some(alt) => (
+            format!("GPRMC,{time},A,3842.20000,N,00911.00000,W,000.0,000.0,181126,003.4,W"),
+            format!("GPGGA,{time},3842.20000,N,00911.00000,W,1,09,0.9,{alt:.1},M,50.0,M,,"),
+        ),
+        None => (format!("GPRMC,{time},V,,,,,,,181126,,"), format!("GPGGA,{time},,,,,0,00,,,M,,M,,")),
+    };
+    sentence(&rmc) + &sentence(&gga)
+}
+
+/// A Garmin receiver that listens on its line and answers each `$PGRM…` sentence. Lets go of the line when
+/// dropped.
+pub struct Garmin {
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Garmin {
+    /// Answers through `answer`: the sentence's body in, the answer's body out.
+    pub fn start(mut line: File, answer: impl Fn(&str) -> Option<String> + Send + 'static) -> Self {
+        let stop = Arc::new(AtomicBool::new(false));
+        let asked = stop.clone();
+        let thread = std::thread::spawn(move || {
+            let (mut heard, mut buffer) = (String::new(), [0u8; 256]);
+            while !asked.load(Ordering::Acquire) {
+                let wait = Timespec { tv_sec: 0, tv_nsec: 50_000_000 };
+                let mut ready = [PollFd::new(&line, PollFlags::IN)];
+                if !poll(&mut ready, Some(&wait)).is_ok_and(|count| count > 0) {
+                    continue;
+                }
+                // Nobody has the near end open: as quiet as no bytes.
+                let Ok(count) = line.read(&mut buffer) else {
+                    std::thread::sleep(Duration::from_millis(50));
+                    continue;
+                };
+                heard.push_str(&String::from_utf8_lossy(&buffer[..count]));
+                while let Some((one, rest)) = heard.split_once("\r\n") {
+                    let body = one.strip_prefix('$').and_then(|one| one.split_once('*'));
+                    // A sentence with a wrong checksum is not heard.
+                    let body =
+                        body.filter(|(body, _)| sentence(body).trim_end() == one).map(|(body, _)| body);
+                    if let Some(answer) = body.and_then(&answer) {
+                        let _ = line.write_all(sentence(&answer).as_bytes());
+                    }
+                    heard = rest.to_owned();
+                }
+            }
+        });
+        Self { stop, thread: Some(thread) }
+    }
+}
+
+impl Drop for Garmin {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Release);
+        self.thread.take().expect("running").join().expect("ended");
+    }
 }
 
 /// Numbers of the frames of a recording; none where there is nothing to read yet.

@@ -1,6 +1,7 @@
 //! The real binary over pseudo-terminals at the real pace, with a recorded camera: everything but the
 //! V4L2 call is what flies.
 
+mod devices;
 mod harness;
 mod warm;
 
