@@ -81,11 +81,11 @@ deb: build
 	target/release/windhover generate man target/generated/man
 	target/release/windhover generate completions target/generated/completions
 	test -x target/tools/bin/cargo-deb || $(CARGO) install cargo-deb --version 3.8.0 --locked --root target/tools
-	target/tools/bin/cargo-deb --no-build --locked
+	target/tools/bin/cargo-deb --no-build --locked --strip
 
 hil hil-long: deb
 	@sh tests/setup/packages.sh qemu-system-x86 mmdebstrap e2fsprogs python3
-	$(CARGO) build --release --locked --examples
+	$(CARGO) build --release --locked --example hil_feed --example hil_frames --example hil_stream
 	sh hil/fly.sh $(if $(filter hil-long,$@),--long,)
 
 clean:

@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
 # Builds the virtual payload computer: Debian from its packages, our package installed as a user would,
 # a read-only root image and an empty data card. What is there already is not built again.
-#   hil/build.sh WINDHOVER.deb [DIRECTORY]
+#   hil/build.sh WINDHOVER.deb WINDHOVER [DIRECTORY]
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 deb=$(realpath "$1")
-out=$(realpath -m "${2:-target/hil}")
+windhover=$(realpath "$2")
+out=$(realpath -m "${3:-target/hil}")
 suite=${SUITE:-bookworm}
 packages=linux-image-amd64,systemd,systemd-sysv,udev,kmod,v4l-utils,iproute2,dbus,dmsetup,e2fsprogs
 mkdir -p "$out"
@@ -33,19 +34,24 @@ chroot "$root" apt-get install -y --no-install-recommends -o Dpkg::Use-Pty=0 /tm
     { cat "$out/apt.log" >&2; exit 1; }
 rm "$root/tmp/windhover.deb"
 
-# The bench's own parts: camera driver, card, control line. Nothing here touches the package's files
-# but its configuration, which is the user's to write.
+# The bench's own parts: camera driver, pulse, network, control line. Nothing here touches the package's
+# files but its configuration and keys, which are the user's to write.
 cp -a "$here/guest/." "$root/"
 chmod 755 "$root/usr/local/sbin/"*
 install -m 644 "$here/windhover.toml" "$root/etc/windhover/windhover.toml"
+test -f "$out/keys/authority.pem" || "$windhover" keys authority --dir "$out/keys"
+test -f "$out/keys/payload-bench.pem" || "$windhover" keys payload bench --dir "$out/keys"
+test -f "$out/keys/station-bench.pem" || "$windhover" keys station bench --dir "$out/keys"
+cp "$out/keys/authority.pem" "$out/keys/revoked.pem" "$out"/keys/payload-bench.* "$root/etc/windhover/keys/"
+chroot "$root" sh -c 'chown windhover:windhover /etc/windhover/keys/* && chmod 600 /etc/windhover/keys/*.key'
 echo payload >"$root/etc/hostname"
-cat >"$root/etc/fstab" <<'FSTAB'
-/dev/vda / ext4 ro 0 1
-LABEL=WINDHOVER /var/lib/windhover ext4 noatime,nofail,x-systemd.device-timeout=180s 0 2
-FSTAB
-chroot "$root" systemctl --quiet enable windhover.service bench-camera.service bench-control.service
+# The card is mounted by the package's own unit.
+echo '/dev/vda / ext4 ro 0 1' >"$root/etc/fstab"
+chroot "$root" systemctl --quiet enable windhover.service bench-camera.service bench-control.service \
+    bench-log.service bench-network.service bench-pulse.service
 chroot "$root" systemctl --quiet mask serial-getty@ttyS0.service serial-getty@ttyS1.service systemd-timesyncd.service \
-    apt-daily.timer apt-daily-upgrade.timer dpkg-db-backup.timer systemd-random-seed.service
+    apt-daily.timer apt-daily-upgrade.timer dpkg-db-backup.timer systemd-random-seed.service e2scrub_reap.service \
+    e2scrub_all.timer fstrim.timer getty@tty1.service systemd-update-utmp.service
 chroot "$root" passwd --quiet -d root
 
 cp "$root"/boot/vmlinuz-* "$out/vmlinuz"

@@ -1,11 +1,19 @@
-"""Compares a flight off the card with the simulated truth."""
+"""What a flight off the card is held against: the simulated truth, its own replay, the ground station."""
 
 import csv
+import json
 import math
 import subprocess
+from itertools import zip_longest
 from pathlib import Path
 
 from machine import Failure
+
+
+def demand(condition, words):
+    """A scenario's assertion."""
+    if not condition:
+        raise Failure(words)
 
 
 def rows(path):
@@ -17,40 +25,86 @@ def rms(values):
     return math.sqrt(sum(v * v for v in values) / len(values)) if values else math.inf
 
 
-def compare(windhover, frames_tool, flight, truth_path, work):
+def run(*command):
+    """Runs a tool; its standard output."""
+    done = subprocess.run([str(word) for word in command], capture_output=True, text=True)
+    if done.returncode != 0:
+        raise Failure(f"{' '.join(map(str, command))}: exit {done.returncode}: {done.stderr.strip()[-400:]}")
+    return done.stdout
+
+
+def exported(args, flight, work):
+    """The flight's tables as CSV; their folder."""
+    out = Path(work) / f"export-{Path(flight).stem}"
+    run(args.windhover, "export", flight, "--format", "csv", "--out", out)
+    return out
+
+
+def frames_shown(args, flight):
+    """Frames of a flight by their number: which frame of the feed each shows, empty where none."""
+    seen = csv.DictReader(run(args.frames, flight).splitlines())
+    return {int(row["frame"]): row["number"] for row in seen}
+
+
+def against_truth(args, flight, work):
     """Figures of a flight: frames, estimates, errors against the truth of the picture each frame shows.
 
     The bench's clocks are not one: pictures, receiver and compass run through an emulator, tens of
     milliseconds apart, so this proves function and not accuracy.
     """
-    out = Path(work) / f"export-{flight.name}"
-    subprocess.run([windhover, "export", str(flight), "--format", "csv", "--out", str(out)], check=True,
-                   stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    seen = subprocess.run([frames_tool, str(flight)], check=True, capture_output=True, text=True).stdout
-    shown = {r["frame"]: int(r["number"]) for r in csv.DictReader(seen.splitlines()) if r["number"]}
-    truth = {int(r["frame"]): r for r in rows(truth_path)}
-    estimates = [r for r in rows(out / "estimates.csv") if r["status"] == "tracking" and r["lat_deg"]]
-    north, east, heading = [], [], []
+    shown = frames_shown(args, flight)
+    truth = {int(r["frame"]): r for r in rows(args.truth)}
+    table = rows(exported(args, flight, work) / "estimates.csv")
+    estimates = [r for r in table if r["status"] == "tracking" and r["lat_deg"]]
+    distance, heading = [], []
     for row in estimates:
-        true = truth.get(shown.get(row["frame"], -1))
+        number = shown.get(int(row["frame"]))
+        true = truth.get(int(number)) if number else None
         if true is None:
             continue
         lat = math.radians(float(true["lat_deg"]))
-        north.append((float(row["lat_deg"]) - float(true["lat_deg"])) * 111_132.0)
-        east.append((float(row["lon_deg"]) - float(true["lon_deg"])) * 111_320.0 * math.cos(lat))
+        north = (float(row["lat_deg"]) - float(true["lat_deg"])) * 111_132.0
+        east = (float(row["lon_deg"]) - float(true["lon_deg"])) * 111_320.0 * math.cos(lat)
+        distance.append(math.hypot(north, east))
         turn = float(row["heading_rad"]) - float(true["heading_rad"])
         heading.append(math.degrees(math.atan2(math.sin(turn), math.cos(turn))))
     return {
-        "frames": len(seen.splitlines()) - 1,
-        "numbered": len(shown),
+        "frames": len(shown),
         "estimates": len(estimates),
-        "compared": len(north),
-        "position_m": rms([math.hypot(n, e) for n, e in zip(north, east)]),
-        "heading_deg": rms(heading),
+        "compared": len(distance),
+        "position_m": round(rms(distance), 2),
+        "heading_deg": round(rms(heading), 2),
     }
 
 
-def demand(condition, words):
-    """A scenario's assertion."""
-    if not condition:
-        raise Failure(words)
+def against_replay(args, flight, work):
+    """What flew is what replays: how many rows of estimates are the same, and the first that is not.
+
+    A frame the card had no time for is a gap in the frames' numbers: up to the first gap the rows must be
+    the same.
+    """
+    kept = sorted(frames_shown(args, flight))
+    whole = next((n for n, frame in enumerate(kept) if n != frame), len(kept))
+    again = Path(work) / f"again-{flight.name}.mcap"
+    again.unlink(missing_ok=True)
+    run(args.windhover, "replay", flight, "--out", again)
+    flown, replayed = (
+        (exported(args, file, work) / "estimates.csv").read_text().splitlines()[1:] for file in (flight, again))
+    same = 0
+    for old, new in zip_longest(flown, replayed):
+        if old is None or int(old.split(",")[1]) >= whole:
+            break
+        demand(old == new, f"estimates differ in the replay:\nflown    {old}\nreplayed {new}")
+        same += 1
+    return {"frames_kept": len(kept), "frames_before_a_gap": whole, "rows_equal": same}
+
+
+def against_stream(args, flight, station):
+    """What the ground has of a flight beside what the card has."""
+    return json.loads(run(args.stream, flight, station))
+
+
+def listed(args, store):
+    """Flights of a store by session, as `windhover store list` tells them."""
+    text = run(args.windhover, "store", "--path", store, "list", "--json")
+    return {row["session"]: row for row in map(json.loads, text.splitlines())}

@@ -1,7 +1,7 @@
-//! Feeds a capture into the bench's lines at its own pace: serial bytes and grey frames, each into a
-//! Unix socket of the emulator. At its end it begins again, as if the receiver had been restarted.
+//! Feeds a capture into the bench's lines at its own pace: serial bytes, frames, and the receiver's pulse,
+//! each into a Unix socket of the emulator. At its end it begins again, as if the receiver had been restarted.
 //!
-//! `hil_feed CAPTURE GPS_SOCKET COMPASS_SOCKET FRAMES_SOCKET`
+//! `hil_feed CAPTURE GPS_SOCKET COMPASS_SOCKET FRAMES_SOCKET PULSE_SOCKET [GREY|YUYV|UYVY|NV12|RGB3]`
 //!
 //! Each frame carries its number as 24 squares of 8 pixels in its top-left corner, so that the far end
 //! can tell which frame it saw. One line `start NS` on standard output tells when it began, and
@@ -14,19 +14,27 @@ use std::process::ExitCode;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Duration;
 
-use windhover::io::capture::CaptureReader;
+use windhover::config::Config;
+use windhover::io::capture::{CaptureReader, attached_config};
 use windhover::io::clock::HostClock;
 use windhover::msg::{EventBody, FramePayload, GrayImage};
 use windhover::pipeline::Pipeline;
-use windhover::time::Span;
+use windhover::time::{MonoTime, Span};
+
+type Trouble = Box<dyn std::error::Error>;
 
 fn main() -> ExitCode {
     let args: Vec<String> = std::env::args().skip(1).collect();
-    let [capture, gps, compass, frames] = args.as_slice() else {
-        eprintln!("usage: hil_feed CAPTURE GPS_SOCKET COMPASS_SOCKET FRAMES_SOCKET");
+    let (paths, format) = match args.as_slice() {
+        [paths @ .., format] if paths.len() == 5 => (paths, format.as_str()),
+        paths => (paths, "GREY"),
+    };
+    let [capture, gps, compass, frames, pulse] = paths else {
+        eprintln!("usage: hil_feed CAPTURE GPS_SOCKET COMPASS_SOCKET FRAMES_SOCKET PULSE_SOCKET [FORMAT]");
         return ExitCode::from(2);
     };
-    match feed(capture, gps, compass, frames) {
+    let feed = Lines::open(gps, compass, frames, pulse, format).and_then(|lines| lines.feed(capture));
+    match feed {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("hil_feed: {error}");
@@ -35,61 +43,124 @@ fn main() -> ExitCode {
     }
 }
 
-fn feed(capture: &str, gps: &str, compass: &str, frames: &str) -> Result<(), Box<dyn std::error::Error>> {
-    let clock = HostClock::start();
-    let mut gps = UnixStream::connect(gps)?;
-    let mut compass = UnixStream::connect(compass)?;
-    // The newest frame wins: what the far end has no time for is left out, as a camera does.
-    let (sender, receiver) = sync_channel::<(u32, GrayImage)>(1);
-    let camera = UnixStream::connect(frames)?;
-    let writer = std::thread::spawn(move || write_frames(&receiver, camera));
-    loop {
-        play(capture, clock, &mut gps, &mut compass, &sender)?;
-        if writer.is_finished() {
-            return Err("the camera's line went away".into());
-        }
-    }
+/// The emulator's lines.
+struct Lines {
+    clock: HostClock,
+    gps: UnixStream,
+    compass: UnixStream,
+    pulse: UnixStream,
+    frames: SyncSender<(u32, GrayImage)>,
+    writer: std::thread::JoinHandle<()>,
 }
 
-/// Plays the capture once.
-fn play(
-    capture: &str,
-    clock: HostClock,
-    gps: &mut UnixStream,
-    compass: &mut UnixStream,
-    frames: &SyncSender<(u32, GrayImage)>,
-) -> Result<(), Box<dyn std::error::Error>> {
-    let began = clock.now();
-    println!("start {}", began.ns());
-    let mut first = None;
-    for item in CaptureReader::open(Path::new(capture))? {
-        let Some(event) = item.event else { continue };
-        let due = began + (event.t_recv - *first.get_or_insert(event.t_recv));
-        let left = due - clock.now();
+impl Lines {
+    fn open(gps: &str, compass: &str, frames: &str, pulse: &str, format: &str) -> Result<Self, Trouble> {
+        let pack = packing(format).ok_or_else(|| format!("{format} is no format of the bench"))?;
+        // The newest frame wins: what the far end has no time for is left out, as a camera does.
+        let (sender, receiver) = sync_channel::<(u32, GrayImage)>(1);
+        let camera = UnixStream::connect(frames)?;
+        Ok(Self {
+            clock: HostClock::start(),
+            gps: UnixStream::connect(gps)?,
+            compass: UnixStream::connect(compass)?,
+            pulse: UnixStream::connect(pulse)?,
+            frames: sender,
+            writer: std::thread::spawn(move || write_frames(&receiver, camera, pack)),
+        })
+    }
+
+    fn feed(mut self, capture: &str) -> Result<(), Trouble> {
+        let pulses = first_pulse(capture)?;
+        loop {
+            self.play(capture, pulses)?;
+            if self.writer.is_finished() {
+                return Err("the camera's line went away".into());
+            }
+        }
+    }
+
+    /// Plays the capture once; `pulse` is when a second of the receiver begins.
+    fn play(&mut self, capture: &str, pulse: Option<MonoTime>) -> Result<(), Trouble> {
+        let began = self.clock.now();
+        println!("start {}", began.ns());
+        let (mut first, mut pulse) = (None, pulse);
+        for item in CaptureReader::open(Path::new(capture))? {
+            let Some(event) = item.event else { continue };
+            let shift = began - *first.get_or_insert(event.t_recv);
+            while let Some(second) = pulse.filter(|second| *second <= event.t_recv) {
+                self.sleep_until(second + shift);
+                self.pulse.write_all(b".")?;
+                pulse = Some(second + Span::from_s(1.0));
+            }
+            self.sleep_until(event.t_recv + shift);
+            match event.body {
+                EventBody::GnssBytes(bytes) => self.gps.write_all(&bytes)?,
+                EventBody::CompassBytes(bytes) => self.compass.write_all(&bytes)?,
+                EventBody::Frame(frame) => {
+                    if let Some(image) = numbered(&frame) {
+                        let _ = self.frames.try_send((frame.index, image));
+                    }
+                }
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn sleep_until(&self, due: MonoTime) {
+        let left = due - self.clock.now();
         if left > Span::ZERO {
             std::thread::sleep(Duration::from_nanos(left.ns().unsigned_abs()));
         }
-        match event.body {
-            EventBody::GnssBytes(bytes) => gps.write_all(&bytes)?,
-            EventBody::CompassBytes(bytes) => compass.write_all(&bytes)?,
-            EventBody::Frame(frame) => {
-                if let Some(image) = numbered(&frame) {
-                    let _ = frames.try_send((frame.index, image));
-                }
-            }
-            _ => {}
-        }
     }
-    Ok(())
 }
 
-fn write_frames(frames: &Receiver<(u32, GrayImage)>, mut camera: UnixStream) {
+/// When the first pulse of the capture's receiver is due: the beginning of its second, which its sentences
+/// tell `gps.latency_ms` later. The earliest of the first ones has the least jitter. `None` without RMC.
+fn first_pulse(capture: &str) -> Result<Option<MonoTime>, Trouble> {
+    /// Sentences looked at: ten seconds of them.
+    const SENTENCES: usize = 50;
+    let path = Path::new(capture);
+    let config = attached_config(path)?.ok_or("the capture has no configuration")?;
+    let latency = Span::from_ms(Config::parse(&config)?.gps.latency_ms);
+    let heard = CaptureReader::open(path)?.filter_map(|item| item.event).filter_map(|event| {
+        let EventBody::GnssBytes(bytes) = &event.body else { return None };
+        let text = String::from_utf8_lossy(bytes);
+        let seconds: f64 = text.split_once("RMC,")?.1.split(',').next()?.get(4..)?.parse().ok()?;
+        Some(event.t_recv - Span::from_s(seconds.fract()))
+    });
+    let second = |t: &MonoTime| t.ns().rem_euclid(1_000_000_000);
+    let heard: Vec<MonoTime> = heard.take(SENTENCES).collect();
+    let Some(begin) = heard.first().copied() else { return Ok(None) };
+    let late =
+        |t: &MonoTime| (second(t) - second(&begin) + 1_500_000_000).rem_euclid(1_000_000_000) - 500_000_000;
+    let earliest = heard.iter().map(late).min().unwrap_or(0);
+    Ok(Some(begin + Span::from_ns(earliest) - latency))
+}
+
+fn write_frames(frames: &Receiver<(u32, GrayImage)>, mut camera: UnixStream, pack: Packing) {
     while let Ok((number, image)) = frames.recv() {
-        if camera.write_all(&image.data).is_err() {
+        if camera.write_all(&pack(&image.data)).is_err() {
             return;
         }
         println!("frame {number}");
     }
+}
+
+/// Grey pixels in a pixel format of V4L2.
+type Packing = fn(&[u8]) -> Vec<u8>;
+
+/// The packing of a format by its four-character code; colours are those of grey.
+fn packing(format: &str) -> Option<Packing> {
+    const NO_COLOUR: u8 = 128;
+    Some(match format {
+        "GREY" => |grey| grey.to_vec(),
+        "YUYV" => |grey| grey.iter().flat_map(|&y| [y, NO_COLOUR]).collect(),
+        "UYVY" => |grey| grey.iter().flat_map(|&y| [NO_COLOUR, y]).collect(),
+        "NV12" => |grey| [grey, vec![NO_COLOUR; grey.len() / 2].as_slice()].concat(),
+        "RGB3" => |grey| grey.iter().flat_map(|&y| [y; 3]).collect(),
+        _ => return None,
+    })
 }
 
 /// The frame as packed grey with its number in the corner.
