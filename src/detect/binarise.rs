@@ -32,11 +32,11 @@ impl Bitmap {
 
 /// Least range over maximum, of 256, that counts as contrast: ink is a fifth to a tenth as light as paper, and
 /// blur and haze take some of that away, while most ground varies less.
-const LEAST_RELATIVE: usize = 70;
+const LEAST_RELATIVE: u8 = 70;
 
 /// Where more of the image than `BUSY_SHARE` has that contrast, only what has most is looked at, but all that
 /// has this much: a tag that is read keeps it, and coarse gravel does not cost more than grass.
-const ENOUGH_RELATIVE: usize = 160;
+const ENOUGH_RELATIVE: u8 = 160;
 const BUSY_SHARE: f32 = 0.3;
 
 /// Thresholds an image against its surroundings, 12×12 pixels around each tile.
@@ -47,16 +47,21 @@ pub(super) struct Binariser {
     wide_low: Vec<u8>,
     wide_high: Vec<u8>,
     scratch: Vec<u8>,
+    /// Range over maximum around every tile, of 256; nought below the gate.
+    relative: Vec<u8>,
+    /// The least of these that counts in this image.
+    least_relative: u8,
     thresholds: Vec<u8>,
     tiles: (usize, usize),
 }
 
 impl Binariser {
-    /// Measures the range around every tile of an image.
-    pub fn measure(&mut self, image: ImageView<'_>, simd: Simd) {
+    /// Measures the range around every tile of an image. Only ranges of at least `gate` count.
+    pub fn measure(&mut self, image: ImageView<'_>, gate: u8, simd: Simd) {
         let (across, down) = (image.width.div_ceil(TILE), image.height.div_ceil(TILE));
         self.tiles = (across, down);
-        for buffer in [&mut self.low, &mut self.high, &mut self.wide_low, &mut self.wide_high] {
+        let Self { low, high, wide_low, wide_high, relative, .. } = self;
+        for buffer in [low, high, wide_low, wide_high, relative] {
             buffer.resize(across * down, 0);
         }
         for tile in 0..down {
@@ -70,36 +75,37 @@ impl Binariser {
         }
         widen(&self.low, &mut self.wide_low, &mut self.scratch, across, u8::min);
         widen(&self.high, &mut self.wide_high, &mut self.scratch, across, u8::max);
+        self.weigh(gate);
     }
 
-    /// The least range over maximum, of 256, that counts in this image: see `BUSY_SHARE`.
-    fn least_relative(&self, gate: u8) -> usize {
+    /// Fills in `relative` and `least_relative`: see `BUSY_SHARE`.
+    fn weigh(&mut self, gate: u8) {
         let mut tiles = [0u32; 256];
-        for (&low, &high) in self.wide_low.iter().zip(&self.wide_high) {
-            if high - low >= gate {
-                tiles[relative(low, high)] += 1;
-            }
+        for ((r, &low), &high) in self.relative.iter_mut().zip(&self.wide_low).zip(&self.wide_high) {
+            let range = high - low;
+            *r = if range >= gate { relative(range, high) } else { 0 };
+            tiles[usize::from(*r)] += 1;
         }
         let budget = (BUSY_SHARE * self.wide_low.len() as f32) as u32;
-        let (mut least, mut passed) = (ENOUGH_RELATIVE, tiles[ENOUGH_RELATIVE..].iter().sum::<u32>());
-        while least > LEAST_RELATIVE && passed + tiles[least - 1] <= budget {
+        let from = |r: u8| tiles[usize::from(r)];
+        let (mut least, mut passed) = (ENOUGH_RELATIVE, (ENOUGH_RELATIVE..=u8::MAX).map(from).sum::<u32>());
+        while least > LEAST_RELATIVE && passed + from(least - 1) <= budget {
             least -= 1;
-            passed += tiles[least];
+            passed += from(least);
         }
-        least
+        self.least_relative = least;
     }
 
     /// Marks pixels below `fraction`/256 of the way from the local minimum to the local maximum, where
-    /// these are at least `gate` apart and the minimum is well below the maximum; elsewhere nothing is dark.
-    pub fn mark(&mut self, image: ImageView<'_>, gate: u8, fraction: u16, out: &mut Bitmap, simd: Simd) {
+    /// the minimum is well below the maximum; elsewhere nothing is dark.
+    pub fn mark(&mut self, image: ImageView<'_>, fraction: u16, out: &mut Bitmap, simd: Simd) {
         let (across, down) = self.tiles;
         self.thresholds.resize(across * down, 0);
-        let least_relative = self.least_relative(gate);
-        for ((t, &low), &high) in self.thresholds.iter_mut().zip(&self.wide_low).zip(&self.wide_high) {
-            let range = high - low;
-            let above = (u16::from(range) * fraction + 128) >> 8;
-            let seen = range >= gate && relative(low, high) >= least_relative;
-            *t = if seen { low + above as u8 } else { 0 };
+        let least = self.least_relative;
+        let measured = self.wide_low.iter().zip(&self.wide_high).zip(&self.relative);
+        for (t, ((&low, &high), &relative)) in self.thresholds.iter_mut().zip(measured) {
+            let above = (u16::from(high - low) * fraction + 128) >> 8;
+            *t = if relative >= least { low + above as u8 } else { 0 };
         }
         let per_row = image.width.div_ceil(64);
         (out.width, out.height) = (image.width, image.height);
@@ -111,9 +117,20 @@ impl Binariser {
     }
 }
 
-/// Range over maximum, of 256.
-fn relative(low: u8, high: u8) -> usize {
-    usize::from(high - low) * 255 / usize::from(high.max(1))
+/// `RECIPROCALS[n]` = 255 · 2¹⁶ / n, rounded up: products with up to n, shifted back, are exact.
+const RECIPROCALS: [u32; 256] = {
+    let mut table = [0; 256];
+    let mut n = 1;
+    while n < 256 {
+        table[n] = (255u32 << 16).div_ceil(n as u32);
+        n += 1;
+    }
+    table
+};
+
+/// Range over maximum, of 255, without a division.
+fn relative(range: u8, high: u8) -> u8 {
+    ((u32::from(range) * RECIPROCALS[usize::from(high)]) >> 16) as u8
 }
 
 /// Extreme over 3×3 tiles.
@@ -149,15 +166,25 @@ mod tests {
             (12..22).for_each(|u| image.data[v * 40 + u] = 20);
         }
         let (mut binariser, mut bits) = (Binariser::default(), Bitmap::default());
-        binariser.measure(image.view(), Simd::best());
-        binariser.mark(image.view(), 30, 128, &mut bits, Simd::best());
+        binariser.measure(image.view(), 30, Simd::best());
+        binariser.mark(image.view(), 128, &mut bits, Simd::best());
         for v in 0..30 {
             for u in 0..40 {
                 let dark = bits.row(v)[u / 64] >> (u % 64) & 1 == 1;
                 assert_eq!(dark, image.data[v * 40 + u] == 20, "({u}, {v})");
             }
         }
-        binariser.mark(image.view(), 190, 128, &mut bits, Simd::best());
+        binariser.measure(image.view(), 190, Simd::best());
+        binariser.mark(image.view(), 128, &mut bits, Simd::best());
         assert!((0..30).all(|v| bits.row(v)[0] == 0), "a gate above the contrast leaves nothing");
+    }
+
+    #[test]
+    fn reciprocals_divide_exactly() {
+        for high in 1..=255u8 {
+            for range in 0..=high {
+                assert_eq!(u32::from(relative(range, high)), u32::from(range) * 255 / u32::from(high));
+            }
+        }
     }
 }

@@ -22,6 +22,8 @@ pub(super) struct Component {
     pub top: u16,
     pub bottom: u16,
     pub area: u32,
+    /// How many runs it is made of.
+    pub runs: u32,
 }
 
 impl Component {
@@ -34,7 +36,7 @@ impl Component {
     }
 
     /// No pixel: what others are added to.
-    const NOTHING: Self = Self { left: u16::MAX, right: 0, top: u16::MAX, bottom: 0, area: 0 };
+    const NOTHING: Self = Self { left: u16::MAX, right: 0, top: u16::MAX, bottom: 0, area: 0, runs: 0 };
 
     #[inline(always)]
     fn add(&mut self, run: &Run, v: u16) {
@@ -43,6 +45,7 @@ impl Component {
         self.top = self.top.min(v);
         self.bottom = v;
         self.area += u32::from(run.end - run.start);
+        self.runs += 1;
     }
 
     fn merge(&mut self, other: &Self) {
@@ -51,6 +54,7 @@ impl Component {
         self.top = self.top.min(other.top);
         self.bottom = self.bottom.max(other.bottom);
         self.area += other.area;
+        self.runs += other.runs;
     }
 }
 
@@ -332,8 +336,14 @@ mod tests {
             if seen[first] || !dark(u, v) {
                 continue;
             }
-            let mut c =
-                Component { left: u as u16, right: u as u16, top: v as u16, bottom: v as u16, area: 0 };
+            let mut c = Component {
+                left: u as u16,
+                right: u as u16,
+                top: v as u16,
+                bottom: v as u16,
+                area: 0,
+                runs: 0,
+            };
             let mut stack = vec![(u, v)];
             seen[first] = true;
             while let Some((u, v)) = stack.pop() {
@@ -343,6 +353,7 @@ mod tests {
                     top: v as u16,
                     bottom: v as u16,
                     area: 1,
+                    runs: 0,
                 });
                 for nv in v.saturating_sub(1)..(v + 2).min(bits.height) {
                     for nu in u.saturating_sub(1)..(u + 2).min(bits.width) {
@@ -374,7 +385,7 @@ mod tests {
             let bits = Bitmap::from_pixels(width, height, &dark);
             let mut labeller = Labeller::default();
             labeller.label(&bits, Simd::best(), |_| true);
-            let mut labelled: Vec<Component> = labeller.kept().map(|(c, _)| *c).collect();
+            let mut labelled: Vec<Component> = labeller.kept().map(|(c, _)| Component { runs: 0, ..*c }).collect();
             let mut expected = flooded(&bits);
             let key = |c: &Component| (c.top, c.left, c.bottom, c.right, c.area);
             labelled.sort_by_key(key);

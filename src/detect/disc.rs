@@ -61,8 +61,8 @@ impl DiscFinder {
             return;
         }
         let least = sizes.0.max(LEAST_DIAMETER);
-        self.binariser.measure(image, self.simd);
-        self.binariser.mark(image, LEAST_STEP, 128, &mut self.bits, self.simd);
+        self.binariser.measure(image, LEAST_STEP, self.simd);
+        self.binariser.mark(image, 128, &mut self.bits, self.simd);
         let (width, height) = (image.width, image.height);
         let keep = |c: &Component| {
             let (w, h) = (c.width() as f64, c.height() as f64);

@@ -3,8 +3,11 @@
 use nalgebra::{Matrix2, Vector2};
 
 use super::disc::{Blob, DiscFinder, center_shift};
+use super::tag::Region;
 use crate::config::{Brightness, CameraConfig, Config, MarkerKind};
-use crate::msg::{FramePrediction, GrayImage, ImageView, MarkerDetection, MarkerId, RgbImage};
+use crate::msg::{
+    FramePrediction, GrayImage, ImageView, MarkerDetection, MarkerId, MarkerPrediction, RgbImage,
+};
 
 /// What a disc looks like against its surroundings.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -39,6 +42,9 @@ pub(super) struct DiscPairs {
 /// Sigmas of a predicted centre within which a disc is taken.
 const GATE_SIGMAS: f64 = 4.0;
 
+/// Ground wanted around a disc, pixels.
+const AROUND_PX: f64 = 12.0;
+
 /// How far a disc's size may be from the predicted one, and a pair's ratio from the configured one.
 const SIZE_SLACK: f64 = 0.25;
 const RATIO_SLACK: f64 = 0.12;
@@ -71,7 +77,8 @@ impl DiscPairs {
         })
     }
 
-    /// Appends the discs that can be told from all others.
+    /// Appends the discs that can be told from all others. While tracking they are looked for where they are
+    /// foretold, and only there; else in the whole frame.
     pub fn find(
         &mut self,
         image: ImageView<'_>,
@@ -80,15 +87,32 @@ impl DiscPairs {
         out: &mut Vec<MarkerDetection>,
     ) {
         self.blobs.clear();
+        let rgb = rgb.filter(|c| (c.width, c.height) == (image.width, image.height));
+        let tracking = prediction.filter(|p| !p.search);
         for i in 0..self.discs.len() {
+            if let Some(prediction) = tracking {
+                let region = predicted(&self.discs[i], Some(prediction)).and_then(|m| region_of(image, m));
+                if let Some(region) = region {
+                    self.search(i, image, rgb, region);
+                }
+                continue;
+            }
             // Discs that look alike are searched once.
             let look = self.discs[i].look;
             match self.discs[..i].iter().position(|d| d.look == look) {
                 Some(same) => {
-                    let alike: Vec<_> = self.blobs.iter().filter(|b| b.0 == same).map(|b| (i, b.1)).collect();
-                    self.blobs.extend(alike);
+                    let searched = self.blobs.len();
+                    for k in 0..searched {
+                        let (disc, blob) = self.blobs[k];
+                        if disc == same {
+                            self.blobs.push((i, blob));
+                        }
+                    }
                 }
-                None => self.search(i, image, rgb),
+                None => {
+                    let whole = Region { u: 0, v: 0, width: image.width, height: image.height };
+                    self.search(i, image, rgb, whole);
+                }
             }
         }
         let targets = self.discs.iter().map(|d| d.target).max().map_or(0, |t| t + 1);
@@ -97,73 +121,70 @@ impl DiscPairs {
         }
     }
 
-    fn search(&mut self, disc: usize, image: ImageView<'_>, rgb: Option<&RgbImage>) {
+    fn search(&mut self, disc: usize, image: ImageView<'_>, rgb: Option<&RgbImage>, region: Region) {
         let look = self.discs[disc].look;
         self.found.clear();
+        let part = image.crop(region.u, region.v, region.width, region.height);
         let sizes = (0.0, 0.5 * image.width.min(image.height) as f64);
-        let rgb = rgb.filter(|c| (c.width, c.height) == (image.width, image.height));
         match (look, rgb) {
-            (Look::Dark, _) => self.finder.find(image, sizes, &mut self.found),
+            (Look::Dark, _) => self.finder.find(part, sizes, &mut self.found),
             (Look::Light, _) => {
-                negative(image, &mut self.plane);
+                negative(part, &mut self.plane);
                 self.finder.find(self.plane.view(), sizes, &mut self.found);
             }
             (Look::Color(color), Some(rgb)) => {
-                color_distance(rgb, color, &mut self.plane);
+                color_distance(rgb, region, color, &mut self.plane);
                 self.finder.find(self.plane.view(), sizes, &mut self.found);
             }
             // A grey frame of a coloured disc: lighter or darker, there is no telling which.
             (Look::Color(_), None) => {
-                self.finder.find(image, sizes, &mut self.found);
-                negative(image, &mut self.plane);
+                self.finder.find(part, sizes, &mut self.found);
+                negative(part, &mut self.plane);
                 self.finder.find(self.plane.view(), sizes, &mut self.found);
             }
         }
-        self.blobs.extend(self.found.iter().map(|b| (disc, *b)));
+        let shift = Vector2::new(region.u as f64, region.v as f64);
+        self.blobs.extend(self.found.iter().map(|b| (disc, Blob { center: b.center + shift, ..*b })));
     }
 
     /// Gives a target's discs to regions where there is one way to do so.
     fn assign(&self, target: usize, prediction: Option<&FramePrediction>, out: &mut Vec<MarkerDetection>) {
-        let discs: Vec<usize> = (0..self.discs.len()).filter(|&i| self.discs[i].target == target).collect();
-        let candidates: Vec<Vec<&Blob>> = discs
-            .iter()
-            .map(|&i| {
-                self.blobs
-                    .iter()
-                    .filter(|b| b.0 == i && self.expected(i, &b.1, prediction))
-                    .map(|b| &b.1)
-                    .collect()
-            })
-            .collect();
-        match discs.as_slice() {
-            [only] => {
+        let mut discs = (0..self.discs.len()).filter(|&i| self.discs[i].target == target);
+        match (discs.next(), discs.next()) {
+            (Some(only), None) => {
                 // Nothing but its place tells a single disc from other round things.
-                let predicted = predicted(&self.discs[*only], prediction).is_some();
-                if let ([blob], true) = (candidates[0].as_slice(), predicted) {
-                    out.push(self.detection(*only, blob));
+                let predicted = predicted(&self.discs[only], prediction).is_some();
+                let mut candidates = self.candidates(only, prediction);
+                if let (Some(blob), None, true) = (candidates.next(), candidates.next(), predicted) {
+                    out.push(self.detection(only, blob));
                 }
             }
-            [first, second, ..] => {
-                let (a, b) = (&self.discs[*first], &self.discs[*second]);
-                let mut pairs = candidates[0]
-                    .iter()
-                    .flat_map(|p| candidates[1].iter().map(move |q| (*p, *q)))
+            (Some(first), Some(second)) => {
+                let (a, b) = (&self.discs[first], &self.discs[second]);
+                let mut pairs = self
+                    .candidates(first, prediction)
+                    .flat_map(|p| self.candidates(second, prediction).map(move |q| (p, q)))
                     .filter(|(p, q)| is_pair((a, p), (b, q)));
                 if let (Some((p, q)), None) = (pairs.next(), pairs.next()) {
-                    out.push(self.detection(*first, p));
-                    out.push(self.detection(*second, q));
+                    out.push(self.detection(first, p));
+                    out.push(self.detection(second, q));
                 }
             }
-            [] => {}
+            (None, _) => {}
         }
     }
 
-    /// Whether a region is where and as large as a disc is expected, if it is.
-    fn expected(&self, disc: usize, blob: &Blob, prediction: Option<&FramePrediction>) -> bool {
-        predicted(&self.discs[disc], prediction).is_none_or(|m| {
-            (blob.center - m.center_px).norm() <= GATE_SIGMAS * m.sigma_px + 3.0
-                && (blob.diameter / m.size_px - 1.0).abs() <= SIZE_SLACK
-        })
+    /// Regions that can be a disc.
+    fn candidates(
+        &self,
+        disc: usize,
+        prediction: Option<&FramePrediction>,
+    ) -> impl Iterator<Item = &Blob> + use<'_> {
+        let expected = predicted(&self.discs[disc], prediction).copied();
+        self.blobs
+            .iter()
+            .filter(move |(of, blob)| *of == disc && expected.is_none_or(|m| is_expected(blob, &m)))
+            .map(|(_, blob)| blob)
     }
 
     fn detection(&self, disc: usize, blob: &Blob) -> MarkerDetection {
@@ -181,10 +202,23 @@ impl DiscPairs {
     }
 }
 
-fn predicted<'a>(
-    disc: &Disc,
-    prediction: Option<&'a FramePrediction>,
-) -> Option<&'a crate::msg::MarkerPrediction> {
+/// Whether a region is where and as large as a disc is expected.
+fn is_expected(blob: &Blob, m: &MarkerPrediction) -> bool {
+    (blob.center - m.center_px).norm() <= reach(m) && (blob.diameter / m.size_px - 1.0).abs() <= SIZE_SLACK
+}
+
+/// How far from the predicted centre a disc's may be, pixels.
+fn reach(m: &MarkerPrediction) -> f64 {
+    GATE_SIGMAS * m.sigma_px + 3.0
+}
+
+/// The part of a frame in which a predicted disc lies whole, with ground around it.
+fn region_of(image: ImageView<'_>, m: &MarkerPrediction) -> Option<Region> {
+    let radius = reach(m) + 0.5 * (1.0 + SIZE_SLACK) * m.size_px + AROUND_PX;
+    radius.is_finite().then(|| Region::around(image, m.center_px, radius)).flatten()
+}
+
+fn predicted<'a>(disc: &Disc, prediction: Option<&'a FramePrediction>) -> Option<&'a MarkerPrediction> {
     let id = MarkerId::Disc { target: disc.target, marker: disc.marker };
     prediction?.markers.iter().find(|m| m.marker == id)
 }
@@ -214,19 +248,22 @@ fn negative(image: ImageView<'_>, to: &mut GrayImage) {
     (0..image.height).for_each(|v| to.data.extend(image.row(v).iter().map(|p| !p)));
 }
 
-/// Distance in chromaticity from a colour, dark where near: shares of red, green and blue do not change
-/// with the light.
-fn color_distance(rgb: &RgbImage, color: [u8; 3], to: &mut GrayImage) {
-    (to.width, to.height, to.stride) = (rgb.width, rgb.height, rgb.width);
+/// Distance in chromaticity from a colour in part of a frame, dark where near: shares of red, green and blue do
+/// not change with the light.
+fn color_distance(rgb: &RgbImage, region: Region, color: [u8; 3], to: &mut GrayImage) {
+    (to.width, to.height, to.stride) = (region.width, region.height, region.width);
     let shares = |c: [u8; 3]| {
         let sum = c.iter().map(|&x| f32::from(x)).sum::<f32>() + 24.0;
         c.map(|x| (f32::from(x) + 8.0) / sum)
     };
     let wanted = shares(color);
     to.data.clear();
-    to.data.extend(rgb.data.chunks_exact(3).map(|p| {
-        let here = shares([p[0], p[1], p[2]]);
-        let distance: f32 = wanted.iter().zip(here).map(|(a, b)| (a - b).abs()).sum();
-        (distance * 300.0).min(255.0) as u8
-    }));
+    for v in region.v..region.v + region.height {
+        let row = &rgb.data[3 * (v * rgb.width + region.u)..][..3 * region.width];
+        to.data.extend(row.chunks_exact(3).map(|p| {
+            let here = shares([p[0], p[1], p[2]]);
+            let distance: f32 = wanted.iter().zip(here).map(|(a, b)| (a - b).abs()).sum();
+            (distance * 300.0).min(255.0) as u8
+        }));
+    }
 }

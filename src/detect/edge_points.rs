@@ -17,6 +17,8 @@ pub(super) struct EdgePoint {
     pub eta: f32,
     /// From dark to light in tag coordinates.
     pub light: [f32; 2],
+    /// Which part of the tag it is in.
+    pub block: u8,
 }
 
 /// One located edge: `residual` px along the normal, ∂/∂parameters (padded), weight.
@@ -25,6 +27,11 @@ pub(super) struct Located {
     pub row: [f32; PADDED],
     pub residual: f32,
     pub strength: f32,
+    /// Share of the edge's height in its slope: 1 where it is narrow against the window, 0 where it fills it.
+    pub sharpness: f32,
+    /// Crossed along ξ (0) or η (1).
+    pub axis: usize,
+    pub block: u8,
 }
 
 /// The model in single precision, for the many edge points.
@@ -79,11 +86,13 @@ impl NarrowModel {
     }
 }
 
-/// Where along `n` from `p` the image steps up, pixels, and how strongly: the centre of mass of the
-/// gradient under a biweight window of half width `half`, which follows the centre it finds. A blurred edge is
-/// symmetric, and so is the window: the centre is not biased by where the search began.
+/// Where along `n` from `p` the image steps up, pixels, and how well that is known (inverse to its error): where
+/// the gradient is balanced under a biweight window of half width `half` (ψ(d) = d (1 − d²/h²)²). A blurred
+/// edge is symmetric, and so is the window: the place is not biased by where the search began. An edge that
+/// motion has smeared over more than the window is level inside it; it is found by Newton's steps, not by
+/// the centre of mass, which would stay where it was put, and the slope of its balance tells what it is worth.
 #[inline(always)]
-fn edge_offset(image: ImageView<'_>, p: Point, n: Point, half: f32) -> Option<(f32, f32)> {
+fn edge_offset(image: ImageView<'_>, p: Point, n: Point, half: f32) -> Option<(f32, f32, f32)> {
     const MOST: usize = 16;
     let spacing = (half * 0.25).max(0.5);
     let reach = ((half * 1.5 / spacing).ceil() as usize).min(MOST / 2 - 1);
@@ -102,32 +111,38 @@ fn edge_offset(image: ImageView<'_>, p: Point, n: Point, half: f32) -> Option<(f
         *gradient = value - before;
         before = value;
     }
-    let (mut center, mut mass) = (0.0f32, 0.0);
+    let (mut center, mut strength, mut sharpness) = (0.0f32, 0.0f32, 0.0f32);
     let per_half = 1.0 / half;
     for _ in 0..3 {
         // Eight sums side by side, so that they fit vector registers.
-        let (mut firsts, mut sums) = ([0.0f32; LANES], [0.0f32; LANES]);
+        let (mut firsts, mut sums, mut slopes) = ([0.0f32; LANES], [0.0f32; LANES], [0.0f32; LANES]);
         for (chunk, gradients) in gradients.chunks_exact(LANES).enumerate() {
             for lane in 0..LANES {
                 let d = ((chunk * LANES + lane) as f32 + 0.5 - reach as f32) * spacing - center;
-                let taper = (1.0 - (d * per_half) * (d * per_half)).max(0.0);
-                let weight = gradients[lane] * taper * taper;
-                firsts[lane] += weight * d;
-                sums[lane] += weight;
+                let square = (d * per_half) * (d * per_half);
+                let taper = (1.0 - square).max(0.0);
+                let weight = gradients[lane] * taper;
+                firsts[lane] += weight * taper * d;
+                sums[lane] += weight * taper;
+                slopes[lane] += weight * (taper - 4.0 * square);
             }
         }
         let (first, sum) = (total(firsts), total(sums));
         if !(sum > 3.0) {
             return None;
         }
-        center += (first / sum).clamp(-0.5 * half, 0.5 * half);
-        mass = sum;
+        strength = total(slopes);
+        sharpness = strength / sum;
+        center += (first / strength.max(LEAST_SLOPE * sum)).clamp(-0.5 * half, 0.5 * half);
         if center.abs() > 0.6 * half {
             return None;
         }
     }
-    Some((center, mass))
+    (strength > 0.0).then_some((center, strength, sharpness))
 }
+
+/// Least share of an edge's height in its slope that a step is divided by.
+const LEAST_SLOPE: f32 = 0.25;
 
 const LANES: usize = 8;
 
@@ -143,7 +158,8 @@ pub(super) struct Locate<'a> {
     pub located: &'a mut Vec<Located>,
     pub image: ImageView<'a>,
     pub model: NarrowModel,
-    pub half: f32,
+    /// Half widths of the window for edges that are crossed along ξ and along η, pixels.
+    pub half: [f32; 2],
     pub every: usize,
 }
 
@@ -153,8 +169,10 @@ impl Kernel for Locate<'_> {
         self.located.clear();
         for point in self.points.iter().step_by(self.every) {
             let (p, n, row) = self.model.edge_at(point);
-            if let Some((offset, strength)) = edge_offset(self.image, p, n, self.half) {
-                self.located.push(Located { row, residual: offset, strength });
+            let axis = usize::from(point.light[0] == 0.0);
+            if let Some((residual, strength, sharpness)) = edge_offset(self.image, p, n, self.half[axis]) {
+                let block = point.block;
+                self.located.push(Located { row, residual, strength, sharpness, axis, block });
             }
         }
     }

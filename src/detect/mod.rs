@@ -20,6 +20,7 @@ mod quad;
 mod refine;
 mod simd;
 mod tag;
+mod windows;
 
 pub use frame::FrameDetector;
 pub use pattern::{TagPattern, tag_pattern};

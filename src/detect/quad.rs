@@ -24,6 +24,10 @@ const LEAST_ASPECT: f32 = 0.25;
 /// Largest share of its hull that a border with the dark cells it holds together covers.
 const MOST_FILL: f32 = 0.93;
 
+/// Fewest times that a row of a border is crossed, in the mean: twice, but for the rows above and below the
+/// inside.
+const LEAST_CROSSINGS: f32 = 1.3;
+
 /// Whether a component can be a tag's border, by box and area alone.
 pub(super) fn may_be_border(c: &Component, limits: SizeLimits, width: usize, height: usize) -> bool {
     let (w, h) = (c.width() as f32, c.height() as f32);
@@ -35,9 +39,11 @@ pub(super) fn may_be_border(c: &Component, limits: SizeLimits, width: usize, hei
     // A border is a quarter to a half of its tag; of a large one only a rim is dark against what is near.
     let area = c.area as f32;
     let fill_fits = area >= (0.17 * w * h).min(2.0 * (w + h)) && area <= MOST_FILL * w * h;
+    // Pebbles are crossed once.
+    let is_open = c.runs as f32 >= LEAST_CROSSINGS * h;
     let inside =
         c.left > 0 && c.top > 0 && usize::from(c.right) + 1 < width && usize::from(c.bottom) + 1 < height;
-    size_fits && shape_fits && fill_fits && inside
+    size_fits && shape_fits && fill_fits && is_open && inside
 }
 
 /// Finds quadrilaterals in outlines; keeps its buffers.

@@ -4,7 +4,8 @@
 //! Model, with ξ, η ∈ [−1, 1] across the border square: `p = H(ξ, η) + c₁ (η² − 1) x̂ + c₂ (ξ² − 1) ŷ`, a
 //! homography and two bows, which is what a lens does to the straight sides of a large tag; x̂, ŷ are the
 //! tag's axes in the image. The bows vanish at the corners and are held near nought by what a wide lens
-//! does. Gauss–Newton on distances along edge normals, Cauchy weights.
+//! does. Gauss–Newton on distances along edge normals, each weighed by how well its edge is placed, Cauchy's
+//! weights on top.
 
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
@@ -13,6 +14,7 @@ use super::family::Family;
 use super::homography::Homography;
 use super::quad::{Quad, distance};
 use super::simd::Simd;
+use super::windows::Windows;
 use crate::msg::ImageView;
 
 type Information = SMatrix<f64, PARAMETERS, PARAMETERS>;
@@ -34,24 +36,27 @@ pub(super) struct Refined {
 /// gives 2·10⁻⁴ to 6·10⁻⁴ towards the rim.
 const LENS_CURVATURE: f64 = 3e-4;
 
-/// Neighbouring points share pixels, so that their errors are alike: independent points are fewer by this,
-/// and by more where blur reaches from cell to cell, below about `SHARED_CELL` pixels a cell. Measured on
-/// generated tags.
-const SHARED: f64 = 1.7;
-const SHARED_CELL: f64 = 4.0;
+/// Cells on a side of a block: the errors of edges that near each other are alike, for they share pixels.
+const BLOCK: usize = 2;
 
-/// Error that neighbouring cells put on an edge, pixels at one pixel a cell: blur brings them in where cells
-/// are small, and with the cube of their size it is gone. Measured on generated tags.
-const NEIGHBOURS: f64 = 4.5;
+/// Blocks of the largest grid, and how many blocks' worth the fit takes up of the errors it is made from.
+const MOST_BLOCKS: usize = 32;
+const TAKEN_UP: f64 = 3.0;
+
+/// Error that neighbouring cells put on all edges of one direction alike, pixels, at a blur of one pixel and one
+/// pixel a cell: it grows with the square of the blur and falls with the cube of the cell. Measured on generated
+/// tags.
+const NEIGHBOURS: f64 = 3.6;
 
 /// What stays of an edge's error when noise is averaged away: sampling, neighbouring cells, print. Pixels.
 const FLOOR_PX: f64 = 0.02;
 
 /// A step that moves no corner further is the last, pixels: each is about a third of the one before.
 const SETTLED_PX: f64 = 0.02;
+const MOST_ROUNDS: usize = 10;
 
-/// Weights that follow residuals make each step about a third too short.
-const OVERSTEP: f64 = 1.4;
+/// Fewest edge points.
+const LEAST_EDGES: usize = 24;
 
 /// Finds edges and fits them; keeps its buffers.
 #[derive(Clone, Debug)]
@@ -82,29 +87,63 @@ impl Refiner {
         self.place_points(family, id, cell);
         let mut model = Model::of_corners(corners)?;
         let bow = LENS_CURVATURE * f64::from(edge).powi(2) / 8.0;
-        let mut information = Information::zeros();
-        let mut variance = 0.0;
-        for round in 0..6 {
-            let half = if round == 0 { (0.7 * cell).clamp(1.5, 6.0) } else { (0.5 * cell).clamp(1.25, 4.0) };
-            self.locate(image, &model, half as f32, if round == 0 { 2 } else { 1 });
-            if self.located.len() < 24 {
-                return None;
-            }
-            let spread = self.spread();
-
-            let (step, info, var) = self.solve(&model, bow, spread)?;
-            let before = model;
-            model.theta += step * if round == 0 { 1.0 } else { OVERSTEP };
-            (information, variance) = (info, var);
-            if round > 0 && model.moved(&before) < SETTLED_PX {
-                break;
-            }
-        }
-        let refined = model.result(&information, variance, cell)?;
+        let (covariance, windows) = self.fit(image, &mut model, family.width, bow)?;
+        let (pitches, blurs) = (model.pitches(family.width), windows.blurs_squared());
+        let neighbours = [0, 1].map(|k| (NEIGHBOURS * blurs[k] / pitches[k].powi(3)).min(0.2 * pitches[k]));
+        let refined = model.result(&covariance, neighbours)?;
         let moved = (0..4).map(|i| {
             (refined.corners[i] - Vector2::new(f64::from(corners[i][0]), f64::from(corners[i][1]))).norm()
         });
         (moved.fold(0.0, f64::max) < (1.5 * cell).max(2.0)).then_some(refined)
+    }
+
+    /// Moves a model to where the edges are; the covariance of its parameters.
+    ///
+    /// First with few points and wide windows, until the corners are nearly right; then with all, in windows as
+    /// narrow as the blur allows: in one narrower than a smear, edges stay where they are put.
+    fn fit(
+        &mut self,
+        image: ImageView<'_>,
+        model: &mut Model,
+        cells: usize,
+        bow: f64,
+    ) -> Option<(Information, Windows)> {
+        let mut windows = Windows::default();
+        let (mut coarse, mut settled, mut spread) = (true, false, 0.0);
+        let mut last = None;
+        for round in 0..MOST_ROUNDS {
+            let pitches = model.pitches(cells);
+            windows.half = windows.halves(pitches, coarse);
+            self.locate(image, model, windows.half, if coarse { 2 } else { 1 });
+            if self.located.len() < LEAST_EDGES {
+                return None;
+            }
+            self.normalise();
+            if !settled {
+                spread = self.spread();
+            }
+            let solved = self.solve(model, bow, spread)?;
+            let before = *model;
+            let overstep = if coarse { 1.0 } else { (1.0 / solved.flattening).clamp(1.0, 1.6) };
+            model.theta += solved.step * overstep;
+            last = Some(solved);
+            let moved = model.moved(&before);
+            windows.sharpness = self.sharpness();
+            if windows.widen() && round + 2 < MOST_ROUNDS {
+                settled = false;
+                continue;
+            }
+            if !coarse && moved < SETTLED_PX {
+                break;
+            }
+            settled = moved < 0.1;
+            let nearly = 0.1 * pitches[0].min(pitches[1]);
+            if coarse && (moved < nearly || round + 6 >= MOST_ROUNDS) {
+                coarse = false;
+                windows.narrow();
+            }
+        }
+        Some((self.covariance(&last?, spread)?, windows))
     }
 
     /// Points along every edge between cells of different colour.
@@ -117,34 +156,55 @@ impl Refiner {
         self.lights.extend(around.map(|(x, y)| family.is_light(id, x, y) == Some(true)));
         let light = |x: i32, y: i32| self.lights[((y + 1) * (w + 2) + x + 1) as usize];
         let scale = 2.0 / w as f32;
-        for y in 0..w {
-            for x in 0..=w {
-                let edge = x as f32 * scale - 1.0;
-                let (upright, level) = ((light(x - 1, y), light(x, y)), (light(y, x - 1), light(y, x)));
-                for k in 0..per_cell {
-                    let along = (y as f32 + (k as f32 + 0.5) / per_cell as f32) * scale - 1.0;
-                    let sign = |to: bool| if to { 1.0 } else { -1.0 };
-                    if upright.0 != upright.1 {
-                        self.points.push(EdgePoint { xi: edge, eta: along, light: [sign(upright.1), 0.0] });
-                    }
-                    if level.0 != level.1 {
-                        self.points.push(EdgePoint { xi: along, eta: edge, light: [0.0, sign(level.1)] });
-                    }
-                }
+        let blocks = w as usize / BLOCK + 1;
+        let block = |x: usize, y: usize| (x / BLOCK * blocks + y / BLOCK) as u8;
+        // Upright edges, left of cell (x, y), and level ones, above cell (y, x).
+        for (y, x, upright) in (0..w).flat_map(|y| (0..=w).flat_map(move |x| [(y, x, true), (y, x, false)])) {
+            let cell = |x: i32| if upright { light(x, y) } else { light(y, x) };
+            let (before, after) = (cell(x - 1), cell(x));
+            if before == after {
+                continue;
+            }
+            let sign = if after { 1.0 } else { -1.0 };
+            let across = x as f32 * scale - 1.0;
+            let (x, y) = (x as usize, y as usize);
+            for k in 0..per_cell {
+                let along = (y as f32 + (k as f32 + 0.5) / per_cell as f32) * scale - 1.0;
+                self.points.push(match upright {
+                    true => EdgePoint { xi: across, eta: along, light: [sign, 0.0], block: block(x, y) },
+                    false => EdgePoint { xi: along, eta: across, light: [0.0, sign], block: block(y, x) },
+                });
             }
         }
     }
 
-    fn locate(&mut self, image: ImageView<'_>, model: &Model, half: f32, every: usize) {
+    fn locate(&mut self, image: ImageView<'_>, model: &Model, half: [f32; 2], every: usize) {
         let Self { points, located, .. } = self;
         self.simd.run(Locate { points, located, image, model: model.narrow(), half, every });
     }
 
-    /// Robust spread of the residuals, pixels.
-    fn spread(&self) -> f64 {
-        let mut histogram = [0u32; 64];
+    /// Makes strengths relative to their mean. Strong edges are located better, up to the point where noise no
+    /// longer tells.
+    fn normalise(&mut self) {
+        let mean = self.located.iter().map(|l| l.strength).sum::<f32>() / self.located.len() as f32;
+        self.located.iter_mut().for_each(|l| l.strength = (l.strength / mean).min(1.5));
+    }
+
+    /// Mean sharpness of the edges crossed along ξ and along η.
+    fn sharpness(&self) -> [f64; 2] {
+        let mut sums = [(0.0f32, 1e-3f32); 2];
         for l in &self.located {
-            histogram[((l.residual.abs() * 32.0) as usize).min(63)] += 1;
+            sums[l.axis].0 += l.sharpness;
+            sums[l.axis].1 += 1.0;
+        }
+        sums.map(|(sum, count)| f64::from(sum / count))
+    }
+
+    /// Robust spread of the residuals of edges of mean strength, pixels.
+    fn spread(&self) -> f64 {
+        let mut histogram = [0u32; 100];
+        for l in &self.located {
+            histogram[((l.residual.abs() * l.strength * 32.0) as usize).min(99)] += 1;
         }
         let (mut below, mut median) = (0, 2.0);
         for (bin, count) in histogram.iter().enumerate() {
@@ -157,24 +217,22 @@ impl Refiner {
         (1.4826 * median).max(0.08)
     }
 
-    fn solve(&self, model: &Model, bow: f64, spread: f64) -> Option<(Row, Information, f64)> {
+    fn solve(&self, model: &Model, bow: f64, spread: f64) -> Option<Solved> {
         let mut sums = [[0.0f32; PADDED]; PARAMETERS];
         let mut rights = [0.0f32; PADDED];
-        let (mut sum, mut weights) = (0.0, 0.0);
+        let (mut sum, mut weights, mut slopes) = (0.0, 0.0, 0.0);
         let count = self.located.len() as f32;
-        let mean = self.located.iter().map(|l| l.strength).sum::<f32>() / count;
         for l in &self.located {
-            let normalised = l.residual / (2.0 * spread as f32);
-            // Strong edges are located better, up to the point where noise no longer tells.
-            let weight = (l.strength / mean).min(1.5) / (1.0 + normalised * normalised);
+            let (weight, slope) = weigh(l, l.residual, spread as f32);
             for (sums, r) in sums.iter_mut().zip(l.row) {
                 add_scaled(sums, weight * r, &l.row);
             }
             add_scaled(&mut rights, weight * l.residual, &l.row);
             sum += weight * l.residual * l.residual;
             weights += weight;
+            slopes += slope;
         }
-        let variance = f64::from(sum / weights * count / (count - 8.0));
+        let variance = f64::from(sum / count * count / (count - 8.0));
         let mut information = Information::from_fn(|i, j| f64::from(sums[i.min(j)][i.max(j)]));
         let mut right = Row::from_fn(|i, _| f64::from(rights[i]));
         for k in 8..PARAMETERS {
@@ -182,9 +240,54 @@ impl Refiner {
             information[(k, k)] += hold;
             right[k] -= hold * model.theta[k];
         }
-        let step = information.cholesky()?.solve(&right);
-        step.iter().all(|s| s.is_finite()).then_some((step, information, variance))
+        let inverse = information.cholesky()?.inverse();
+        let step = inverse * right;
+        let flattening = f64::from(slopes / weights);
+        step.iter().all(|s| s.is_finite()).then_some(Solved { step, inverse, flattening })
     }
+
+    /// Covariance of the parameters: of M-estimates, with errors that are alike within a block. How much more
+    /// they err together than each by itself is one number, from the blocks' pulls `g` on the parameters:
+    /// `λ = Σ gᵀ A⁻¹ g / p`, which counts noise and whatever else the model leaves over; the covariance is
+    /// `λ A⁻¹ / ρ²`, ρ being how much Cauchy's weights flatten the residuals.
+    fn covariance(&self, solved: &Solved, spread: f64) -> Option<Information> {
+        let mut pulls = [[0.0f32; PADDED]; MOST_BLOCKS];
+        for l in &self.located {
+            let moved: f64 = (0..PARAMETERS).map(|k| f64::from(l.row[k]) * solved.step[k]).sum();
+            let residual = l.residual - moved as f32;
+            let (weight, _) = weigh(l, residual, spread as f32);
+            add_scaled(&mut pulls[usize::from(l.block)], weight * residual, &l.row);
+        }
+        let (mut sum, mut blocks) = (0.0, 0.0f64);
+        for pull in pulls.iter().filter(|b| b.iter().any(|x| *x != 0.0)) {
+            let pull = Row::from_fn(|i, _| f64::from(pull[i]));
+            sum += (pull.transpose() * solved.inverse * pull)[0];
+            blocks += 1.0;
+        }
+        // The fit takes up some of it, most in the corners. The bows are held: eight are free.
+        let lambda = sum / 8.0 / (1.0 - TAKEN_UP / blocks).max(0.5);
+        let flattening = solved.flattening.clamp(0.4, 1.0);
+        (blocks > 4.0).then(|| solved.inverse * (lambda / (flattening * flattening)))
+    }
+}
+
+/// One step of the fit.
+struct Solved {
+    step: Row,
+    /// Of the information matrix.
+    inverse: Information,
+    /// Mean slope of the weighted residuals over the mean weight.
+    flattening: f64,
+}
+
+/// Weight of an edge at a residual, inverse to its variance and Cauchy's in units of `spread`, and the slope of
+/// weight times residual there.
+#[inline(always)]
+fn weigh(l: &Located, residual: f32, spread: f32) -> (f32, f32) {
+    let normalised = residual * l.strength / (2.0 * spread);
+    let square = normalised * normalised;
+    let weight = l.strength * l.strength;
+    (weight / (1.0 + square), weight * (1.0 - square) / ((1.0 + square) * (1.0 + square)))
 }
 
 #[inline(always)]
@@ -253,11 +356,21 @@ impl Model {
         }
     }
 
-    fn result(&self, information: &Information, variance: f64, cell: f64) -> Option<Refined> {
-        let shared = SHARED * (1.0 + (SHARED_CELL / cell).powi(3));
-        let covariance = information.cholesky()?.inverse() * (variance * shared);
-        let neighbours = (NEIGHBOURS / cell.powi(3)).min(0.25);
-        let floor = Matrix2::identity() * (FLOOR_PX * FLOOR_PX + neighbours * neighbours);
+    /// Width of a cell across its edges, for edges crossed along ξ and along η, at the tag's middle, pixels.
+    fn pitches(&self, width: usize) -> [f64; 2] {
+        let t = &self.theta;
+        let (d_xi, d_eta) = (
+            Vector2::new(t[0] - t[2] * t[6], t[3] - t[5] * t[6]),
+            Vector2::new(t[1] - t[2] * t[7], t[4] - t[5] * t[7]),
+        );
+        let area = (d_xi.x * d_eta.y - d_xi.y * d_eta.x).abs() * 2.0 / width as f64;
+        [area / d_eta.norm().max(1e-9), area / d_xi.norm().max(1e-9)]
+    }
+
+    /// Corners and centre with their covariances; `neighbours` are errors common to all edges along ξ and η.
+    fn result(&self, covariance: &Information, neighbours: [f64; 2]) -> Option<Refined> {
+        let common = (0..2).map(|i| self.axes[i] * self.axes[i].transpose() * neighbours[i].powi(2));
+        let floor = common.fold(Matrix2::identity() * FLOOR_PX.powi(2), |sum, c| sum + c);
         let at = |xi: f64, eta: f64| {
             let (p, jacobian) = self.at(xi, eta);
             (p + self.origin, jacobian * covariance * jacobian.transpose() + floor)

@@ -7,7 +7,7 @@ use super::family::{Family, Word};
 use super::noise::noise_sigma;
 use super::payload;
 use super::pyramid::{Base, Level, Pyramid};
-use super::quad::{Quad, QuadFinder, SizeLimits, distance, looks_like_tag, may_be_border};
+use super::quad::{Quad, QuadFinder, SizeLimits, distance, looks_like_tag, may_be_border, polygon_area};
 use super::refine::{Refined, Refiner};
 use super::simd::Simd;
 use crate::config::TagFamily;
@@ -72,9 +72,11 @@ struct Found {
 
 /// Where between the local minimum and maximum dark and light are divided, of 256. Low keeps a border whole
 /// where a shadow's edge crosses the tag; a second time higher up for borders that are blurred, which the
-/// coarser levels can afford, and small tags need in the finest.
+/// coarser levels can afford, and small tags need in the finest. In the coarser ones a third time lower still:
+/// where a deep shadow ends, its paper is not much lighter than ink in the light.
 const FRACTIONS_ONCE: [u16; 1] = [85];
 const FRACTIONS_TWICE: [u16; 2] = [72, 116];
+const FRACTIONS_THRICE: [u16; 3] = [40, 72, 116];
 
 /// Smallest edge in a level at which a border can be told from its surroundings, pixels.
 const LEAST_EDGE_IN_LEVEL: f32 = 12.0;
@@ -158,8 +160,11 @@ impl TagDetector {
         let first = usize::from(base != Base::Full).min(self.pyramid.len() - 1);
         let last = (first + 2).min(self.pyramid.len() - 1);
         for n in (first..=last).rev() {
-            let once = n == first && base == Base::Half;
-            let fractions: &[u16] = if once { &FRACTIONS_ONCE } else { &FRACTIONS_TWICE };
+            let fractions: &[u16] = match (n == first, base) {
+                (true, Base::Half) => &FRACTIONS_ONCE,
+                (true, _) => &FRACTIONS_TWICE,
+                (false, _) => &FRACTIONS_THRICE,
+            };
             self.search_level(image, n, fractions, inverted);
         }
     }
@@ -170,9 +175,9 @@ impl TagDetector {
         let (width, height) = (level.image.width, level.image.height);
         // Noise alone spans some five sigmas in the 144 pixels of a neighbourhood.
         let gate = (7.0 * self.noise / level.scale).clamp(12.0, 60.0) as u8;
-        self.binariser.measure(level.image, self.simd);
+        self.binariser.measure(level.image, gate, self.simd);
         for &fraction in fractions {
-            self.binariser.mark(level.image, gate, fraction, &mut self.bits, self.simd);
+            self.binariser.mark(level.image, fraction, &mut self.bits, self.simd);
             self.labeller.label(&self.bits, self.simd, |c| may_be_border(c, limits, width, height));
             for (component, outline) in self.labeller.kept() {
                 let Some(quad) = self.finder.quad(component, outline, limits) else { continue };
@@ -193,18 +198,19 @@ impl TagDetector {
 /// A quadrilateral of a level, in frame coordinates, with its sides fitted to the image; `None` where the
 /// image does not step from dark to light along them.
 fn straighten(level: Level<'_>, quad: &Quad, gate: u8) -> Option<Quad> {
-    let edge = mean_edge(quad);
+    // Seen aslant, a cell is narrower one way than the other.
+    let narrow = polygon_area(quad) / longest_edge(quad).max(1.0);
     let least_step = f32::from(gate) / 3.0;
-    if !looks_like_tag(level.image, quad, (edge / 16.0).clamp(0.8, 4.0), least_step) {
+    if !looks_like_tag(level.image, quad, (narrow / 16.0).clamp(0.8, 4.0), least_step) {
         return None;
     }
-    let search = EdgeSearch { reach: (edge / 8.0).clamp(1.5, 3.0), least_step };
+    let search = EdgeSearch { reach: (narrow / 8.0).clamp(1.0, 3.0), least_step };
     let quad = fit_sides(level.image, quad, search)?;
     Some(quad.map(|p| p.map(|c| level.to_frame(c))))
 }
 
-fn mean_edge(quad: &Quad) -> f32 {
-    (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).sum::<f32>() / 4.0
+fn longest_edge(quad: &Quad) -> f32 {
+    (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).fold(0.0, f32::max)
 }
 
 fn negate(image: ImageView<'_>, to: &mut GrayImage) {

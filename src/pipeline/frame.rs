@@ -87,29 +87,30 @@ fn damaged(encoding: FrameEncoding, reason: impl std::fmt::Display) -> FrameFaul
     FrameFault::Damaged { encoding, reason: reason.to_string() }
 }
 
+/// Decodes once: to luma alone, or where colours are wanted and there are any to luma and chroma.
 fn jpeg(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault> {
     let fault = |e: zune_jpeg::errors::DecodeErrors| damaged(FrameEncoding::Jpeg, format!("{e:?}"));
-    let decode_as = |space: ColorSpace| {
-        let options = DecoderOptions::default()
-            .jpeg_set_out_colorspace(space)
-            .set_max_width(LARGEST_SIDE)
-            .set_max_height(LARGEST_SIDE);
-        let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&frame.data[..]), options);
-        let pixels = decoder.decode().map_err(fault)?;
-        let (width, height) =
-            decoder.dimensions().ok_or_else(|| damaged(FrameEncoding::Jpeg, "it has no size"))?;
-        Ok::<_, FrameFault>((width, height, pixels))
-    };
-    let (width, height, luma) = decode_as(ColorSpace::Luma)?;
-    let gray = GrayImage::from_vec(width, height, luma)
-        .ok_or_else(|| damaged(FrameEncoding::Jpeg, "it has fewer pixels than its header says"))?;
-    let rgb = if want_rgb {
-        let (width, height, data) = decode_as(ColorSpace::RGB)?;
-        (data.len() == 3 * width * height).then_some(RgbImage { width, height, data })
-    } else {
-        None
-    };
-    Ok(DecodedFrame { gray, rgb })
+    let options = DecoderOptions::default().set_max_width(LARGEST_SIDE).set_max_height(LARGEST_SIDE);
+    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&frame.data[..]), options);
+    decoder.decode_headers().map_err(fault)?;
+    let with_chroma = want_rgb && decoder.input_colorspace() == Some(ColorSpace::YCbCr);
+    let space = if with_chroma { ColorSpace::YCbCr } else { ColorSpace::Luma };
+    decoder.set_options(options.jpeg_set_out_colorspace(space));
+    let mut pixels = decoder.decode().map_err(fault)?;
+    let (width, height) =
+        decoder.dimensions().ok_or_else(|| damaged(FrameEncoding::Jpeg, "it has no size"))?;
+    let short = || damaged(FrameEncoding::Jpeg, "it has fewer pixels than its header says");
+    if !with_chroma {
+        let gray = GrayImage::from_vec(width, height, pixels).ok_or_else(short)?;
+        return Ok(DecodedFrame { gray, rgb: None });
+    }
+    if pixels.len() != 3 * width * height {
+        return Err(short());
+    }
+    let luma = pixels.chunks_exact(3).map(|p| p[0]).collect();
+    let gray = GrayImage::from_vec(width, height, luma).ok_or_else(short)?;
+    pixels.chunks_exact_mut(3).for_each(|p| p.copy_from_slice(&yuv(p[0], p[1], p[2])));
+    Ok(DecodedFrame { gray, rgb: Some(RgbImage { width, height, data: pixels }) })
 }
 
 fn png(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault> {
@@ -244,6 +245,27 @@ mod tests {
             decode(&payload(FrameEncoding::Nv12, 2, 2, 0, vec![81, 81, 81, 81, 90, 240]), true).unwrap();
         let data = red.rgb.unwrap().data;
         assert!(data[0] > 200 && data[1] < 40 && data[2] < 40, "{data:?}");
+    }
+
+    #[test]
+    fn a_coloured_jpeg_has_the_same_luma_with_and_without_its_colours() {
+        let (width, height) = (64, 48);
+        let pixels: Vec<u8> = (0..width * height)
+            .flat_map(|i| if i % width < 32 { [200, 30, 30] } else { [40, (i / width * 4) as u8, 160] })
+            .collect();
+        let mut data = Vec::new();
+        jpeg_encoder::Encoder::new(&mut data, 95)
+            .encode(&pixels, width as u16, height as u16, jpeg_encoder::ColorType::Rgb)
+            .unwrap();
+        let frame = payload(FrameEncoding::Jpeg, 0, 0, 0, data);
+        let (plain, coloured) = (decode(&frame, false).unwrap(), decode(&frame, true).unwrap());
+        assert_eq!(plain.gray, coloured.gray);
+        assert_eq!(plain.rgb, None);
+        let rgb = coloured.rgb.unwrap();
+        let at = 3 * (20 * width + 10);
+        for (seen, drawn) in rgb.data[at..at + 3].iter().zip([200i32, 30, 30]) {
+            assert!((i32::from(*seen) - drawn).abs() < 12, "{:?}", &rgb.data[at..at + 3]);
+        }
     }
 
     #[test]

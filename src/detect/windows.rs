@@ -1,0 +1,66 @@
+//! The windows in which a tag's edges are looked for: as narrow as the blur allows, in either direction.
+
+/// Cells wider than this, pixels, have windows no wider: sharp edges are sampled too coarsely in wider ones.
+const WIDEST_CELL: f64 = 5.7;
+
+/// Sharpness of edges that need a wider window, and of those that do with a narrower one: a Gaussian's whose
+/// sigma is a half and 0.3 of the half width.
+const SMEARED: f64 = 0.5;
+const NARROW: f64 = 0.68;
+
+/// Half widths of the windows in which edges are looked for, along ξ and along η.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Windows {
+    /// Over the width of a cell.
+    widths: [f64; 2],
+    /// Pixels.
+    pub half: [f32; 2],
+    /// Mean of the edges found in them.
+    pub sharpness: [f64; 2],
+}
+
+impl Default for Windows {
+    fn default() -> Self {
+        Self { widths: [0.7; 2], half: [0.0; 2], sharpness: [1.0; 2] }
+    }
+}
+
+impl Windows {
+    pub fn halves(&self, pitches: [f64; 2], coarse: bool) -> [f32; 2] {
+        [0, 1].map(|axis| {
+            let (pitch, width) = (pitches[axis].min(WIDEST_CELL), self.widths[axis]);
+            // Two pixels' gradients at least, but hardly more than a cell.
+            let least = if coarse { pitch.clamp(1.0, 1.5) } else { (0.625 * pitch).clamp(0.8, 1.25) };
+            (width * pitch).clamp(least, 6.0) as f32
+        })
+    }
+
+    /// Widens where edges fill the window, as far as the neighbours allow; whether it did.
+    pub fn widen(&mut self) -> bool {
+        let mut widened = false;
+        for axis in 0..2 {
+            if self.sharpness[axis] < SMEARED && self.widths[axis] < 0.9 {
+                self.widths[axis] *= 1.3;
+                widened = true;
+            }
+        }
+        widened
+    }
+
+    /// Narrows where edges are narrow: less of the neighbours.
+    pub fn narrow(&mut self) {
+        for axis in 0..2 {
+            if self.sharpness[axis] > NARROW {
+                self.widths[axis] *= 0.7;
+            }
+        }
+    }
+
+    /// Variance of the blur, px², from what the windows say: `q = 1 / (1 + (2 σ / h)²)`, nearly.
+    pub fn blurs_squared(&self) -> [f64; 2] {
+        [0, 1].map(|axis| {
+            let (half, q) = (f64::from(self.half[axis]), self.sharpness[axis].clamp(0.2, 1.0));
+            half * half * (1.0 / q - 1.0) / 4.0
+        })
+    }
+}
