@@ -172,6 +172,7 @@ fn centres_are_within_the_bar_light_dark_and_red_round_and_aslant() {
                 nes / found
             );
             assert!(found >= 1.9 * FRAMES as f64, "{look:?} {tilt}: {found} found, seed 2");
+            assert!(nes / found < 5.0, "{look:?} {tilt}: normalised error squared {}, seed 2", nes / found);
             assert!(rms <= 0.15 && bias < 0.05, "{look:?} {tilt}: RMS {rms} px, bias {bias} px, seed 2");
         }
     }

@@ -266,19 +266,25 @@ fn fit_conic(points: &[Vector2<f64>], start: &Ellipse) -> Option<(Ellipse, f64, 
 ///
 /// A circle of radius ρ on a plane whose normal is θ off the line of sight, at distance Z and focal length f:
 /// half axes a = fρ/Z and b = a cos θ, and the far half looks smaller, so that the ellipse's centre lies
-/// nearer by a² sin θ cos θ / f, hence `a b √(1 − b²/a²) / f`, along the short axis. The side is told by
-/// where the camera stands: for a disc that faces along the optical axis, what is farther off the axis is
-/// farther away.
-pub(super) fn center_shift(blob: &Blob, focal_px: f64, principal: Vector2<f64>) -> Vector2<f64> {
+/// nearer by a² sin θ cos θ / f, hence `a b √(1 − b²/a²) / f`, along the short axis. Which side is farther the
+/// ellipse does not tell. For a disc that faces along the optical axis it is the one farther off the axis, and θ
+/// is the angle off it; where θ is more than that, the camera is tilted by the rest, one way or the other. The
+/// shift is taken in that share and the rest becomes covariance.
+pub(super) fn center_shift(
+    blob: &Blob,
+    focal_px: f64,
+    principal: Vector2<f64>,
+) -> (Vector2<f64>, Matrix2<f64>) {
     let [a, b] = blob.half_axes;
     let size = a * b * (1.0 - (b / a).powi(2)).max(0.0).sqrt() / focal_px;
     let minor = Vector2::new(-blob.major.y, blob.major.x);
-    let outwards = blob.center - principal;
     // Below a pixel's worth of flattening the direction of the short axis is noise.
-    if a - b < 0.02 * a || outwards.norm() < 1.0 {
-        return Vector2::zeros();
+    if a - b < 0.02 * a {
+        return (Vector2::zeros(), Matrix2::identity() * size * size);
     }
-    minor * (size * minor.dot(&outwards).signum())
+    let off_axis = (minor.dot(&(blob.center - principal)) / focal_px).atan();
+    let share = (off_axis / (b / a).acos()).clamp(-1.0, 1.0);
+    (minor * (size * share), minor * minor.transpose() * (size * size * (1.0 - share * share)))
 }
 
 #[cfg(test)]

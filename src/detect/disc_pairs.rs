@@ -189,10 +189,11 @@ impl DiscPairs {
 
     fn detection(&self, disc: usize, blob: &Blob) -> MarkerDetection {
         let Disc { target, marker, .. } = self.discs[disc];
+        let (shift, doubt) = center_shift(blob, self.focal_px, self.principal);
         MarkerDetection {
             marker: MarkerId::Disc { target, marker },
-            center_px: blob.center + center_shift(blob, self.focal_px, self.principal),
-            center_cov_px2: blob.cov,
+            center_px: blob.center + shift,
+            center_cov_px2: blob.cov + doubt,
             corners_px: None,
             corner_cov_px2: [Matrix2::zeros(); 4],
             hamming: 0,
