@@ -253,10 +253,7 @@ mod tests {
         let pixels: Vec<u8> = (0..width * height)
             .flat_map(|i| if i % width < 32 { [200, 30, 30] } else { [40, (i / width * 4) as u8, 160] })
             .collect();
-        let mut data = Vec::new();
-        jpeg_encoder::Encoder::new(&mut data, 95)
-            .encode(&pixels, width as u16, height as u16, jpeg_encoder::ColorType::Rgb)
-            .unwrap();
+        let data = crate::jpeg::encode(&pixels, crate::jpeg::Layout::Rgb, (width, height), 95).unwrap();
         let frame = payload(FrameEncoding::Jpeg, 0, 0, 0, data);
         let (plain, coloured) = (decode(&frame, false).unwrap(), decode(&frame, true).unwrap());
         assert_eq!(plain.gray, coloured.gray);
