@@ -243,10 +243,10 @@ mod tests {
             inbox.put(at(ms + 1), EventBody::CompassBytes(vec![0]));
             taken.extend(inbox.take(Duration::ZERO));
         }
-        // Then it comes to a frame all the same, and what was lost is told with it, once.
+        // Then it comes to a frame all the same, after the reads before it, and what was lost is told with it, once.
         let frames = taken.iter().filter(|e| matches!(e.body, EventBody::Frame(_))).count();
         let told = taken.iter().filter(|e| matches!(e.body, EventBody::Dropped { .. })).count();
-        assert!(frames >= 5 && told <= frames, "{frames} frames, {told} times told of lost ones: {taken:?}");
+        assert!(frames >= 3 && told <= frames, "{frames} frames, {told} times told of lost ones: {taken:?}");
     }
 
     #[test]
