@@ -212,3 +212,36 @@ fn what_is_ambiguous_is_refused() {
     assert_eq!(seen(&mut detector, &image, Some(&prediction)), []);
     assert_eq!(seen(&mut detector, &image, None).len(), 2);
 }
+
+#[test]
+fn a_disc_whose_partner_is_covered_is_found_where_it_is_foretold() {
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    let scene = Scene::random(&mut rng, Look::Light, 0.2, &[(0.5, 0.0, DIAMETERS[1])]);
+    let image = scene.render(&mut rng);
+    let mut detector = FrameDetector::new(&config(Look::Light, DIAMETERS));
+    assert_eq!(seen(&mut detector, &image, None), [], "alone it may be anything round");
+    let here = scene.truth(0) + Vector2::new(1.0, -1.5);
+    let marker = |marker: usize, center_px: Vector2<f64>| MarkerPrediction {
+        marker: MarkerId::Disc { target: 0, marker },
+        center_px,
+        sigma_px: 1.0,
+        size_px: DIAMETER_PX * DIAMETERS[marker] / DIAMETERS[0],
+    };
+    let away = here - Vector2::new(70.0, 0.0);
+    let mut prediction =
+        FramePrediction { markers: vec![marker(0, away), marker(1, here)], ..Default::default() };
+    for search in [false, true] {
+        prediction.search = search;
+        let found = seen(&mut detector, &image, Some(&prediction));
+        assert_eq!(found.len(), 1, "{found:?}");
+        assert_eq!(found[0].marker, MarkerId::Disc { target: 0, marker: 1 });
+        assert!((found[0].center_px - scene.truth(0)).norm() < 0.3, "{found:?}");
+    }
+    // Foretold of another size, or with the other's place as likely, it is not taken.
+    prediction.markers[1].size_px *= 0.6;
+    assert_eq!(seen(&mut detector, &image, Some(&prediction)), []);
+    let size_px = 1.2 * DIAMETER_PX;
+    prediction.markers = vec![marker(0, here), marker(1, here)];
+    prediction.markers.iter_mut().for_each(|m| m.size_px = size_px);
+    assert_eq!(seen(&mut detector, &image, Some(&prediction)), []);
+}

@@ -151,26 +151,50 @@ impl DiscPairs {
     fn assign(&self, target: usize, prediction: Option<&FramePrediction>, out: &mut Vec<MarkerDetection>) {
         let mut discs = (0..self.discs.len()).filter(|&i| self.discs[i].target == target);
         match (discs.next(), discs.next()) {
-            (Some(only), None) => {
-                // Nothing but its place tells a single disc from other round things.
-                let predicted = predicted(&self.discs[only], prediction).is_some();
-                let mut candidates = self.candidates(only, prediction);
-                if let (Some(blob), None, true) = (candidates.next(), candidates.next(), predicted) {
-                    out.push(self.detection(only, blob));
-                }
-            }
+            (Some(only), None) => out.extend(self.alone(only, prediction)),
             (Some(first), Some(second)) => {
                 let (a, b) = (&self.discs[first], &self.discs[second]);
                 let mut pairs = self
                     .candidates(first, prediction)
                     .flat_map(|p| self.candidates(second, prediction).map(move |q| (p, q)))
                     .filter(|(p, q)| is_pair((a, p), (b, q)));
-                if let (Some((p, q)), None) = (pairs.next(), pairs.next()) {
-                    out.push(self.detection(first, p));
-                    out.push(self.detection(second, q));
+                match (pairs.next(), pairs.next()) {
+                    (Some((p, q)), None) => {
+                        out.push(self.detection(first, p));
+                        out.push(self.detection(second, q));
+                    }
+                    (Some(_), Some(_)) => {}
+                    (None, _) => out.extend(self.left_over(first, second, prediction)),
                 }
             }
             (None, _) => {}
+        }
+    }
+
+    /// A disc by itself: nothing but its place and size tell it from other round things.
+    fn alone(&self, disc: usize, prediction: Option<&FramePrediction>) -> Option<MarkerDetection> {
+        predicted(&self.discs[disc], prediction)?;
+        let mut candidates = self.candidates(disc, prediction);
+        match (candidates.next(), candidates.next()) {
+            (Some(blob), None) => Some(self.detection(disc, blob)),
+            _ => None,
+        }
+    }
+
+    /// The disc of a pair whose other one is covered: where it is foretold, while nothing there can be the
+    /// other.
+    fn left_over(
+        &self,
+        first: usize,
+        second: usize,
+        prediction: Option<&FramePrediction>,
+    ) -> Option<MarkerDetection> {
+        predicted(&self.discs[first], prediction).and(predicted(&self.discs[second], prediction))?;
+        let is_there = |disc| self.candidates(disc, prediction).next().is_some();
+        match (is_there(first), is_there(second)) {
+            (true, false) => self.alone(first, prediction),
+            (false, true) => self.alone(second, prediction),
+            _ => None,
         }
     }
 
