@@ -15,9 +15,8 @@ use super::sense::Noted;
 const QUEUE_LIMIT: Duration = Duration::from_millis(30);
 /// Standing delay below which more is tried.
 const QUEUE_EMPTY: Duration = Duration::from_millis(15);
-/// Where the search begins, bytes a second: carries a vehicle's estimates and the helicopter's at 15 Hz at once,
-/// and is little enough above the 6,000 of a radio of 48 kbit/s not to begin with a long queue there.
-const RATE_AT_START: f64 = 7_500.0;
+/// Where the search begins, bytes a second: carries two vehicles at 15 Hz over the slowest radios.
+const RATE_AT_START: f64 = 10_000.0;
 /// Never less than this, bytes a second: it finds out when the path is back.
 const RATE_LEAST: f64 = 1_500.0;
 /// Never more than this, bytes a second.
