@@ -6,7 +6,7 @@
 //! [`mcap_record`](super::mcap_record), and what a file defines is kept once and within a limit: a
 //! hostile file costs at most some hundreds of megabytes while it is read.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -14,14 +14,10 @@ use std::sync::Arc;
 
 use mcap::records::{Record as McapRecord, op};
 
+use super::mcap_definitions::{ChannelInfo, Definitions};
 use super::mcap_record::{RECORD_HEAD, longest, parse, sized_u32, split, unpack_chunk};
 use crate::time::MonoTime;
 
-/// Schemas and channels of a file are kept up to so many bytes: a thousand channels of this program
-/// take a tenth of it.
-const MAX_DEFINITIONS: usize = 1 << 26;
-/// Memory that a definition takes beside its bytes, near enough for a limit.
-const DEFINITION_COST: usize = 256;
 /// Longest attachment that is read: a configuration, not a film.
 const MAX_ATTACHMENT: u64 = 1 << 24;
 
@@ -48,30 +44,6 @@ pub enum ReadError {
         /// The directory.
         path: PathBuf,
     },
-}
-
-/// A schema of a recording.
-#[derive(Clone, PartialEq, Eq, Debug, Default)]
-pub struct SchemaInfo {
-    /// Its name; empty stands for no schema.
-    pub name: String,
-    /// How it is written, e.g. `protobuf`.
-    pub encoding: String,
-    /// The schema.
-    pub data: Vec<u8>,
-}
-
-/// A channel of a recording: topic and schema.
-#[derive(Clone, PartialEq, Eq, Debug, Default)]
-pub struct ChannelInfo {
-    /// Topic.
-    pub topic: String,
-    /// Encoding of its messages.
-    pub message_encoding: String,
-    /// Its schema, shared by all channels that have it.
-    pub schema: Arc<SchemaInfo>,
-    /// What else its writer said of it.
-    pub metadata: BTreeMap<String, String>,
 }
 
 /// A message of a recording.
@@ -126,17 +98,6 @@ struct OpenFile {
     definitions: Definitions,
     /// The chunk being read: its records, and how far.
     chunk: Option<(Vec<u8>, usize)>,
-}
-
-/// Schemas and channels of a file, by number.
-#[derive(Default)]
-struct Definitions {
-    schemas: HashMap<u16, Arc<SchemaInfo>>,
-    channels: HashMap<u16, Arc<ChannelInfo>>,
-    /// Bytes taken by everything ever defined; what is said again does not count.
-    bytes: usize,
-    /// Whether something was left out because that was too much.
-    overfull: bool,
 }
 
 /// One record's frame: operation code and length of its body.
@@ -353,48 +314,6 @@ impl OpenFile {
             );
         }
         Step::Other
-    }
-}
-
-impl Definitions {
-    /// Takes a schema or channel whose record has so many bytes; false where there is no room for it.
-    fn learn(&mut self, record: McapRecord<'_>, bytes: usize) -> bool {
-        let room = self.bytes.saturating_add(bytes + DEFINITION_COST) <= MAX_DEFINITIONS;
-        match record {
-            McapRecord::Schema { header, data } => {
-                let same = |s: &Arc<SchemaInfo>| {
-                    s.name == header.name && s.encoding == header.encoding && s.data == *data
-                };
-                if self.schemas.get(&header.id).is_some_and(same) {
-                    return true;
-                }
-                if room {
-                    let data = data.into_owned();
-                    let schema = SchemaInfo { name: header.name, encoding: header.encoding, data };
-                    self.schemas.insert(header.id, Arc::new(schema));
-                }
-            }
-            McapRecord::Channel(channel) => {
-                let schema = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-                let info = ChannelInfo {
-                    topic: channel.topic,
-                    message_encoding: channel.message_encoding,
-                    schema,
-                    metadata: channel.metadata,
-                };
-                if self.channels.get(&channel.id).is_some_and(|known| **known == info) {
-                    return true;
-                }
-                if room {
-                    self.channels.insert(channel.id, Arc::new(info));
-                }
-            }
-            _ => return true,
-        }
-        if room {
-            self.bytes += bytes + DEFINITION_COST;
-        }
-        room
     }
 }
 

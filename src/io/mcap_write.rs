@@ -9,7 +9,7 @@ use std::sync::Arc;
 use mcap::records::MessageHeader;
 use mcap::{Attachment, Compression, WriteOptions};
 
-use super::mcap_read::{ChannelInfo, SchemaInfo};
+use super::mcap_definitions::{ChannelInfo, SchemaInfo};
 use super::records::Record;
 use crate::time::{MonoTime, Span};
 

@@ -6,6 +6,7 @@ pub mod clock;
 pub mod device;
 pub mod link;
 pub mod import;
+pub mod mcap_definitions;
 pub mod mcap_read;
 pub mod mcap_record;
 pub mod mcap_write;

@@ -62,6 +62,22 @@ fn state(n: i64) -> Record {
     }
 }
 
+/// A station with a page whose payload never answers.
+fn alone(keys: &Keys, web: SocketAddr) -> GroundSettings {
+    GroundSettings {
+        link: station_settings(keys.files(Role::Station, "base"), Some(([127, 0, 0, 1], 9).into())),
+        out: keys.path().join("out"),
+        web: Some(web),
+        token: None,
+        tiles: None,
+        nmea: None,
+        foxglove: None,
+        #[cfg(feature = "zenoh")]
+        zenoh: None,
+        terminal: false,
+    }
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_station_keeps_shows_and_feeds_what_it_receives() {
     let keys = Keys::new();
@@ -70,15 +86,8 @@ async fn a_station_keeps_shows_and_feeds_what_it_receives() {
     let out = keys.path().join("out");
     let settings = GroundSettings {
         link: station_settings(keys.files(Role::Station, "base"), Some(payload.address)),
-        out: out.clone(),
-        web: Some(web),
-        token: None,
-        tiles: None,
         nmea: Some(nmea),
-        foxglove: None,
-        #[cfg(feature = "zenoh")]
-        zenoh: None,
-        terminal: false,
+        ..alone(&keys, web)
     };
     let stop = tokio::sync::watch::Sender::new(false);
     let running = tokio::spawn(ground::run(settings, stop.subscribe()));
@@ -122,18 +131,7 @@ async fn a_station_keeps_shows_and_feeds_what_it_receives() {
 async fn a_page_beyond_loopback_asks_for_its_token() {
     let keys = Keys::new();
     let web: SocketAddr = ([0, 0, 0, 0], free_port().port()).into();
-    let settings = GroundSettings {
-        link: station_settings(keys.files(Role::Station, "base"), Some(([127, 0, 0, 1], 9).into())),
-        out: keys.path().join("out"),
-        web: Some(web),
-        token: Some("open-sesame".into()),
-        tiles: None,
-        nmea: None,
-        foxglove: None,
-        #[cfg(feature = "zenoh")]
-        zenoh: None,
-        terminal: false,
-    };
+    let settings = GroundSettings { token: Some("open-sesame".into()), ..alone(&keys, web) };
     let stop = tokio::sync::watch::Sender::new(false);
     let running = tokio::spawn(ground::run(settings, stop.subscribe()));
     let reach: SocketAddr = ([127, 0, 0, 1], web.port()).into();
@@ -153,18 +151,7 @@ async fn bytes_that_are_no_request_leave_the_page_as_it_was() {
     use rand::{Rng as _, SeedableRng as _};
     let keys = Keys::new();
     let web = free_port();
-    let settings = GroundSettings {
-        link: station_settings(keys.files(Role::Station, "base"), Some(([127, 0, 0, 1], 9).into())),
-        out: keys.path().join("out"),
-        web: Some(web),
-        token: None,
-        tiles: Some(keys.path().join("tiles")),
-        nmea: None,
-        foxglove: None,
-        #[cfg(feature = "zenoh")]
-        zenoh: None,
-        terminal: false,
-    };
+    let settings = GroundSettings { tiles: Some(keys.path().join("tiles")), ..alone(&keys, web) };
     let stop = tokio::sync::watch::Sender::new(false);
     let running = tokio::spawn(ground::run(settings, stop.subscribe()));
     let local = "Host: 127.0.0.1\r\n";
