@@ -33,13 +33,13 @@ impl HostClock {
 
     /// Host time of a CLOCK_MONOTONIC stamp, as drivers give them.
     pub fn from_monotonic(&self, stamp: Duration) -> MonoTime {
-        MonoTime::from_ns(i64::try_from(stamp.as_nanos()).unwrap_or(i64::MAX)) + self.host_from_monotonic
+        MonoTime::from_unsigned_ns(stamp.as_nanos()) + self.host_from_monotonic
     }
 
     /// Host time of a recent CLOCK_REALTIME stamp, as the kernel's pulse-per-second gives them. The
     /// realtime clock may have been stepped since start, so its present distance is read anew.
     pub fn from_realtime(&self, stamp: Duration) -> MonoTime {
-        let realtime = MonoTime::from_ns(i64::try_from(stamp.as_nanos()).unwrap_or(i64::MAX));
+        let realtime = MonoTime::from_unsigned_ns(stamp.as_nanos());
         realtime - realtime_from_monotonic() + self.host_from_monotonic
     }
 

@@ -299,8 +299,8 @@ impl OpenFile {
             let Some(channel) = self.definitions.channels.get(&header.channel_id) else { return Step::Other };
             return Step::Message(RawMessage {
                 channel: Arc::clone(channel),
-                log_time: host_time(header.log_time),
-                publish_time: host_time(header.publish_time),
+                log_time: MonoTime::from_unsigned_ns(header.log_time),
+                publish_time: MonoTime::from_unsigned_ns(header.publish_time),
                 sequence: header.sequence,
                 data: data.into_owned(),
             });
@@ -323,11 +323,6 @@ fn chunk_records(body: &[u8]) -> Option<Vec<u8>> {
         McapRecord::Chunk { header, data } => unpack_chunk(&header, &data),
         _ => None,
     }
-}
-
-/// MCAP times are unsigned; what does not fit is the end of time.
-fn host_time(ns: u64) -> MonoTime {
-    MonoTime::from_ns(i64::try_from(ns).unwrap_or(i64::MAX))
 }
 
 /// The first attachment of that name in a recording, wherever in the file it stands.

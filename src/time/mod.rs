@@ -34,6 +34,12 @@ impl MonoTime {
         Self(ns)
     }
 
+    /// A time `ns` nanoseconds after the scale's zero, told without a sign, as in MCAP files and by the kernel;
+    /// what does not fit is the end of time.
+    pub fn from_unsigned_ns(ns: impl TryInto<i64>) -> Self {
+        Self(ns.try_into().unwrap_or(i64::MAX))
+    }
+
     /// Nanoseconds since the scale's zero.
     pub const fn ns(self) -> i64 {
         self.0

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::mirror::{RUN_FILE, segments};
+use super::mirror::{RUN_FILE, messages};
 use crate::time::MonoTime;
 
 /// A record out of the files.
@@ -35,33 +35,24 @@ fn subdirectories(dir: &Path) -> Vec<(String, std::path::PathBuf)> {
 }
 
 /// Gives every record of the payloads that `wanted` names, as far as it is on the disk, in the order in which
-/// the files hold them, until `give` says that it is enough. A file that was cut off counts as far as its
-/// whole chunks go.
+/// the files hold them, until `give` says that it is enough.
 pub fn read(root: &Path, wanted: impl Fn(&str) -> bool, mut give: impl FnMut(&Past<'_>) -> bool) {
     for (payload, dir) in subdirectories(root).iter().filter(|(name, _)| wanted(name)) {
         for (_, flight) in subdirectories(dir) {
             let text = std::fs::read_to_string(flight.join(RUN_FILE)).unwrap_or_default();
             let Ok(run) = u32::from_str_radix(text.trim(), 16) else { continue };
-            for path in segments(&flight) {
-                let Ok(bytes) = std::fs::read(&path) else { continue };
-                let options = mcap::read::Options::IgnoreEndMagic;
-                let Ok(stream) = mcap::MessageStream::new_with_options(&bytes, options.into()) else {
-                    continue;
+            for message in messages(&flight) {
+                let past = Past {
+                    payload,
+                    topic: &message.channel.topic,
+                    schema_name: &message.channel.schema.name,
+                    run,
+                    number: message.sequence,
+                    t: message.publish_time,
+                    data: &message.data,
                 };
-                for message in stream.map_while(Result::ok) {
-                    let schema = message.channel.schema.as_ref();
-                    let past = Past {
-                        payload,
-                        topic: &message.channel.topic,
-                        schema_name: schema.map_or("", |schema| &schema.name),
-                        run,
-                        number: message.sequence,
-                        t: MonoTime::from_ns(i64::try_from(message.publish_time).unwrap_or(i64::MAX)),
-                        data: &message.data,
-                    };
-                    if !give(&past) {
-                        return;
-                    }
+                if !give(&past) {
+                    return;
                 }
             }
         }

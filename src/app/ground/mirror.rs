@@ -12,6 +12,7 @@ use mcap::records::MessageHeader;
 use mcap::{Compression, WriteOptions};
 
 use crate::io::link::{Arrival, Channel, RangeSet};
+use crate::io::mcap_read::{McapReader, RawMessage};
 use crate::io::proto::schema_of_package;
 use crate::time::MonoTime;
 
@@ -218,17 +219,17 @@ fn flight_dir(root: &Path, payload: &str, flight: &str, run: u32) -> PathBuf {
     dirs.find(of_run).expect("some number is free")
 }
 
-/// Numbers of a run that the files of earlier lives hold. A segment that was cut off counts as far as its
-/// whole chunks go.
+/// Messages of a flight's directory, as far as they are on the disk: of a segment that is being written, or was
+/// cut off, every whole chunk.
+pub(super) fn messages(dir: &Path) -> impl Iterator<Item = RawMessage> {
+    McapReader::open(dir).into_iter().flatten()
+}
+
+/// Numbers of a run that the files of earlier lives hold.
 pub fn recall(root: &Path, payload: &str, flight: &str, run: u32) -> RangeSet {
     let mut numbers = RangeSet::new();
-    for path in segments(&flight_dir(root, payload, flight, run)) {
-        let Ok(bytes) = std::fs::read(&path) else { continue };
-        let options = mcap::read::Options::IgnoreEndMagic;
-        let Ok(stream) = mcap::MessageStream::new_with_options(&bytes, options.into()) else { continue };
-        for message in stream.map_while(Result::ok) {
-            numbers.insert(message.sequence);
-        }
+    for message in messages(&flight_dir(root, payload, flight, run)) {
+        numbers.insert(message.sequence);
     }
     numbers
 }

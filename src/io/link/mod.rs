@@ -6,6 +6,7 @@ mod backlog;
 mod dial;
 mod door;
 mod events;
+mod governor;
 mod inbox;
 pub mod keys;
 mod live;

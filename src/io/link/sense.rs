@@ -2,7 +2,7 @@
 //!
 //! QUIC's own congestion window is opened wide: a window that shrinks on loss would hold estimates back
 //! on a lossy radio, and one that fills during a cut would hold them back after it. What is sent is
-//! limited by [`super::pace`] instead, from the round-trip times and losses noted here.
+//! limited by [`super::governor`] instead, from the round-trip times and losses noted here.
 
 use std::any::Any;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -13,6 +13,11 @@ use quinn::congestion::{Controller, ControllerFactory};
 /// Wide enough never to hold anything back; the pacer of QUIC is idle above 2³² bytes.
 const WINDOW: u64 = 1 << 40;
 
+/// Classes of packets by size, each of [`CLASS`] bytes: packets of up to 1280 bytes.
+pub const CLASSES: usize = 20;
+/// Bytes.
+const CLASS: u64 = 64;
+
 /// What was noted since the last [`Sense::take`].
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct Noted {
@@ -20,8 +25,20 @@ pub struct Noted {
     pub acked: u64,
     /// Bytes given up as lost.
     pub lost: u64,
-    /// Least round-trip time among the acknowledged packets.
-    pub least_rtt: Option<Duration>,
+    /// Packets acknowledged.
+    pub packets: u64,
+    /// Least round-trip time among the acknowledged packets, by size.
+    pub least_rtt: [Option<Duration>; CLASSES],
+}
+
+impl Noted {
+    /// A packet was acknowledged so long after it was sent.
+    pub fn acknowledge(&mut self, bytes: u64, rtt: Duration) {
+        self.acked += bytes;
+        self.packets += 1;
+        let least = &mut self.least_rtt[((bytes / CLASS) as usize).min(CLASSES - 1)];
+        *least = Some(least.map_or(rtt, |least| least.min(rtt)));
+    }
 }
 
 /// Shared notes of one connection's path.
@@ -69,10 +86,7 @@ impl Controller for SenseController {
         _app_limited: bool,
         _rtt: &quinn_proto::RttEstimator,
     ) {
-        let rtt = now.saturating_duration_since(sent);
-        let mut notes = self.sense.notes();
-        notes.acked += bytes;
-        notes.least_rtt = Some(notes.least_rtt.map_or(rtt, |least| least.min(rtt)));
+        self.sense.notes().acknowledge(bytes, now.saturating_duration_since(sent));
     }
 
     fn on_congestion_event(&mut self, _now: Instant, _sent: Instant, _persistent: bool, lost: u64) {

@@ -13,11 +13,10 @@ const OVERHEAD: usize = 160;
 
 /// The record as it was handed in; `None` where its schema is another program's.
 fn record_of(queued: QueuedRecord) -> Option<Record> {
-    let time = |ns: u64| MonoTime::from_ns(i64::try_from(ns).unwrap_or(i64::MAX));
     Some(Record {
         schema: Schema::named(&queued.schema)?,
-        log_time: time(queued.log_ns),
-        publish_time: time(queued.publish_ns),
+        log_time: MonoTime::from_unsigned_ns(queued.log_ns),
+        publish_time: MonoTime::from_unsigned_ns(queued.publish_ns),
         topic: queued.topic.into(),
         data: queued.data,
     })

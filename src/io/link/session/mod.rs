@@ -12,7 +12,7 @@ use quinn::{Connection, SendStream};
 use tokio::sync::{Notify, mpsc};
 use tokio::time::Instant;
 
-use super::pace::Governor;
+use super::governor::Governor;
 use super::payload::{Shared, StationStatus};
 use super::peer::{Ended, Peer};
 use super::sense::Sense;
@@ -108,10 +108,11 @@ async fn run(
     let (control, control_queue) = mpsc::channel(64);
     let address = peer.connection.remote_address();
     let mapped = matches!(address.ip(), std::net::IpAddr::V6(ip) if ip.to_ipv4_mapped().is_none());
+    let headers = if mapped { 48.0 } else { 28.0 };
     let session = Session {
         shared: Arc::clone(shared),
         connection: peer.connection.clone(),
-        governor: Mutex::new(Governor::new(Instant::now())),
+        governor: Mutex::new(Governor::new(headers, Instant::now())),
         wanted: Mutex::default(),
         wanted_more: Notify::new(),
         live_waits: AtomicBool::new(false),
@@ -123,7 +124,7 @@ async fn run(
         unread: AtomicU64::new(0),
         predicted: AtomicU64::new(0),
         name: peer.name.clone(),
-        headers: if mapped { 48.0 } else { 28.0 },
+        headers,
     };
     let news = shared.news();
     tokio::select! {
