@@ -17,6 +17,13 @@ from browser import Browser  # noqa: E402
 from relay import Relay  # noqa: E402
 
 PICTURES = ROOT / "target/web"
+# Cards beside the map that hide a part of their content, or of their neighbour.
+CLIPPED = """(() => {
+  const cards = [...document.querySelectorAll("#column .card")].filter((card) => card.id !== "events-card");
+  const low = (card) => card.getBoundingClientRect().bottom;
+  return cards.filter((card, i) => card.scrollHeight > card.clientHeight + 1
+    || (i > 0 && low(cards[i - 1]) > card.getBoundingClientRect().top)).map((card) => card.id).join(" ");
+})()"""
 
 
 class Page(unittest.TestCase):
@@ -61,7 +68,13 @@ class Page(unittest.TestCase):
         self.becomes("coordinates", lambda text: text not in ("", before))
         more = lambda: browser.ask("fleet.get('alpha').targets.get('ugv').trail.length") > trail + 50  # noqa: E731
         rig.until(more, 60, lambda: "the trail does not grow")
-        browser.photograph(PICTURES / "desktop.png")
+        for width, height in (1280, 720), (1280, 900), (1920, 1080):
+            browser.size(width, height)
+            rig.until(lambda: browser.ask("innerHeight") == height, 10, lambda: "the window keeps its size")
+            self.assertEqual(browser.ask(CLIPPED), "", f"cards cut off at {width}x{height}")
+            browser.ask("draw.last = 0, dirty = true")
+            rig.until(lambda: browser.ask("!dirty"), 10, lambda: "it does not draw")
+            browser.photograph(PICTURES / f"desktop-{height}.png")
         browser.size(390, 844, phone=True)
         rig.until(lambda: browser.ask("innerWidth") == 390, 10, lambda: "no phone")
         self.assertLessEqual(browser.ask("document.documentElement.scrollWidth"), 390, "nothing sticks out")
