@@ -79,6 +79,12 @@ impl Bucket {
         self.rate = rate;
     }
 
+    /// Nothing more is sent, not even live data, until `bytes` have gone at the present rate.
+    pub fn pause(&mut self, bytes: f64, now: Instant) {
+        self.fill(now);
+        self.balance = self.balance.min(-self.live_debt() - bytes);
+    }
+
     /// Takes what was sent.
     pub fn charge(&mut self, bytes: f64) {
         self.balance -= bytes;
