@@ -79,10 +79,11 @@ impl Bucket {
         self.rate = rate;
     }
 
-    /// Nothing more is sent, not even live data, until `bytes` have gone at the present rate.
+    /// Nothing is sent until `bytes` have gone at the present rate; live data only for that part of the time that
+    /// its debt at higher rates does not cover.
     pub fn pause(&mut self, bytes: f64, now: Instant) {
         self.fill(now);
-        self.balance = self.balance.min(-self.live_debt() - bytes);
+        self.balance = self.balance.min(-LIVE_DEBT_LEAST - bytes);
     }
 
     /// Takes what was sent.
