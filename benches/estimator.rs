@@ -1,6 +1,7 @@
 //! Scores the estimator on simulated flights, without pixels or bytes, and prints a table.
 //!
-//! `cargo bench --bench estimator -- [--runs N] [--seconds S] [--no-features] [SCENARIO…]`
+//! `cargo bench --bench estimator -- [--runs N] [--seconds S] [--no-features] [--marker-px X] [--feature-px X]
+//! [--no-bound] [SCENARIO…]`
 
 use std::sync::Arc;
 
@@ -26,6 +27,8 @@ struct Score {
     nees3: f64,
     nees5: f64,
     nees2: f64,
+    /// Of heading, speed and yaw rate each.
+    apart: [f64; 3],
     lost: usize,
 }
 
@@ -56,6 +59,9 @@ impl Score {
             let last: Matrix3<f64> = p.fixed_view::<3, 3>(2, 2).into();
             let e3 = e.fixed_rows::<3>(2).into_owned();
             self.nees3 += last.try_inverse().map_or(f64::NAN, |i| (e3.transpose() * i * e3)[0]);
+            for (i, sum) in self.apart.iter_mut().enumerate() {
+                *sum += e[2 + i] * e[2 + i] / p[(2 + i, 2 + i)];
+            }
             self.nees5 +=
                 p.try_inverse().map_or(f64::NAN, |i: SMatrix<f64, 5, 5>| (e.transpose() * i * e)[0]);
             let two = p.fixed_view::<2, 2>(0, 0).into_owned();
@@ -80,6 +86,33 @@ impl Score {
             self.frames as f64 / self.owed.max(1) as f64,
         ])
     }
+
+    fn apart(&self) -> [f64; 3] {
+        self.apart.map(|sum| sum / self.frames.max(1) as f64)
+    }
+}
+
+/// An estimate beside the truth: each error with its sigma.
+fn line(e: &TargetEstimate, world: &World) -> String {
+    let head = format!("{:6.2} target {} {:?}", world.seconds(e.t_valid), e.target, e.status);
+    let Some((state, p)) = e.state.as_ref().and_then(|s| Some((s, s.covariance?))) else { return head };
+    let truth = world.vehicle(e.target, e.t_valid);
+    let reference = truth.reference(world.scenario().config.target[e.target].reference_m);
+    let sigma = |i: usize| p[(i, i)].sqrt();
+    format!(
+        "{head} north {:.2}±{:.2} m, east {:.2}±{:.2} m, heading {:.2}±{:.2} deg, speed {:.3}±{:.3} m/s, \
+         yaw rate {:.4}±{:.4} rad/s",
+        state.north_m - reference.x,
+        sigma(0),
+        state.east_m - reference.y,
+        sigma(1),
+        wrap_angle(state.heading_rad - truth.heading_rad).to_degrees(),
+        sigma(2).to_degrees(),
+        state.speed_mps - truth.speed_mps,
+        sigma(3),
+        state.yaw_rate_radps - truth.yaw_rate_radps,
+        sigma(4),
+    )
 }
 
 /// The truth as the bound takes it.
@@ -278,18 +311,28 @@ fn summary(runs: &[Figures]) -> String {
     text
 }
 
+/// Mean and spread over runs.
+fn summary_of(values: impl Iterator<Item = f64> + Clone) -> String {
+    let n = values.clone().count().max(1) as f64;
+    let mean = values.clone().sum::<f64>() / n;
+    let spread = (values.map(|x| (x - mean).powi(2)).sum::<f64>() / n).sqrt();
+    format!("{mean:.2}±{spread:.2}")
+}
+
 struct Run {
     filter: Figures,
     in_view: Figures,
     smoothed: Figures,
     paper: Figures,
     bound: Figures,
+    /// NEES of heading, speed and yaw rate each.
+    apart: [f64; 3],
     us_per_frame: f64,
     resets: usize,
     delay_error_ms: f64,
 }
 
-fn run(scenario: &Scenario, seed: u64, verbose: bool) -> Run {
+fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
     let world = Arc::new(World::new(scenario.clone(), seed));
     let config = &world.scenario().config;
     let site = Site {
@@ -338,6 +381,9 @@ fn run(scenario: &Scenario, seed: u64, verbose: bool) -> Run {
         for output in out.drain(..) {
             match output {
                 EstimatorOutput::Estimate(e) => {
+                    if verbose {
+                        println!("{}", line(&e, &world));
+                    }
                     f.add(&e, &world);
                     if shows(suite.observations(), config, e.target) {
                         in_view.add(&e, &world);
@@ -357,7 +403,8 @@ fn run(scenario: &Scenario, seed: u64, verbose: bool) -> Run {
         in_view: in_view.figures(),
         smoothed: s.figures(),
         paper: p.figures(),
-        bound: bound(&world, &site),
+        bound: if with_bound { bound(&world, &site) } else { Figures([f64::NAN; 8]) },
+        apart: f.apart(),
         us_per_frame: busy.s() * 1e6 / frames.max(1) as f64,
         resets,
         delay_error_ms: filter.gps_delay_s() * 1e3 - error,
@@ -370,12 +417,17 @@ fn main() {
     let mut features = None;
     let mut names = Vec::new();
     let mut verbose = false;
+    let mut with_bound = true;
+    let (mut marker_px, mut feature_px) = (None, None);
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
         match argument.as_str() {
             "--runs" => runs = arguments.next().and_then(|n| n.parse().ok()).expect("--runs takes a number"),
             "--seconds" => seconds = arguments.next().and_then(|n| n.parse().ok()),
             "--no-features" => features = Some(0),
+            "--no-bound" => with_bound = false,
+            "--marker-px" => marker_px = arguments.next().and_then(|n| n.parse().ok()),
+            "--feature-px" => feature_px = arguments.next().and_then(|n| n.parse().ok()),
             "--verbose" => verbose = true,
             "--bench" => {}
             name => names.push(name.to_owned()),
@@ -401,7 +453,17 @@ fn main() {
         let mut scenario = Scenario::named(&name).unwrap_or_else(|| panic!("no scenario {name}"));
         scenario.duration_s = seconds.unwrap_or(scenario.duration_s);
         scenario.camera.features = features.unwrap_or(scenario.camera.features);
-        let results: Vec<Run> = (0..runs).map(|seed| run(&scenario, seed + 1, verbose)).collect();
+        scenario.camera.marker_noise_px = marker_px.unwrap_or(scenario.camera.marker_noise_px);
+        scenario.camera.feature_noise_px = feature_px.unwrap_or(scenario.camera.feature_noise_px);
+        let results: Vec<Run> = (0..runs).map(|seed| run(&scenario, seed + 1, with_bound, verbose)).collect();
+        for (seed, r) in results.iter().enumerate().filter(|_| verbose) {
+            let [_, heading, speed, yaw_rate, nees, ..] = r.filter.0;
+            println!(
+                "seed {}: {heading:.3} deg {speed:.3} m/s {yaw_rate:.3} rad/s, NEES {nees:.2} {:.2?}",
+                seed + 1,
+                r.apart
+            );
+        }
         let of = |pick: fn(&Run) -> Figures| summary(&results.iter().map(pick).collect::<Vec<_>>());
         println!("{name:<18} filter    {}", of(|r| r.filter));
         println!("{name:<18} in view   {}", of(|r| r.in_view));
@@ -416,6 +478,8 @@ fn main() {
         println!("{name:<18} of the bound, in view: {:.3} {:.3} {:.3}", ratio(1), ratio(2), ratio(3));
         let n = results.len() as f64;
         let mean = |pick: fn(&Run) -> f64| results.iter().map(pick).sum::<f64>() / n;
+        let apart = |i: usize| summary_of(results.iter().map(|r| r.apart[i]));
+        println!("{name:<18} NEES of heading {}, speed {}, yaw rate {}", apart(0), apart(1), apart(2));
         println!(
             "{name:<18} {:.0} us of processor a frame, {} resets, GPS delay error {:.1} ms rms",
             mean(|r| r.us_per_frame),

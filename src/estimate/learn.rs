@@ -38,6 +38,9 @@ pub(super) struct Learnt {
 pub(super) const LEAST: f64 = 0.01;
 pub(super) const MOST: f64 = 5.0;
 
+/// Least that is learnt of a vehicle's motion, likewise: one that is parked does not move at all.
+const STILL: f64 = 0.003;
+
 /// The configured values and how fast to leave them.
 #[derive(Clone, Debug)]
 pub(super) struct Learning {
@@ -129,26 +132,34 @@ impl State {
     /// Fits the walk of target `i`'s speed (`k` = 0) or yaw rate (`k` = 1).
     fn learn_target(&mut self, learning: &Learning, i: usize, k: usize, gain: f64) {
         let (column, row) = (self.target_at(i) + 3 + k, at::TARGET * i + 3 + k);
-        let var = self.cov.at(column, column);
         let q = self.learnt.target_q[i][k];
-        let memory_s = (LAG * var / q).clamp(SHORTEST_S, learning.interval.s());
+        let memory_s = self.cov.at(column, column) / q;
         self.targets[i].memory_s[k] = memory_s;
         let target = &self.targets[i];
         // A target started again since then has nothing in common with its copy.
-        let usable = self.echoes.iter().filter(|e| e.live && e.t < self.t && e.t >= target.started);
-        let misfit = |e: &&Echo| ((self.t - e.t).s() - memory_s).abs();
-        let Some(echo) = usable.min_by(|a, b| misfit(a).total_cmp(&misfit(b))) else { return };
+        let usable = || self.echoes.iter().filter(|e| e.live && e.t < self.t && e.t >= target.started);
+        let Some(last) = usable().map(|e| e.t).max() else { return };
+        let frame_s = (self.t - last).s();
+        let lag_s = (LAG * memory_s).min(learning.interval.s()).max(2.0 * frame_s);
+        let misfit = |e: &&Echo| ((self.t - e.t).s() - lag_s).abs();
+        let Some(echo) = usable().min_by(|a, b| misfit(a).total_cmp(&misfit(b))) else { return };
         let age_s = (self.t - echo.t).s();
-        if age_s < 0.5 * memory_s {
+        if age_s < 0.75 * lag_s {
             return;
         }
-        let spread = increment(echo, row, var, column, 1.0);
-        let square = (target.mean[3 + k] - echo.mean[row]).powi(2) + spread;
-        // How much of an increment the measurements tell: where it is little, plain expectation
-        // maximisation creeps.
-        let told = (1.0 - spread / (q * age_s)).clamp(LEAST_TOLD, 1.0);
-        let gain = (gain / told).min(0.5);
-        blend(&mut self.learnt.target_q[i][k], square / age_s, gain, learning.start.target_q[i][k]);
+        let (value, var) = echo.told[i][k];
+        let found = var - echo.cov.at(row, row);
+        if found < LEAST_TOLD * var {
+            return;
+        }
+        let due = found * (1.0 + more_than_found(memory_s, age_s, frame_s));
+        let ratio = (echo.mean[row] - value).powi(2) / due;
+        let start = learning.start.target_q[i][k];
+        if ratio.is_finite() && ratio > 0.0 {
+            // Never beyond what explains this one.
+            let grown = q * (gain * (ratio - 1.0)).min(ratio.ln().max(0.0)).exp();
+            self.learnt.target_q[i][k] = grown.clamp(start * STILL * STILL, start * MOST * MOST);
+        }
     }
 }
 
@@ -168,7 +179,7 @@ impl State {
         if target.motion < RESTING {
             let keep = (-since_s / REST_S).exp();
             for (q, start) in self.learnt.target_q[i].iter_mut().zip(&learning.start.target_q[i]) {
-                *q = (*q * keep).max(start * LEAST * LEAST);
+                *q = (*q * keep).max(start * STILL * STILL);
             }
         }
     }
@@ -194,14 +205,22 @@ const REST_S: f64 = 0.5;
 const RESTING: f64 = 2.5;
 pub(super) const MOVING: f64 = 20.0;
 
-/// Share of an increment that measurements tell, at the least, as the fit's step takes it.
-const LEAST_TOLD: f64 = 0.1;
-
-/// Span of the increments looked at over `P/q`.
-const LAG: f64 = 4.0 / 3.0;
-
+/// How much later than the filter's memory P/q an estimate is compared with what became of it.
+const LAG: f64 = 2.0;
+/// Least share of a variance that must have been found out since.
+const LEAST_TOLD: f64 = 0.2;
 /// Shortest increment looked at, s.
 pub(super) const SHORTEST_S: f64 = 0.1;
+
+/// By what share more than a smoother finds out an honest estimate of a memory of `memory_s` turns out to
+/// be off after `age_s`: nothing where motion is a walk. Where it is smooth the estimate trails, which no
+/// later noise takes part in: `E[(filtered − smoothed)²]` of a target at constant acceleration,
+/// computed over noise and frame rates, exceeds `P_f − P_s` by `min(0.27 age/T, 0.42 + 0.17 frame/T)`.
+/// Vehicles are between the two; over less than a frame or two they are smooth.
+fn more_than_found(memory_s: f64, age_s: f64, frame_s: f64) -> f64 {
+    let smooth = (0.27 * age_s).min(0.42 * memory_s + 0.17 * frame_s) / memory_s;
+    smooth * (1.0 - 0.25 * memory_s / frame_s).max(0.5)
+}
 
 /// Variance of `x_now − decay · x_then`.
 fn increment(echo: &Echo, row: usize, var_now: f64, column: usize, decay: f64) -> f64 {
@@ -239,4 +258,4 @@ pub(super) fn blend_factor(value: &mut f64, misfit: f64, samples: f64) {
 }
 
 /// Limits of a factor on the variance of pixels: from a fifth of the sigma assumed to five times as much.
-const FACTORS: (f64, f64) = (0.04, 25.0);
+const FACTORS: (f64, f64) = (0.01, 25.0);

@@ -5,6 +5,7 @@
 //! `docs/estimator.md` gives state, models and what each choice is worth.
 
 mod anchor;
+mod begin;
 mod bound;
 mod core;
 mod filter;

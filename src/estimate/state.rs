@@ -142,6 +142,8 @@ pub(super) struct Echo {
     pub(super) cov: Grid,
     pub(super) cross: Grid,
     pub(super) status: Vec<TrackStatus>,
+    /// Speed and yaw rate of each target as the filter told them then, with their variances.
+    pub(super) told: Vec<[(f64, f64); 2]>,
 }
 
 impl Echo {
@@ -154,6 +156,7 @@ impl Echo {
             cov: Grid::zeros(states, states),
             cross: Grid::zeros(states, n),
             status: vec![TrackStatus::Lost; targets],
+            told: vec![[(0.0, 0.0); 2]; targets],
         }
     }
 
@@ -168,6 +171,7 @@ impl Echo {
         self.cov.copy_from(&other.cov);
         self.cross.copy_from(&other.cross);
         self.status.clone_from(&other.status);
+        self.told.clone_from(&other.told);
     }
 }
 
@@ -353,6 +357,8 @@ impl State {
         for (i, target) in self.targets.iter().enumerate() {
             echo.mean[i * at::TARGET..][..at::TARGET].copy_from_slice(&target.mean);
             echo.status[i] = target.status;
+            let column = at::OWN + at::TARGET * i + 3;
+            echo.told[i] = std::array::from_fn(|k| (target.mean[3 + k], self.cov.at(column + k, column + k)));
         }
         (echo.live, echo.t, echo.frame) = (true, self.t, frame);
         take(&self.cov, echo, first);

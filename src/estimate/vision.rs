@@ -3,14 +3,15 @@
 use nalgebra::{Matrix2, Matrix2x3, Vector2, Vector3};
 
 use crate::config::TargetModel;
-use crate::geo::{locate, skew, wrap_angle};
+use crate::geo::skew;
 use crate::msg::{Disposition, FeatureTrack, FrameObservations, FusionSource, MarkerDetection, TrackStatus};
 
+use super::begin::ground_point;
 use super::core::Core;
-use super::learn::{MOVING, blend_factor};
+use super::learn::blend_factor;
 use super::models::Models;
 use super::state::{Own, State, Target, at};
-use super::track::{FRAMES_TO_START, started, started_again};
+use super::track::{BLINK_S, FRAMES_TO_START};
 use super::update::Measurement;
 
 /// A point of the world in the image, with its derivatives.
@@ -85,6 +86,9 @@ impl Core {
             self.start_target(index, markers, before);
             return;
         }
+        if !rests && self.is_back_in_doubt(index) && self.place_anew(index, markers) {
+            return;
+        }
         let mut good = 0;
         for detection in markers {
             if let Some((t, marker)) = self.models.find(detection.marker)
@@ -102,12 +106,11 @@ impl Core {
             target.last_seen = t;
         } else {
             target.rejected += 1;
-            let patience = if target.status == TrackStatus::Tracking { restart_after } else { 2 };
-            if target.rejected >= patience {
-                if rests || target.placed_anew || target.status == TrackStatus::Acquiring {
+            let believed = target.status == TrackStatus::Tracking && !target.placed_anew;
+            if target.rejected >= if believed { restart_after } else { 2 } {
+                let hopeless = rests || target.placed_anew || target.status == TrackStatus::Acquiring;
+                if hopeless || !self.place_anew(index, markers) {
                     self.start_target(index, markers, None);
-                } else {
-                    self.place_anew(index, markers);
                 }
                 return;
             }
@@ -118,7 +121,13 @@ impl Core {
 
     /// Fuses one marker: a tag's four corners at once, or a disc's centre. Whether it was inside the
     /// gate.
-    fn fuse_marker(&mut self, index: usize, marker: usize, seen: &MarkerDetection, gated: bool) -> bool {
+    pub(super) fn fuse_marker(
+        &mut self,
+        index: usize,
+        marker: usize,
+        seen: &MarkerDetection,
+        gated: bool,
+    ) -> bool {
         let start = self.state.target_at(index);
         let mean = self.state.targets[index].mean;
         let model = &self.models.targets[index].markers[marker];
@@ -169,68 +178,6 @@ impl Core {
         let cov = &self.state.cov;
         let tilt_var = cov.at(at::ATTITUDE, at::ATTITUDE) + cov.at(at::ATTITUDE + 1, at::ATTITUDE + 1);
         (self.models.camera.fx * tilt_var).powi(2)
-    }
-
-    /// Starts a target from the markers of one frame: where they lie on the ground, with a wide
-    /// prior that the same pixels then narrow, so that everything common with the helicopter's own
-    /// errors stands in the covariance.
-    fn start_target(&mut self, index: usize, markers: &[MarkerDetection], before: Option<Target>) {
-        let Some((mean, heading_known)) = guess(&self.state.own, &self.models, index, markers) else {
-            self.refuse(FusionSource::Marker, Disposition::Invalid);
-            return;
-        };
-        let start = self.state.target_at(index);
-        let moving = self.models.targets[index].model != TargetModel::Static;
-        let t = self.state.t;
-        self.state.targets[index] = match before {
-            Some(before) if moving => started_again(mean, t, &before),
-            Some(before) => Target { seen: before.seen + 1, ..started(mean, t) },
-            None => started(mean, t),
-        };
-        self.state.learnt.target_q[index] = self.learning.start.target_q[index];
-        let heading_var = if heading_known { 1.0 } else { UNKNOWN_HEADING.powi(2) };
-        let (speed_var, rate_var) = if moving { (9.0, 1.0) } else { (0.0, 0.0) };
-        self.state.renew(start, &[900.0, 900.0, heading_var, speed_var, rate_var]);
-        self.fuse_ungated(index, markers);
-        self.state.settle(index);
-    }
-
-    /// A track that comes back elsewhere than expected: place and heading are what its markers show, while speed and
-    /// yaw rate are still about what they were. Where that does not hold either, the track starts afresh.
-    fn place_anew(&mut self, index: usize, markers: &[MarkerDetection]) {
-        let before = self.state.targets[index];
-        let Some((mut mean, true)) = guess(&self.state.own, &self.models, index, markers) else {
-            self.start_target(index, markers, None);
-            return;
-        };
-        mean[3..].copy_from_slice(&before.mean[3..]);
-        let (s, t) = (self.state.target_at(index), self.state.t);
-        let motion: [f64; 2] = std::array::from_fn(|k| {
-            self.state.cov.at(s + 3 + k, s + 3 + k) + ANEW_S * self.models.target_walks[k]
-        });
-        self.state.targets[index] = Target {
-            mean,
-            placed_anew: true,
-            rejected: 0,
-            last_seen: t,
-            started: t,
-            motion: MOVING,
-            ..before
-        };
-        self.state.learnt.target_q[index] = self.learning.start.target_q[index];
-        self.state.renew(s, &[900.0, 900.0, 1.0, motion[0], motion[1]]);
-        self.fuse_ungated(index, markers);
-        self.state.settle(index);
-    }
-
-    fn fuse_ungated(&mut self, index: usize, markers: &[MarkerDetection]) {
-        for detection in markers {
-            if let Some((t, marker)) = self.models.find(detection.marker)
-                && t == index
-            {
-                self.fuse_marker(index, marker, detection, false);
-            }
-        }
     }
 
     /// Ground features: each a point of the ground that stays where it is.
@@ -318,13 +265,6 @@ const LEARN_RATIO: f64 = 4.0;
 const MARKER_SAMPLES: f64 = 100.0;
 const FEATURE_SAMPLES: f64 = 400.0;
 
-/// How long a track that is placed anew may have driven as configured since its motion was known, s.
-const ANEW_S: f64 = 1.0;
-/// Heading quite unknown, one sigma of a uniform circle, rad.
-const UNKNOWN_HEADING: f64 = 1.8;
-/// Farthest that a ray is followed to the ground, m.
-const FARTHEST_M: f64 = 1_000.0;
-
 fn set_point(
     z: &mut Measurement,
     i: usize,
@@ -344,51 +284,6 @@ fn set_point(
             z.noise[2 * i + r][2 * i + c] = noise[(r, c)];
         }
     }
-}
-
-/// The ground point `above_m` over the ground seen at a pixel.
-fn ground_point(own: &Own, models: &Models, px: Vector2<f64>, above_m: f64) -> Option<Vector3<f64>> {
-    let ned_from_camera =
-        own.ned_from_body * nalgebra::Rotation3::from_matrix_unchecked(models.camera_from_body.transpose());
-    let camera = own.position + own.ned_from_body * models.camera_at;
-    locate(&models.camera, &camera, &ned_from_camera, px, &models.ground, above_m, FARTHEST_M)
-        .ok()
-        .map(|found| found.ned_m)
-}
-
-/// First guess of a target from one frame: (state, whether the heading is known).
-fn guess(
-    own: &Own,
-    models: &Models,
-    index: usize,
-    markers: &[MarkerDetection],
-) -> Option<([f64; at::TARGET], bool)> {
-    let target = &models.targets[index];
-    let mut first = None;
-    let mut heading = None;
-    for seen in markers {
-        let Some(marker) = target.markers.iter().find(|marker| marker.id == seen.marker) else { continue };
-        let Some(place) = ground_point(own, models, seen.center_px, -marker.center.z) else { continue };
-        if let (None, Some(corners)) = (heading, &seen.corners_px) {
-            let point = |k: usize| ground_point(own, models, corners[k], -marker.center.z);
-            let up = point(0)? + point(1)? - point(2)? - point(3)?;
-            heading = Some(wrap_angle(up.y.atan2(up.x) - marker.yaw));
-        }
-        let Some((other, there)) = first else {
-            first = Some((marker, place));
-            continue;
-        };
-        let (apart, along): (Vector3<f64>, Vector3<f64>) = (place - there, marker.center - other.center);
-        if along.xy().norm() > 1e-3 {
-            heading = heading.or(Some(wrap_angle(apart.y.atan2(apart.x) - along.y.atan2(along.x))));
-        }
-    }
-    let (marker, place): (&super::models::Marker, Vector3<f64>) = first?;
-    let (s, c) = heading.unwrap_or(0.0).sin_cos();
-    let offset = marker.center;
-    let north = place.x - (c * offset.x - s * offset.y);
-    let east = place.y - (s * offset.x + c * offset.y);
-    Some(([north, east, heading.unwrap_or(0.0), 0.0, 0.0], heading.is_some()))
 }
 
 /// The track not yet used that lies farthest from those in use: spread is what separates turning from
@@ -421,7 +316,7 @@ impl Target {
             || (self.status == TrackStatus::Acquiring && away.s() > super::track::DOUBTFUL_S)
         {
             self.status = TrackStatus::Lost;
-        } else if away.s() > super::track::BLINK_S && self.status == TrackStatus::Tracking {
+        } else if away.s() > BLINK_S && self.status == TrackStatus::Tracking {
             self.status = TrackStatus::Coasting;
         }
     }

@@ -1,0 +1,87 @@
+//! Whether a vehicle's speed and yaw rate are off by as much as is told, whatever the pixels are worth; and
+//! whether a track outlives its vehicle's absence.
+
+use std::sync::Arc;
+
+use windhover::estimate::{Estimator, EstimatorOutput, Site};
+use windhover::geo::Ground;
+use windhover::msg::{Stamped, TargetEstimate, TrackStatus};
+use windhover::simulate::{Sample, Scenario, SensorSuite, World};
+use windhover::time::Span;
+
+/// Flies a scenario whose pixels are this good (px); gives the world and the estimates of its first target.
+fn fly(
+    name: &str,
+    seconds: f64,
+    seed: u64,
+    (marker_px, feature_px): (f64, f64),
+) -> (Arc<World>, Vec<TargetEstimate>) {
+    let mut scenario = Scenario::named(name).expect("a named scenario");
+    scenario.duration_s = seconds;
+    (scenario.camera.marker_noise_px, scenario.camera.feature_noise_px) = (marker_px, feature_px);
+    let declination_rad = scenario.declination_deg.to_radians();
+    let world = Arc::new(World::new(scenario, seed));
+    let site = Site { frame: *world.frame(), ground: Ground::Flat { down_m: 0.0 }, declination_rad };
+    let config = &world.scenario().config;
+    let offset = Span::from_ms(config.camera.exposure_offset_ms);
+    let mut filter = Estimator::new(config, &site);
+    let mut suite = SensorSuite::new(Arc::clone(&world));
+    let mut out = Vec::new();
+    while let Some(sample) = suite.next() {
+        match &sample {
+            Sample::Gnss { stamped, .. } => filter.gnss(stamped, &mut out),
+            Sample::Attitude { stamped, .. } => filter.attitude(stamped, &mut out),
+            Sample::Frame { truth, seq } => {
+                let (t_valid, t_recv) = (truth.t_stamp + offset, truth.t_recv);
+                let value = suite.observations().clone();
+                filter.frame(&Stamped { t_valid, t_recv, seq: *seq, value }, &mut out);
+            }
+        }
+    }
+    let estimates = out.into_iter().filter_map(|o| match o {
+        EstimatorOutput::Estimate(e) if e.target == 0 => Some(e),
+        _ => None,
+    });
+    let estimates = estimates.collect();
+    (world, estimates)
+}
+
+/// Mean over frames and seeds of squared error over variance told, of speed and of yaw rate.
+fn squared_over_told(name: &str, px: (f64, f64)) -> [f64; 2] {
+    let (mut sums, mut n) = ([0.0; 2], 0.0);
+    for seed in 1..4 {
+        let (world, estimates) = fly(name, 25.0, seed, px);
+        for estimate in estimates.iter().filter(|e| world.seconds(e.t_valid) > 6.0) {
+            let state = estimate.state.expect("it is in view all the time");
+            let truth = world.vehicle(0, estimate.t_valid);
+            let p = state.covariance.expect("the filter tells it");
+            sums[0] += (state.speed_mps - truth.speed_mps).powi(2) / p[(3, 3)];
+            sums[1] += (state.yaw_rate_radps - truth.yaw_rate_radps).powi(2) / p[(4, 4)];
+            n += 1.0;
+        }
+    }
+    sums.map(|sum| sum / n)
+}
+
+#[test]
+fn speed_and_yaw_rate_are_off_by_what_is_told() {
+    for px in [(0.5, 0.5), (0.03, 0.1)] {
+        for name in ["follow", "circle20"] {
+            let ratios = squared_over_told(name, px);
+            assert!(ratios.iter().all(|r| (0.7..1.4).contains(r)), "{name}, {px:?} px: {ratios:.2?}");
+        }
+    }
+}
+
+#[test]
+fn a_track_outlives_its_vehicles_absence() {
+    for seed in [1, 2] {
+        let (world, estimates) = fly("leave-and-return", 30.0, seed, (0.1, 0.2));
+        let late = estimates.iter().filter(|e| world.seconds(e.t_valid) > 6.0);
+        assert!(late.clone().any(|e| e.status == TrackStatus::Coasting), "seed {seed}: it leaves");
+        for e in late {
+            let known = matches!(e.status, TrackStatus::Tracking | TrackStatus::Coasting);
+            assert!(known, "seed {seed}: {:?} at {:.2} s", e.status, world.seconds(e.t_valid));
+        }
+    }
+}
