@@ -1,6 +1,9 @@
 //! Intensities fitted in flight.
 //!
-//! By the tower rule the posterior expectation of a squared increment has the prior's mean where the
+//! Vehicles: the smoother, which knows what was measured later, shows how wrong the filter was; a walk is right
+//! that makes the filter as wrong as it said it was (`learn_target`).
+//!
+//! Helicopter: by the tower rule the posterior expectation of a squared increment has the prior's mean where the
 //! prior's intensity is right: `E[(x_t − φ x_s)² | data]` averages to `q`-times-what-`q`-does over the
 //! interval. The filter holds `x_t`, the smoothed `x_s` and their covariance, so the expectation is at
 //! hand, and a sliding mean of it is the fit (expectation maximisation with forgetting).
@@ -39,7 +42,7 @@ pub(super) const LEAST: f64 = 0.01;
 pub(super) const MOST: f64 = 5.0;
 
 /// Least that is learnt of a vehicle's motion, likewise: one that is parked does not move at all.
-const STILL: f64 = 0.003;
+const STILL: f64 = 0.005;
 
 /// The configured values and how fast to leave them.
 #[derive(Clone, Debug)]
@@ -107,11 +110,6 @@ impl State {
     }
 
     /// Fits the targets' intensities. Call once a frame, after its fusion.
-    ///
-    /// The increments looked at span the filter's own memory of the component: real motion is smoother than a random
-    /// walk, and the intensity that serves is the one at that scale. A filter of position and its rate trails a
-    /// rate that changes by a per second by `a P/q`, and noise makes up a quarter of P; so P is the squared error
-    /// where `q = a² T` is taken from increments over `T = 4/3 P/q`.
     pub(super) fn learn_targets(&mut self, learning: &Learning) {
         let now = self.t;
         let since_s = (now - self.learnt.t_target).s().clamp(0.0, 0.2);
@@ -130,6 +128,11 @@ impl State {
     }
 
     /// Fits the walk of target `i`'s speed (`k` = 0) or yaw rate (`k` = 1).
+    ///
+    /// Twice the filter's memory `P/q` ago (at least two frames, at most the interval) it told a value and a
+    /// variance; since then the smoother has moved that value, and knows by how much it should have: `P_f − P_s`,
+    /// and more where motion is smooth ([`more_than_found`]). The logarithm of the intensity moves by what the
+    /// ratio of the two differs from one, so that the mean ratio over time is one.
     fn learn_target(&mut self, learning: &Learning, i: usize, k: usize, gain: f64) {
         let (column, row) = (self.target_at(i) + 3 + k, at::TARGET * i + 3 + k);
         let q = self.learnt.target_q[i][k];
@@ -216,11 +219,14 @@ pub(super) const SHORTEST_S: f64 = 0.1;
 /// be off after `age_s`: nothing where motion is a walk. Where it is smooth the estimate trails, which no
 /// later noise takes part in: `E[(filtered − smoothed)²]` of a target at constant acceleration,
 /// computed over noise and frame rates, exceeds `P_f − P_s` by `min(0.27 age/T, 0.42 + 0.17 frame/T)`.
-/// Vehicles are between the two; over less than a frame or two they are smooth.
+/// A vehicle is smooth over times short against its own response, and walks over long ones.
 fn more_than_found(memory_s: f64, age_s: f64, frame_s: f64) -> f64 {
     let smooth = (0.27 * age_s).min(0.42 * memory_s + 0.17 * frame_s) / memory_s;
-    smooth * (1.0 - 0.25 * memory_s / frame_s).max(0.5)
+    smooth / (1.0 + memory_s / RESPONSE_S)
 }
+
+/// Time within which a vehicle's drive and steering gear follow their commands, s.
+const RESPONSE_S: f64 = 0.2;
 
 /// Variance of `x_now − decay · x_then`.
 fn increment(echo: &Echo, row: usize, var_now: f64, column: usize, decay: f64) -> f64 {
@@ -257,5 +263,5 @@ pub(super) fn blend_factor(value: &mut f64, misfit: f64, samples: f64) {
     }
 }
 
-/// Limits of a factor on the variance of pixels: from a fifth of the sigma assumed to five times as much.
+/// Limits of a factor on the variance of pixels: from a tenth of the sigma assumed to five times as much.
 const FACTORS: (f64, f64) = (0.01, 25.0);
