@@ -4,7 +4,8 @@
 //! `hil_feed CAPTURE GPS_SOCKET COMPASS_SOCKET FRAMES_SOCKET PULSE_SOCKET [GREY|YUYV|UYVY|NV12|RGB3]`
 //!
 //! Each frame carries its number as 24 squares of 8 pixels in its top-left corner, so that the far end
-//! can tell which frame it saw. One line `start NS` on standard output tells when it began, and
+//! can tell which frame it saw. Serial bytes that nobody takes are lost after a second or so, as on a real
+//! line, and do not wait in the emulator for somebody to open the port. One line `start NS` on standard output tells when it began, and
 //! `frame N` each frame that was handed over.
 
 use std::io::Write;
@@ -61,8 +62,8 @@ impl Lines {
         let camera = UnixStream::connect(frames)?;
         Ok(Self {
             clock: HostClock::start(),
-            gps: UnixStream::connect(gps)?,
-            compass: UnixStream::connect(compass)?,
+            gps: line(gps)?,
+            compass: line(compass)?,
             pulse: UnixStream::connect(pulse)?,
             frames: sender,
             writer: std::thread::spawn(move || write_frames(&receiver, camera, pack)),
@@ -94,8 +95,8 @@ impl Lines {
             }
             self.sleep_until(event.t_recv + shift);
             match event.body {
-                EventBody::GnssBytes(bytes) => self.gps.write_all(&bytes)?,
-                EventBody::CompassBytes(bytes) => self.compass.write_all(&bytes)?,
+                EventBody::GnssBytes(bytes) => say(&mut self.gps, &bytes)?,
+                EventBody::CompassBytes(bytes) => say(&mut self.compass, &bytes)?,
                 EventBody::Frame(frame) => {
                     if let Some(image) = numbered(&frame) {
                         let _ = self.frames.try_send((frame.index, image));
@@ -112,6 +113,22 @@ impl Lines {
         if left > Span::ZERO {
             std::thread::sleep(Duration::from_nanos(left.ns().unsigned_abs()));
         }
+    }
+}
+
+/// A serial line: what waits in it is as little as the kernel allows, a handful of writes.
+fn line(path: &str) -> Result<UnixStream, Trouble> {
+    let stream = UnixStream::connect(path)?;
+    rustix::net::sockopt::set_socket_send_buffer_size(&stream, 1)?;
+    stream.set_nonblocking(true)?;
+    Ok(stream)
+}
+
+/// Says something on a line; what does not fit is lost.
+fn say(line: &mut UnixStream, bytes: &[u8]) -> std::io::Result<()> {
+    match line.write(bytes) {
+        Err(error) if error.kind() != std::io::ErrorKind::WouldBlock => Err(error),
+        _ => Ok(()),
     }
 }
 

@@ -19,7 +19,12 @@ LINK_PORT = 17447
 
 
 class Failure(Exception):
-    """An assertion of a scenario that does not hold; says what was seen instead."""
+    """An assertion of a scenario that does not hold; says what was seen instead. `output`: lines of the tool
+    that failed."""
+
+    def __init__(self, words, output=()):
+        super().__init__(words)
+        self.output = output
 
 
 class Machine:

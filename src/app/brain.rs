@@ -16,7 +16,7 @@ use super::health::{self, Figures};
 use super::latencies::Latencies;
 use super::outlets::Outlets;
 use super::supervise::Heart;
-use super::warm::{self, Origin};
+use super::warm::{self, Earlier, Origin};
 
 /// What the health task and the pipeline's task show each other. Copies are the same board.
 #[derive(Clone, Debug, Default)]
@@ -105,14 +105,18 @@ impl Brain<'_> {
         }
         let tell = |words: String| self.around.log.tell(OperatorEvent::WarmStart, "", words);
         match warm::wait_for(self.outlets.slot(), &self.origin, self.around, heart) {
-            Some(Ok((state, age))) => {
+            Earlier::Known(state, age) => {
                 tell(format!("continues from what was known {:.1} s ago", age.s()));
-                let body = EventBody::Warm(Box::new(state));
+                let body = EventBody::Warm(state);
                 let event = self.around.inbox.number(self.around.began, body);
                 self.handle(&event);
             }
-            Some(Err(stale)) => tell(format!("what an earlier run knew is not used: {stale}")),
-            None => {}
+            Earlier::Unusable(stale) => tell(format!("what an earlier run knew is not used: {stale}")),
+            Earlier::NotTold(patience) => tell(format!(
+                "begins anew: the card did not tell within {:.0} s what an earlier run knew",
+                patience.s()
+            )),
+            Earlier::Nothing => {}
         }
     }
 

@@ -12,7 +12,8 @@ use tokio::sync::{mpsc, watch};
 use crate::config::Config;
 use crate::io::clock::HostClock;
 use crate::io::link::{
-    Backlog, LinkEvent, LinkHandle, LinkStatus, PayloadLink, PayloadSettings, Picture, StoreBacklog,
+    Backlog, EarlyRecords, LinkEvent, LinkHandle, LinkStatus, PayloadLink, PayloadSettings, Picture,
+    StoreBacklog,
 };
 use crate::io::mavlink::MavlinkSender;
 use crate::io::records::Record;
@@ -35,15 +36,16 @@ const CARD: Span = Span::from_ns(2_000_000_000);
 /// A clock that reads less was never set: 2020-01-01.
 const CLOCK_SET_UNIX_NS: i64 = 1_577_836_800_000_000_000;
 
-#[derive(Default)]
 struct Lines {
     link: Option<LinkHandle>,
+    /// What was made before there was one; `None` where there is to be none.
+    early: Option<EarlyRecords>,
     mavlink: Option<MavlinkSender>,
     frame: Option<FramePayload>,
 }
 
 /// The way down, from the pipeline's side. Copies are the same; nothing here waits.
-#[derive(Clone, Default)]
+#[derive(Clone)]
 pub struct Downlink {
     lines: Arc<Mutex<Lines>>,
     /// Whether the link numbers records in the run the store is in.
@@ -51,13 +53,26 @@ pub struct Downlink {
 }
 
 impl Downlink {
+    /// Before anything is open; with a link configured, records are numbered from the first on.
+    pub fn new(config: &Config) -> Self {
+        let early =
+            config.link.enabled.then(|| EarlyRecords::new(&PayloadSettings::from_config(&config.link)));
+        let lines = Lines { link: None, early, mavlink: None, frame: None };
+        Self { lines: Arc::new(Mutex::new(lines)), one_run: Arc::new(AtomicBool::new(true)) }
+    }
+
     fn lines(&self) -> MutexGuard<'_, Lines> {
         self.lines.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Sends a record; gives the number under which the store is to keep it for back-fill.
     pub fn record(&self, record: &Record) -> Option<u32> {
-        let number = self.lines().link.as_ref()?.send(record)?;
+        let lines = self.lines();
+        let number = match (&lines.link, &lines.early) {
+            (Some(link), _) => link.send(record),
+            (None, Some(early)) => early.send(record),
+            (None, None) => None,
+        }?;
         self.one_run.load(Ordering::Relaxed).then_some(number)
     }
 
@@ -198,8 +213,14 @@ impl Task<'_> {
         let one_run = deep.is_some();
         let settings = PayloadSettings::from_config(&self.config.link);
         let opened = PayloadLink::open(&settings, run, &flight, deep)?;
-        self.downlink.one_run.store(one_run, Ordering::Relaxed);
-        self.downlink.lines().link = Some(opened.1.clone());
+        let mut lines = self.downlink.lines();
+        // A store that closed its flight meanwhile stays another's.
+        self.downlink.one_run.fetch_and(one_run, Ordering::Relaxed);
+        if let Some(early) = lines.early.take() {
+            opened.1.begin_with(early);
+        }
+        lines.link = Some(opened.1.clone());
+        drop(lines);
         Ok(opened)
     }
 

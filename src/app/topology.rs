@@ -84,7 +84,7 @@ pub fn start(config: &Config, clock: HostClock, log: &Log) -> std::io::Result<Gr
     let mut tasks = Supervisor::new(clock);
 
     let (slot, orders) = (Slot::default(), CardOrders::default());
-    let downlink = Downlink::default();
+    let downlink = Downlink::new(config);
     {
         let (config, around, board) = (config.clone(), around.clone(), board.clone());
         let (slot, downlink) = (slot.clone(), downlink.clone());

@@ -22,9 +22,23 @@ const STATE: &str = "warm";
 /// A state older than this is of another flight: the service manager restarts a daemon in seconds.
 const OLDEST: Span = Span::from_ns(120_000_000_000);
 
-/// How long the pipeline waits at the start for the card to tell the state. What devices deliver
-/// meanwhile waits in the inbox.
-const PATIENCE: Span = Span::from_ns(1_500_000_000);
+/// Longest the pipeline waits at the start for the card to tell the state. What devices deliver meanwhile
+/// waits in the inbox, which holds twice as much. The state is the first thing read of a card: only one that
+/// is slow beyond use, or an index that another program holds, takes so long.
+const PATIENCE: Span = Span::from_ns(5_000_000_000);
+
+/// What the card tells of an earlier run.
+#[derive(Debug)]
+pub enum Earlier {
+    /// What it knew, and how long ago.
+    Known(Box<WarmState>, Span),
+    /// It left what is not to be used.
+    Unusable(Stale),
+    /// Nothing: there was none, nothing is recorded, or the end was asked for.
+    Nothing,
+    /// The card did not answer within this.
+    NotTold(Span),
+}
 
 /// Where and as what this process runs: what a state must have in common with it.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -107,28 +121,27 @@ pub fn save(store: &StoreHandle, origin: &Origin, t: MonoTime, state: &WarmState
     store.put_state(STATE, origin.sign(t, state));
 }
 
-/// The state to continue from and its age; `None` where the card has none, does not record, or does not
-/// answer soon; `Some(Err)` where it has one that is not to be used.
-pub fn wait_for(
-    slot: &Slot,
-    origin: &Origin,
-    around: &Surroundings,
-    heart: &Heart,
-) -> Option<Result<(WarmState, Span), Stale>> {
+/// Waits for the card to tell what an earlier run knew.
+pub fn wait_for(slot: &Slot, origin: &Origin, around: &Surroundings, heart: &Heart) -> Earlier {
     let end = around.clock.now() + PATIENCE;
     while !around.stop.asked() && around.clock.now() < end {
         heart.beat();
         if let Some(store) = slot.get() {
             if let Some(index) = store.index() {
-                return Some(origin.take_back(&index.state(STATE)?, around.clock.now()));
+                let kept = index.state(STATE).map(|kept| origin.take_back(&kept, around.clock.now()));
+                return match kept {
+                    Some(Ok((state, age))) => Earlier::Known(Box::new(state), age),
+                    Some(Err(stale)) => Earlier::Unusable(stale),
+                    None => Earlier::Nothing,
+                };
             }
             if matches!(store.status().recording, Recording::Stopped(_)) {
-                return None;
+                return Earlier::Nothing;
             }
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    None
+    if around.stop.asked() { Earlier::Nothing } else { Earlier::NotTold(PATIENCE) }
 }
 
 #[cfg(test)]

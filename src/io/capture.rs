@@ -23,6 +23,10 @@ const REORDER_BYTES: usize = 1 << 28;
 /// Memory of a message beside its bytes, near enough for a limit.
 const MESSAGE_COST: usize = 256;
 
+/// Topics of what was heard.
+const EVENTS: [&str; 5] =
+    [topic::GPS_SERIAL, topic::COMPASS_SERIAL, topic::CAMERA_IMAGE, topic::SOURCE_EVENT, topic::WARM_START];
+
 /// One message of a capture: as recorded, and as the event it stands for, if any.
 #[derive(Clone, Debug)]
 pub struct CaptureItem {
@@ -194,7 +198,10 @@ impl Iterator for CaptureReader {
             let due = self.waiting_bytes > REORDER_BYTES
                 || self.waiting.peek().is_some_and(|first| self.newest - first.raw.log_time >= REORDER);
             if !due && let Some(raw) = self.reader.next() {
-                self.newest = self.newest.max(raw.log_time);
+                // Others may be dated by other clocks than what was heard.
+                if EVENTS.contains(&raw.channel.topic.as_str()) {
+                    self.newest = self.newest.max(raw.log_time);
+                }
                 self.waiting_bytes += raw.data.len() + MESSAGE_COST;
                 self.waiting.push(Waiting { raw, order: self.read });
                 self.read += 1;

@@ -1,8 +1,48 @@
-//! Devices that are held by others, or have nothing to say: the real binary over pseudo-terminals.
+//! Devices that answer, are held by others, or have nothing to say: the real binary over pseudo-terminals.
 
 use std::time::Duration;
 
-use super::harness::{Bench, Feeder};
+use super::harness::{Bench, Feeder, Garmin};
+
+#[test]
+fn a_receiver_is_configured_and_its_answers_are_checked() {
+    // Given a receiver that echoes what it is told, as a GPS 18x does.
+    let bench = Bench::new();
+    bench.configure(|text| {
+        text.replace("baud = 38400\n\n[compass]", "baud = 38400\nconfigure_garmin = true\n\n[compass]")
+    });
+    let (gps, compass) = bench.lines();
+    let receiver = Garmin::start(gps.far_end(), |body| Some(body.to_owned()));
+    let daemon = bench.start();
+    let feeder = Feeder::start(gps, compass);
+
+    // Then every setting is accepted, and the receiver is used.
+    let (line, seen) = daemon.wait(&["event=receiver_configured", "about=gps"]);
+    assert!(line.contains("7 settings accepted"), "{line}");
+    let (_, seen) = daemon.wait_from(seen, &["event=health", "fix=3d"]);
+
+    // When another receiver is plugged in that keeps averaging positions, then that is told.
+    let (mut gps, compass) = feeder.stop();
+    drop(receiver);
+    gps.unplug();
+    let (_, seen) = daemon.wait_from(seen, &["event=device_down", "about=gps", "fault=unplugged"]);
+    gps.plug();
+    let other = |body: &str| Some(body.replace("PGRMC1,1,1,1", "PGRMC1,1,1,2"));
+    let receiver = Garmin::start(gps.far_end(), other);
+    let (line, seen) = daemon.wait_from(seen, &["event=receiver_not_configured", "about=gps"]);
+    assert!(line.contains("PGRMC1") && line.contains("other values"), "{line}");
+
+    // When one is plugged in that does not answer, then that is told too, and what it sends is used.
+    drop(receiver);
+    gps.unplug();
+    let (_, seen) = daemon.wait_from(seen, &["event=device_down", "about=gps"]);
+    gps.plug();
+    let feeder = Feeder::start(gps, compass);
+    let (line, seen) = daemon.wait_from(seen, &["event=receiver_not_configured", "about=gps"]);
+    assert!(line.contains("did not answer PGRMC1"), "{line}");
+    daemon.wait_from(seen, &["event=health", "fix=3d"]);
+    feeder.stop();
+}
 
 #[test]
 fn a_port_that_another_program_holds_is_taken_when_it_is_free() {

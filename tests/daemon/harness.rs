@@ -1,7 +1,7 @@
 //! A running `windhover run`: its configuration, its lines over pseudo-terminals, its log.
 
 use std::fs::File;
-use std::io::Write;
+use std::io::{Read, Write};
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use tempfile::TempDir;
@@ -45,6 +46,11 @@ impl Line {
         let _ = std::fs::remove_file(&self.link);
         std::os::unix::fs::symlink(name, &self.link).expect("linked");
         self.far = Some(File::from(far));
+    }
+
+    /// The far end once more, for a device that listens too.
+    pub fn far_end(&self) -> File {
+        self.far.as_ref().expect("plugged").try_clone().expect("a second handle")
     }
 
     /// Takes the line away.
@@ -123,6 +129,55 @@ fn epoch(n: u32, alt_msl_m: Option<f64>) -> String {
         None => (format!("GPRMC,{time},V,,,,,,,181126,,"), format!("GPGGA,{time},,,,,0,00,,,M,,M,,")),
     };
     sentence(&rmc) + &sentence(&gga)
+}
+
+/// A Garmin receiver that listens on its line and answers each `$PGRM…` sentence. Lets go of the line when
+/// dropped.
+pub struct Garmin {
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Garmin {
+    /// Answers through `answer`: the sentence's body in, the answer's body out.
+    pub fn start(mut line: File, answer: impl Fn(&str) -> Option<String> + Send + 'static) -> Self {
+        let stop = Arc::new(AtomicBool::new(false));
+        let asked = stop.clone();
+        let thread = std::thread::spawn(move || {
+            let (mut heard, mut buffer) = (String::new(), [0u8; 256]);
+            while !asked.load(Ordering::Acquire) {
+                let wait = Timespec { tv_sec: 0, tv_nsec: 50_000_000 };
+                let mut ready = [PollFd::new(&line, PollFlags::IN)];
+                if !poll(&mut ready, Some(&wait)).is_ok_and(|count| count > 0) {
+                    continue;
+                }
+                // Nobody has the near end open: as quiet as no bytes.
+                let Ok(count) = line.read(&mut buffer) else {
+                    std::thread::sleep(Duration::from_millis(50));
+                    continue;
+                };
+                heard.push_str(&String::from_utf8_lossy(&buffer[..count]));
+                while let Some((one, rest)) = heard.split_once("\r\n") {
+                    let body = one.strip_prefix('$').and_then(|one| one.split_once('*'));
+                    // A sentence with a wrong checksum is not heard.
+                    let body =
+                        body.filter(|(body, _)| sentence(body).trim_end() == one).map(|(body, _)| body);
+                    if let Some(answer) = body.and_then(&answer) {
+                        let _ = line.write_all(sentence(&answer).as_bytes());
+                    }
+                    heard = rest.to_owned();
+                }
+            }
+        });
+        Self { stop, thread: Some(thread) }
+    }
+}
+
+impl Drop for Garmin {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Release);
+        self.thread.take().expect("running").join().expect("ended");
+    }
 }
 
 /// Numbers of the frames of a recording; none where there is nothing to read yet.

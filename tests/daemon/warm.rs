@@ -8,6 +8,7 @@ use windhover::detect::tag_pattern;
 use windhover::io::mcap_read::{McapReader, RawMessage};
 use windhover::io::proto::{host_time, windhover as wh};
 use windhover::io::records::topic;
+use windhover::io::store::index::{INDEX, Index};
 use windhover::time::Span;
 
 use super::harness::{Bench, Feeder};
@@ -101,4 +102,22 @@ fn a_restart_in_flight_tracks_within_two_seconds_and_replays() {
     for (flown, replayed) in flown.iter().zip(&replayed) {
         assert_eq!(flown, replayed);
     }
+}
+
+#[test]
+fn a_card_that_does_not_tell_what_was_known_is_told_and_not_waited_for() {
+    // Given a card whose index another program holds.
+    let bench = Bench::new();
+    let held = Index::open(&bench.path("card").join(INDEX)).expect("a new index");
+    let (gps, compass) = bench.lines();
+    let feeder = Feeder::start(gps, compass);
+    // Then the daemon says so, and flies.
+    let daemon = bench.start();
+    let (line, seen) = daemon.wait(&["event=warm_start"]);
+    assert!(line.contains("begins anew"), "{line}");
+    daemon.wait_from(seen, &["event=ready"]);
+    // And when the index is free, it is used.
+    drop(held);
+    daemon.wait_from(seen, &["event=index_ready"]);
+    feeder.stop();
 }

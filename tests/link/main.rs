@@ -10,9 +10,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use relay::{Radio, Relay};
-use team::{Keys, Payload, Station, any, card, loopback, payload_settings, station_settings, within};
+use team::{Keys, Payload, Station, any, card, loopback, payload_settings, record, station_settings, within};
 use windhover::io::link::keys::Role;
-use windhover::io::link::{Backlog, LinkEvent};
+use windhover::io::link::{Backlog, EarlyRecords, LinkEvent};
+use windhover::time::MonoTime;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 
@@ -58,6 +59,24 @@ async fn a_good_radio_carries_everything_live() {
     pair.station.stop().await;
     let gone = |e: &LinkEvent| matches!(e, LinkEvent::Down { peer, .. } if peer == "base");
     assert!(within(PATIENCE, || any(&pair.payload.events, gone)).await, "the station said goodbye");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_was_made_before_the_link_was_open_reaches_the_station() {
+    // Given records of a run whose link was not open yet.
+    let keys = Keys::new();
+    let settings = payload_settings(keys.files(Role::Payload, "alpha"), loopback());
+    let early = EarlyRecords::new(&settings);
+    let numbers: Vec<_> = (0..5).map(|n| early.send(&record(MonoTime::from_ns(n)))).collect();
+    assert_eq!(numbers, [0, 1, 2, 3, 4].map(Some));
+    // When the link is open, then numbers go on, and a station gets them all.
+    let payload = Payload::start(&settings, 1, None);
+    payload.handle.begin_with(early);
+    assert_eq!(payload.send(), 5);
+    let files = keys.files(Role::Station, "base");
+    let station = Station::first(&station_settings(files, Some(payload.address)));
+    station.complete(1, 6, PATIENCE).await;
+    station.stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -96,6 +96,14 @@ impl MemoryBacklog {
         number
     }
 
+    /// Takes over what another held, before anything was appended here.
+    pub fn adopt(&self, earlier: Self) {
+        let earlier = earlier.held.into_inner().unwrap_or_else(PoisonError::into_inner);
+        let mut held = self.held();
+        debug_assert!(held.records.is_empty() && held.first == 0, "numbers are given out once");
+        *held = earlier;
+    }
+
     /// The number the next record gets.
     pub fn end(&self) -> u32 {
         let held = self.held();

@@ -28,7 +28,7 @@ pub use backlog::{Backlog, Extent, Found, MemoryBacklog, Unread};
 pub use events::{LinkError, LinkEvent};
 pub use inbox::{Inbox, Progress};
 pub use live::{Class, downlink_class};
-pub use payload::{LinkHandle, LinkStatus, PayloadLink, PayloadSettings, StationStatus};
+pub use payload::{EarlyRecords, LinkHandle, LinkStatus, PayloadLink, PayloadSettings, StationStatus};
 pub use ranges::RangeSet;
 pub use station::{
     Arrival, Channel, FromPayload, OpenStation, PayloadStatus, Recall, StationHandle, StationLink,

@@ -170,6 +170,29 @@ impl Shared {
     }
 }
 
+/// Records of a run whose link is not open yet: they are numbered like all that follow.
+#[derive(Debug)]
+pub struct EarlyRecords(MemoryBacklog);
+
+impl EarlyRecords {
+    /// Of a link with these settings: bounded like its own memory, the oldest go first.
+    pub fn new(settings: &PayloadSettings) -> Self {
+        Self(MemoryBacklog::new(0, "", settings.backlog_bytes))
+    }
+
+    /// Keeps a record for when the link is open and gives its number; `None` where its topic is not for the
+    /// ground.
+    pub fn send(&self, record: &Record) -> Option<u32> {
+        numbered(&self.0, record)
+    }
+}
+
+/// Keeps a record that is for the ground; its number.
+fn numbered(recent: &MemoryBacklog, record: &Record) -> Option<u32> {
+    downlink_class(&record.topic)?;
+    Some(recent.append(Arc::new(record.clone())))
+}
+
 /// Gives records to the link. Copies are cheap; nothing here ever blocks.
 #[derive(Clone)]
 pub struct LinkHandle {
@@ -177,11 +200,16 @@ pub struct LinkHandle {
 }
 
 impl LinkHandle {
+    /// Begins with records that were made before the link was open, under the numbers they got.
+    pub fn begin_with(&self, early: EarlyRecords) {
+        self.shared.recent.adopt(early.0);
+        self.shared.end.send_replace(self.shared.recent.end());
+    }
+
     /// Takes a record on its way to the ground and gives its number in this run; `None` where its topic
     /// is not for the ground. Sessions are told at once.
     pub fn send(&self, record: &Record) -> Option<u32> {
-        downlink_class(&record.topic)?;
-        let number = self.shared.recent.append(Arc::new(record.clone()));
+        let number = numbered(&self.shared.recent, record)?;
         self.shared.end.send_modify(|end| *end = (*end).max(number + 1));
         Some(number)
     }

@@ -9,8 +9,8 @@ use crate::io::store::StoreHandle;
 
 /// Name under which the card keeps its identity.
 const CARD: &str = "link.card";
-/// How long the card may take to tell it.
-const WAIT: Duration = Duration::from_millis(500);
+/// How long the card may take to tell it: records of meanwhile are sent once the link is open.
+const WAIT: Duration = Duration::from_secs(5);
 
 /// The store's queue. Its runs count 1, 2, 3, … on each card, so that a card made anew begins again; on the
 /// link they are told apart by a random number that the card carries.
@@ -21,19 +21,23 @@ pub struct StoreBacklog {
 
 impl StoreBacklog {
     /// Over a store; also gives the identity of the present run on the link and its flight's name. Waits
-    /// for the card up to a second.
+    /// for the card up to ten seconds, where there is one.
     pub fn open(store: StoreHandle) -> (Self, u32, String) {
         let session = store.run();
-        let known = store.state(CARD, WAIT).and_then(|blob| Some(u32::from_be_bytes(blob.try_into().ok()?)));
-        let card = known.unwrap_or_else(|| {
-            let mut fresh = [0; 4];
-            // Without random bytes runs of different cards may be confused, which is all that fails.
-            let _ = ring::rand::SystemRandom::new().fill(&mut fresh);
-            store.put_state(CARD, fresh.to_vec());
-            u32::from_be_bytes(fresh)
-        });
-        let flight =
-            store.index().and_then(|index| index.flight(session)).unwrap_or_else(|| boot_name(session));
+        let index = store.index_within(WAIT);
+        let known = index.as_ref().and_then(|index| index.state(CARD));
+        let card =
+            known.and_then(|blob| Some(u32::from_be_bytes(blob.try_into().ok()?))).unwrap_or_else(|| {
+                let mut fresh = [0; 4];
+                // Without random bytes runs of different cards may be confused, which is all that fails.
+                let _ = ring::rand::SystemRandom::new().fill(&mut fresh);
+                // A card that did not answer may have one: it keeps that.
+                if index.is_some() {
+                    store.put_state(CARD, fresh.to_vec());
+                }
+                u32::from_be_bytes(fresh)
+            });
+        let flight = index.and_then(|index| index.flight(session)).unwrap_or_else(|| boot_name(session));
         (Self { store, card }, session ^ card, flight)
     }
 }

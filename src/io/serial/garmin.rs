@@ -107,7 +107,7 @@ impl GarminSetup {
 }
 
 /// A sentence with its frame and checksum.
-fn sentence(body: &str) -> String {
+pub(super) fn sentence(body: &str) -> String {
     let checksum = body.bytes().fold(0u8, |sum, byte| sum ^ byte);
     format!("${body}*{checksum:02X}\r\n")
 }

@@ -2,6 +2,7 @@
 
 mod garbled;
 mod garmin;
+mod garmin_speed;
 
 use std::io::{ErrorKind as IoKind, Read, Write};
 use std::path::Path;
@@ -13,6 +14,7 @@ use super::clock::HostClock;
 use super::device::{Backoff, Fault, FaultKind, NAP, NoteKind, Report, Stop};
 use garbled::TextShare;
 use garmin::GarminSetup;
+use garmin_speed::Settling;
 
 /// What a line is and how it is set.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -98,7 +100,13 @@ fn read_until_lost(
 ) -> Option<Fault> {
     let mut buffer = vec![0; READ_BYTES];
     let mut share = TextShare::default();
-    let mut setup = settings.configure_garmin.then(GarminSetup::new);
+    let mut setup = None;
+    if settings.configure_garmin {
+        if let Err(fault) = (Settling { port: &mut port, settings, clock, stop, tell }).settle() {
+            return Some(fault);
+        }
+        setup = Some(GarminSetup::new());
+    }
     while !stop.asked() {
         let now = clock.now();
         if let Some(step) = setup.as_mut().map(|setup| setup.due(now))

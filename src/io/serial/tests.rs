@@ -1,7 +1,7 @@
 //! The line over pseudo-terminals: what arrives, what goes away, what comes back.
 
 use std::fs::File;
-use std::io::Write;
+use std::io::{Read, Write};
 use std::os::fd::OwnedFd;
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, channel};
@@ -130,4 +130,63 @@ fn noise_tells_of_a_wrong_speed() {
         _ => None,
     });
     assert!(text.contains("38400 baud"), "{text}");
+}
+
+/// A Garmin receiver at the far end of a line, which is deaf and speaks noise at any speed but its own.
+fn garmin_at(mut far: File, mut own: u32) {
+    let mut reader = far.try_clone().expect("a second handle");
+    let (sender, asked) = channel::<Vec<u8>>();
+    std::thread::spawn(move || {
+        let mut buffer = [0; 256];
+        while let Ok(count) = reader.read(&mut buffer) {
+            if sender.send(buffer[..count].to_vec()).is_err() {
+                return;
+            }
+        }
+    });
+    let speed = |far: &File| rustix::termios::tcgetattr(far).map_or(0, |line| line.output_speed());
+    std::thread::spawn(move || {
+        let (mut heard, mut told) = (String::new(), own);
+        loop {
+            let said = asked.recv_timeout(Duration::from_millis(200)).unwrap_or_default();
+            if speed(&far) != own {
+                heard.clear();
+                if far.write_all(&[0xf8, 0x00, 0x9e, 0xe6]).is_err() {
+                    return;
+                }
+                continue;
+            }
+            heard.push_str(&String::from_utf8_lossy(&said));
+            let mut answers = garmin::sentence("GPRMC,150400.0,A,3842.2,N,00911.0,W,0,0,181126,,");
+            while let Some((one, rest)) = heard.split_once("\r\n") {
+                let body = one.trim_start_matches('$').split('*').next().unwrap_or_default();
+                match body.split(',').collect::<Vec<_>>().as_slice() {
+                    ["PGRMC", .., "8"] => told = 38_400,
+                    ["PGRMI", .., "R"] => own = told,
+                    _ => {}
+                }
+                answers.push_str(&garmin::sentence(body));
+                heard = rest.to_owned();
+            }
+            if far.write_all(answers.as_bytes()).is_err() {
+                return;
+            }
+        }
+    });
+}
+
+#[test]
+fn a_receiver_at_another_speed_is_brought_to_the_configured_one() {
+    let (far, name) = pty();
+    garmin_at(far, 19_200);
+    let line = Line::start(&name, true);
+    line.up();
+    let configured = |report| match report {
+        Report::Note(NoteKind::Configured, _, text) => Some(text),
+        _ => None,
+    };
+    let text = line.wait(configured);
+    assert!(text.contains("spoke at 19200 baud"), "{text}");
+    assert_eq!(line.wait(configured), "7 settings accepted", "then it is configured at the new speed");
+    line.wait(|r| matches!(r, Report::Bytes(_, bytes) if bytes.starts_with(b"$GPRMC")).then_some(()));
 }

@@ -72,6 +72,9 @@ pub(super) fn run(
     now: impl Fn() -> MonoTime,
 ) {
     let mut channels = Channels::default();
+    // Of the newest thing heard: what has no time of its own gets this. The clock's may be seconds ahead where
+    // the pipeline is behind, and readers put messages in order over a second only.
+    let mut heard_ns = None;
     let states = ChannelDef::json(STATE_TOPIC);
     let states = Arc::new(ChannelDef { message_encoding: "windhover.state".into(), ..(*states).clone() });
     loop {
@@ -84,7 +87,7 @@ pub(super) fn run(
             Work::Event(event) => encode_event(&event, frames, shared, &mut channels),
             Work::Record(record, number) => Some(channels.raw(&record, number, Weight::Small)),
             Work::State(name, blob) => {
-                let at = unsigned(now());
+                let at = heard_ns.unwrap_or_else(|| unsigned(now()));
                 let data = state_message(&name, &blob).into();
                 let channel = Arc::clone(&states);
                 Some(RawRecord {
@@ -98,6 +101,7 @@ pub(super) fn run(
             }
         };
         if let Some(raw) = raw {
+            heard_ns = heard_ns.max(Some(raw.log_ns));
             let topic = raw.channel.topic.clone().into();
             output.push(Entry {
                 bytes: raw.bytes(),

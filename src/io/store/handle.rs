@@ -15,7 +15,7 @@ use super::record::{RawRecord, STATE_TOPIC, Weight};
 use super::recorder::{self, Recorder, Settings};
 use super::segment::Head;
 use super::shared::Shared;
-use super::status::{StoreNotice, StoreStatus};
+use super::status::{Recording, StoreNotice, StoreStatus};
 use super::volume::Volume;
 use crate::config::{Config, StoreConfig};
 use crate::io::clock::HostClock;
@@ -27,8 +27,8 @@ use crate::time::UtcTime;
 /// battery): the program is younger. 2026-01-01.
 const EARLIEST_UTC: UtcTime = UtcTime::from_unix_ns(1_767_225_600_000_000_000);
 
-/// How long the start waits for the card to tell the number of the run.
-const WAIT_FOR_RUN: Duration = Duration::from_millis(500);
+/// How long the link waits for the card to tell the number of the run.
+const WAIT_FOR_RUN: Duration = Duration::from_secs(5);
 
 /// The running store.
 #[derive(Debug)]
@@ -98,8 +98,8 @@ impl Store {
     }
 
     /// Ends the flight properly: everything handed in is written, the segment is closed. Handles left
-    /// elsewhere lose what they hand in from now on. Waits for the card, and half a second at most for
-    /// the index.
+    /// elsewhere lose what they hand in from now on. Waits for the card, and a second at most for the
+    /// index: what it lacks is found at the next start.
     pub fn stop(self) {
         let Self { handle, writers, keeper } = self;
         handle.intake.close();
@@ -108,7 +108,7 @@ impl Store {
         handle.shared.stop();
         // The keeper may be in the middle of sealing or indexing: what it leaves is found again, and
         // nothing waits for it.
-        for _ in 0..50 {
+        for _ in 0..100 {
             if keeper.as_ref().is_none_or(JoinHandle::is_finished) {
                 break;
             }
@@ -160,14 +160,23 @@ impl StoreHandle {
     /// The last known state of a name, from this run or an earlier one; `None` where there is none, or
     /// the index does not answer within `wait`.
     pub fn state(&self, name: &str, wait: Duration) -> Option<Vec<u8>> {
-        self.wait_for_index(wait)?.state(name)
+        self.index_within(wait)?.state(name)
     }
 
-    fn wait_for_index(&self, wait: Duration) -> Option<Index> {
+    /// The index, once it answers; `None` where it does not within `wait`, or nothing is recorded.
+    pub fn index_within(&self, wait: Duration) -> Option<Index> {
+        self.wait_for(wait, || self.shared.index())
+    }
+
+    /// Waits for what the card is to tell, as long as there is one to record on.
+    fn wait_for<T>(&self, wait: Duration, told: impl Fn() -> Option<T>) -> Option<T> {
         const STEP: Duration = Duration::from_millis(10);
         for _ in 0..=wait.as_millis() / STEP.as_millis() {
-            if let Some(index) = self.shared.index() {
-                return Some(index);
+            if let Some(told) = told() {
+                return Some(told);
+            }
+            if matches!(self.shared.status().recording, Recording::Stopped(_)) {
+                return None;
             }
             std::thread::sleep(STEP);
         }
@@ -202,17 +211,11 @@ impl StoreHandle {
         status
     }
 
-    /// Identity of this run, under which numbered records are kept. Waits for the card up to half a
-    /// second; without one it is a number that no card has, and numbered records are not queued.
+    /// Identity of this run, under which numbered records are kept. Waits for the card up to five
+    /// seconds; without one it is a number that no card has, and numbered records are not queued.
     pub fn run(&self) -> u32 {
-        let step = Duration::from_millis(10);
-        for _ in 0..WAIT_FOR_RUN.as_millis() / step.as_millis() {
-            if let Some(session) = self.shared.session() {
-                return session;
-            }
-            std::thread::sleep(step);
-        }
-        self.shared.settle_session(rand::random::<u32>() | 0x8000_0000)
+        let told = self.wait_for(WAIT_FOR_RUN, || self.shared.session());
+        told.unwrap_or_else(|| self.shared.settle_session(rand::random::<u32>() | 0x8000_0000))
     }
 
     /// A station has every number of a run below `through` on its disk.

@@ -9,12 +9,12 @@ use super::flight::{self, FLIGHTS};
 use super::journal::Journal;
 use super::volume::Volume;
 use super::{Recording, Store, StoreHandle, StoreNotice};
-use crate::config::StoreConfig;
+use crate::config::{FramePolicy, StoreConfig};
 use crate::io::capture::CaptureReader;
 use crate::io::clock::HostClock;
 use crate::io::records::{Record, Schema, topic};
 use crate::msg::{Event, EventBody, FrameEncoding, FramePayload};
-use crate::time::UtcTime;
+use crate::time::{Span, UtcTime};
 
 fn gps(clock: &HostClock, seq: u64) -> Event {
     Event { t_recv: clock.now(), seq, body: EventBody::GnssBytes(format!("$GPGGA,{seq}\r\n").into_bytes()) }
@@ -232,4 +232,86 @@ fn a_broken_index_is_made_again_from_the_segments() {
     assert_eq!(index.state("clock"), Some(vec![9]));
     assert_eq!(super::rebuild::differences(dir.path(), &index).unwrap().len(), 0);
     store.stop();
+}
+
+#[test]
+fn what_an_earlier_run_knew_is_told_before_a_slow_card_has_begun_a_flight() {
+    // Given a state on a card.
+    let dir = tempfile::tempdir().unwrap();
+    let (clock, journal) = (HostClock::start(), Arc::new(Journal::default()));
+    let start = || {
+        let volume = Volume::journaled(dir.path(), Arc::clone(&journal));
+        Store::start_on(volume, &config(dir.path()), String::new(), clock)
+    };
+    let (store, _notices) = start();
+    store.handle().put_state("warm", vec![1, 2, 3]);
+    store.stop();
+
+    // When the next run finds a card that takes its time to begin a flight.
+    journal.set_held(true);
+    let (store, notices) = start();
+    let told = store.handle().state("warm", Duration::from_secs(30));
+    let begun = store.handle().status().flight;
+    journal.set_held(false);
+
+    // Then the state is told meanwhile, and the flight begins all the same; nothing of it is sealed.
+    assert_eq!((told, begun), (Some(vec![1, 2, 3]), String::new()));
+    expect_notice(&notices, "index_ready");
+    store.handle().event(&gps(&clock, 1));
+    store.stop();
+    let names = flight::flight_names(dir.path()).unwrap();
+    assert_eq!(names.len(), 2, "{names:?}");
+    assert!(names.iter().all(|name| flight::flight_info(dir.path(), name).unwrap().closed));
+    let sealed = notices.try_iter().find(|notice| notice.name() == "segment_sealed");
+    assert!(sealed.is_none(), "{sealed:?}");
+}
+
+#[test]
+fn a_segment_that_the_index_missed_at_the_end_is_found_at_the_next_start() {
+    // Given a closed flight of whose segments the index knows none, as after a stop that could not wait.
+    let dir = tempfile::tempdir().unwrap();
+    let clock = HostClock::start();
+    let volume = Volume::new(dir.path());
+    let start = || Store::start_on(volume.clone(), &config(dir.path()), String::new(), clock);
+    let (store, notices) = start();
+    store.handle().record(estimate(&clock, 0), Some(0));
+    expect_notice(&notices, "index_ready");
+    store.stop();
+    let name = flight::flight_names(dir.path()).unwrap().remove(0);
+    let index = super::index::Index::open(&dir.path().join(super::index::INDEX)).unwrap();
+    index.apply(&[super::index::Change::Forget(1), super::index::Change::Flight(1, name)]).unwrap();
+    assert_eq!(super::rebuild::differences(dir.path(), &index).unwrap().len(), 1);
+    drop(index);
+    // When the store is started again, then the index has it.
+    let (store, notices) = start();
+    expect_notice(&notices, "index_ready");
+    let index = store.handle().index().unwrap();
+    assert_eq!(super::rebuild::differences(dir.path(), &index).unwrap(), Vec::<String>::new());
+    store.stop();
+}
+
+#[test]
+fn what_a_daemon_far_behind_records_is_read_in_the_order_it_was_handled() {
+    // Given events that are handled seconds after they were heard, as on an overloaded machine, with states
+    // kept between.
+    let dir = tempfile::tempdir().unwrap();
+    let clock = HostClock::start();
+    let config = StoreConfig { frames: FramePolicy::Zstd, ..config(dir.path()) };
+    let (store, _notices) = Store::start_on(Volume::new(dir.path()), &config, String::new(), clock);
+    let (handle, began) = (store.handle(), clock.now() - Span::from_s(5.0));
+    for n in 0..300u32 {
+        let t_recv = began + Span::from_ms(10.0 * f64::from(n));
+        let made = if n % 10 == 7 { frame(&clock, n) } else { gps(&clock, u64::from(n)) };
+        handle.event(&Event { t_recv, ..made });
+        if n % 100 == 50 {
+            handle.put_state("warm", vec![0; 100]);
+        }
+    }
+    store.stop();
+    // Then they are read in that order.
+    let name = flight::flight_names(dir.path()).unwrap().remove(0);
+    let read = CaptureReader::open(&dir.path().join(FLIGHTS).join(name)).unwrap();
+    let times: Vec<i64> = read.filter_map(|item| item.event).map(|event| event.t_recv.ns()).collect();
+    assert_eq!(times.len(), 300);
+    assert!(times.is_sorted(), "{times:?}");
 }

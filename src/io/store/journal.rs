@@ -74,6 +74,7 @@ struct Log {
     files: u64,
     fault: Option<std::io::ErrorKind>,
     free_bytes: Option<u64>,
+    held: bool,
 }
 
 /// The operations of a [`super::volume::Volume`], in order.
@@ -101,7 +102,17 @@ impl Journal {
         self.log().free_bytes = bytes;
     }
 
+    /// From now on operations wait until they may go on: a card that takes its time.
+    pub fn set_held(&self, held: bool) {
+        self.log().held = held;
+    }
+
+    /// What an operation comes to before it is done: waits while the card takes its time, fails where it is
+    /// to fail.
     pub(super) fn fault(&self) -> std::io::Result<()> {
+        while self.log().held {
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
         self.log().fault.map_or(Ok(()), |kind| Err(kind.into()))
     }
 

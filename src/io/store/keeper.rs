@@ -25,6 +25,8 @@ use crate::time::{MonoTime, Span};
 /// What the keeper is told.
 #[derive(Debug)]
 pub(super) enum Message {
+    /// There is a card to record on; no flight has begun yet.
+    CardFound,
     /// Changes of which the segment is durable.
     Changes(Vec<Change>),
     /// A segment is closed.
@@ -76,6 +78,8 @@ pub(super) struct Keeper {
     held: Vec<Change>,
     queued: u64,
     tasks: VecDeque<Task>,
+    /// Whether there ever was a card.
+    card_found: bool,
     present: Option<(u32, String)>,
     /// Whether the index was told to be complete since it was opened.
     complete: bool,
@@ -96,6 +100,7 @@ impl Keeper {
             held: Vec::new(),
             queued: 0,
             tasks: VecDeque::new(),
+            card_found: false,
             present: None,
             complete: false,
             device: None,
@@ -122,6 +127,7 @@ impl Keeper {
 
     fn hear(&mut self, message: Message) {
         match message {
+            Message::CardFound => self.card_found = true,
             Message::Changes(changes) => {
                 self.queued += changes.iter().filter(|c| matches!(c, Change::Queue(..))).count() as u64;
                 self.held.extend(changes);
@@ -196,12 +202,14 @@ impl Keeper {
         }
     }
 
-    /// Opens the index once the card is there; an unusable one is moved aside and made again.
+    /// Opens the index once the card is there, before there is a flight: what an earlier run knew is waited
+    /// for, and a flight begins with several waits for the card. An unusable one is moved aside and made
+    /// again.
     fn open_index(&mut self) {
         let now = self.clock.now();
         let waiting = self.tried_at.is_some_and(|tried| now - tried < RETRY_INDEX);
         let stopped = matches!(self.shared.status().recording, Recording::Stopped(_));
-        if self.index.is_some() || self.present.is_none() || waiting || stopped {
+        if self.index.is_some() || !self.card_found || waiting || stopped {
             return;
         }
         self.tried_at = Some(now);
@@ -223,7 +231,10 @@ impl Keeper {
                 self.shared.set_index(Some(index.clone()));
                 self.index = Some(index);
                 self.complete = false;
-                self.tasks.push_back(Task::Look);
+                // Without a flight in the air nobody knows which one is not to be touched.
+                if self.present.is_some() {
+                    self.tasks.push_back(Task::Look);
+                }
                 self.apply();
             }
             Err(error) => self.shared.notice(StoreNotice::Failed { reason: error.to_string() }),
@@ -247,9 +258,12 @@ impl Keeper {
         if let Err(error) = done {
             self.shared.notice(StoreNotice::Failed { reason: error.to_string() });
         }
-        if let (true, false, Some(index)) = (self.tasks.is_empty(), self.complete, &self.index) {
-            self.shared.notice(StoreNotice::IndexReady { flights: index.flights().len() });
-            self.complete = true;
+        if self.tasks.is_empty() && self.present.is_some() && !self.complete {
+            self.apply();
+            if let Some(index) = &self.index {
+                self.shared.notice(StoreNotice::IndexReady { flights: index.flights().len() });
+                self.complete = true;
+            }
         }
     }
 
@@ -260,8 +274,9 @@ impl Keeper {
         })
     }
 
-    /// Compares the directories with the index: what the index does not know, or was not closed, is
-    /// settled flight by flight, newest first; what is gone is forgotten.
+    /// Compares the directories with the index: what the index does not know whole (a card may have been too
+    /// slow at the end for the last segment), or was not closed, is settled flight by flight, newest first;
+    /// what is gone is forgotten.
     fn look(&mut self) -> StoreResult<()> {
         let root = self.volume.root().to_owned();
         let known = self.index.as_ref().map_or(Vec::new(), Index::flights);
@@ -274,9 +289,16 @@ impl Keeper {
                 self.held.push(Change::Forget(*run));
             }
         }
+        let segments = self.index.as_ref().map_or(Vec::new(), Index::segments);
         for name in on_card {
-            let closed = root.join(FLIGHTS).join(&name).join(flight::FLIGHT_FILE).exists();
-            let indexed = self.index.is_none() || known.iter().any(|(_, known)| *known == name);
+            let dir = root.join(FLIGHTS).join(&name);
+            let closed = dir.join(flight::FLIGHT_FILE).exists();
+            let whole = |run: u32| {
+                let known = segments.iter().filter(|((of, _), _)| *of == run).count();
+                known >= flight::segment_names(&dir).len()
+            };
+            let indexed =
+                self.index.is_none() || known.iter().any(|(run, known)| *known == name && whole(*run));
             if !closed || !indexed {
                 self.tasks.push_back(Task::Settle(name));
             }

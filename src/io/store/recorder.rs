@@ -53,6 +53,8 @@ pub(super) struct Recorder {
     flight: Option<FlightWriter>,
     trouble: Option<String>,
     retry_at: MonoTime,
+    /// Log time of the newest record taken, ns.
+    heard_ns: Option<u64>,
     missed: Drops,
     uncommitted: Drops,
     changes: Vec<Change>,
@@ -80,6 +82,7 @@ impl Recorder {
             flight: None,
             trouble: None,
             retry_at: clock.now(),
+            heard_ns: None,
             missed: Drops::default(),
             uncommitted: Drops::default(),
             changes: Vec::new(),
@@ -120,6 +123,7 @@ impl Recorder {
     }
 
     fn take(&mut self, record: &RawRecord) {
+        self.heard_ns = self.heard_ns.max(Some(record.log_ns));
         if !self.is_open() {
             self.missed.add(&record.channel.topic, record.data.len(), record.log_ns);
             return;
@@ -285,6 +289,7 @@ impl Recorder {
         self.lock = None;
         self.lock = Some(RecorderLock::acquire(self.volume.root())?);
         self.device = Some(self.volume.device()?);
+        self.send(Message::CardFound);
         let now_ns = unsigned(self.clock.now());
         let start = self.shared.start();
         if let Some(flight) = &mut self.flight {
@@ -327,7 +332,8 @@ impl Recorder {
             "messages": missed.messages,
             "reason": self.trouble.as_deref().unwrap_or("the card did not keep up"),
         });
-        let at = unsigned(now);
+        // In its place among the others, not ahead of what still waits.
+        let at = self.heard_ns.unwrap_or(unsigned(now));
         self.take(&RawRecord {
             channel: Arc::clone(&self.dropouts),
             log_ns: at,

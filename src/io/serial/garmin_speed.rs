@@ -1,0 +1,137 @@
+//! Brings a Garmin receiver to the line speed of the configuration: finds the speed it speaks, tells it the
+//! other, restarts it.
+//!
+//! Source: Garmin GPS 18x technical specifications, "Sensor Configuration Information (PGRMC)": field 10 is
+//! the line speed, which takes effect after a reset (`PGRMI`, field 7 = R).
+
+use std::io::Read as _;
+
+use serialport::{SerialPort as _, TTYPort};
+
+use super::garmin::sentence;
+use super::{IoKind, READ_BYTES, SerialSettings, unplugged};
+use crate::io::clock::HostClock;
+use crate::io::device::{Fault, NoteKind, Report, Stop};
+use crate::time::Span;
+
+/// Speeds a receiver may speak and their codes in PGRMC, factory settings first.
+const SPEEDS: [(u32, u8); 4] = [(19_200, 5), (4_800, 3), (38_400, 8), (9_600, 4)];
+
+/// How long a receiver has to say a sentence: it speaks once a second, or answers at once.
+const LISTEN: Span = Span::from_ns(1_500_000_000);
+
+/// Asks for the present configuration: also a receiver whose sentences are all off answers.
+const QUERY: &str = "PGRMCE";
+
+/// Restarts the receiver.
+const RESET: &str = "PGRMI,,,,,,,R";
+
+/// The line while its speed is settled.
+pub(super) struct Settling<'a> {
+    pub(super) port: &'a mut TTYPort,
+    pub(super) settings: &'a SerialSettings,
+    pub(super) clock: HostClock,
+    pub(super) stop: &'a Stop,
+    pub(super) tell: &'a dyn Fn(Report),
+}
+
+impl Settling<'_> {
+    /// Leaves the line at the configured speed, and the receiver too where it can be brought there.
+    pub(super) fn settle(mut self) -> Result<(), Fault> {
+        let wanted = self.settings.baud;
+        if self.speaks()? {
+            return Ok(());
+        }
+        let Some(code) = SPEEDS.iter().find(|(speed, _)| *speed == wanted).map(|(_, code)| *code) else {
+            return Ok(());
+        };
+        for (speed, _) in SPEEDS.iter().filter(|(speed, _)| *speed != wanted) {
+            self.set_speed(*speed)?;
+            if !self.speaks()? {
+                continue;
+            }
+            let body = format!("PGRMC,,,,,,,,,,{code}");
+            self.send(&body)?;
+            let heard = self.listen(|text| answered(text, code))?;
+            self.send(RESET)?;
+            // Its echo still comes at the old speed; the new one holds after the reset.
+            self.listen(|text| bodies(text).any(|body| body.starts_with("PGRMI")))?;
+            let text = format!("the receiver spoke at {speed} baud and was told to speak at {wanted}");
+            let note = if heard { NoteKind::Configured } else { NoteKind::NotConfigured };
+            (self.tell)(Report::Note(note, 1, text));
+            break;
+        }
+        self.set_speed(wanted)
+    }
+
+    /// Whether sentences arrive at the line's present speed.
+    fn speaks(&mut self) -> Result<bool, Fault> {
+        self.send(QUERY)?;
+        self.listen(holds_a_sentence)
+    }
+
+    fn set_speed(&mut self, speed: u32) -> Result<(), Fault> {
+        let lost = |_| unplugged(&self.settings.device);
+        // What was written goes out at the speed it was meant for.
+        std::io::Write::flush(self.port).map_err(|_| unplugged(&self.settings.device))?;
+        self.port.set_baud_rate(speed).map_err(lost)?;
+        self.port.clear(serialport::ClearBuffer::Input).map_err(lost)
+    }
+
+    fn send(&mut self, body: &str) -> Result<(), Fault> {
+        std::io::Write::write_all(self.port, sentence(body).as_bytes())
+            .map_err(|_| unplugged(&self.settings.device))
+    }
+
+    /// Hears the line for a while; whether `enough` was heard.
+    fn listen(&mut self, enough: impl Fn(&str) -> bool) -> Result<bool, Fault> {
+        let until = self.clock.now() + LISTEN;
+        let (mut text, mut buffer) = (String::new(), vec![0; READ_BYTES]);
+        while self.clock.now() < until && !self.stop.asked() {
+            (self.tell)(Report::Beat);
+            match self.port.read(&mut buffer) {
+                Ok(0) => return Err(unplugged(&self.settings.device)),
+                Ok(count) => text.push_str(&String::from_utf8_lossy(&buffer[..count])),
+                Err(error) if matches!(error.kind(), IoKind::TimedOut | IoKind::Interrupted) => {}
+                Err(_) => return Err(unplugged(&self.settings.device)),
+            }
+            if enough(&text) {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+}
+
+/// Bodies of the sentences in a text whose checksums are right.
+fn bodies(text: &str) -> impl Iterator<Item = &str> {
+    text.split('$').skip(1).filter_map(|rest| {
+        let (body, after) = rest.split_once('*')?;
+        let whole = sentence(body);
+        whole.trim_end().ends_with(&format!("*{}", after.get(..2)?)).then_some(body)
+    })
+}
+
+fn holds_a_sentence(text: &str) -> bool {
+    bodies(text).next().is_some()
+}
+
+/// Whether the receiver echoed the new speed.
+fn answered(text: &str, code: u8) -> bool {
+    bodies(text).any(|body| {
+        body.starts_with("PGRMC,") && body.split(',').nth(10).is_some_and(|field| field == code.to_string())
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sentences_are_told_from_noise() {
+        assert!(holds_a_sentence(&format!("\u{fffd}x${}", sentence("GPRMC,1").trim_start_matches('$'))));
+        assert!(!holds_a_sentence("$GPRMC,1*00\r\n$GP"));
+        assert!(answered(&sentence("PGRMC,A,,100,,,,,,A,8,,2,4,"), 8));
+        assert!(!answered(&sentence("PGRMC,A,,100,,,,,,A,5,,2,4,"), 8));
+    }
+}
