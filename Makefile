@@ -5,7 +5,7 @@ CARGO ?= cargo
 VENV  ?= target/venv
 DEMO  ?= demo
 
-.PHONY: help setup setup-python build demo test test-python test-web test-zenoh check lint docs bench load clean deb hil hil-long
+.PHONY: help setup setup-python build demo test test-python test-web test-zenoh check lint docs bench load clean deb hil hil-long hil-short
 
 help:
 	@echo "make demo     build, simulate a flight, replay it, compare with the truth, write a report page"
@@ -18,6 +18,7 @@ help:
 	@echo "make deb      a Debian package in target/debian"
 	@echo "make hil      the virtual payload computer: install, boot, fly, compare (as root)"
 	@echo "make hil-long the same with every scenario"
+	@echo "make hil-short the same with cold boot, unplugged devices and landing; skips where it cannot run"
 
 # What the build needs of the system: a C compiler for the compression libraries, CMake and an assembler
 # for JPEG, and clang's library for the camera bindings.
@@ -86,7 +87,10 @@ deb: build
 hil hil-long: deb
 	@sh tests/setup/packages.sh qemu-system-x86 mmdebstrap e2fsprogs python3
 	$(CARGO) build --release --locked --example hil_feed --example hil_frames --example hil_stream
-	sh hil/fly.sh $(if $(filter hil-long,$@),--long,)
+	sh hil/fly.sh $(if $(filter hil-long,$@),--long,$(SCENARIOS))
+
+hil-short:
+	@sh hil/short.sh
 
 clean:
 	$(CARGO) clean
