@@ -30,8 +30,9 @@ setup-python: setup
 	@sh tests/setup/packages.sh python3 python3-venv iproute2 nftables
 	@sh tests/setup/venv.sh $(VENV) tests/python/requirements.txt
 
+# Examples are built with the program, where they are wanted: apart, Cargo builds the library twice.
 build: setup
-	$(CARGO) build --release --locked
+	$(CARGO) build --release --locked $(PARTS)
 
 demo: build
 	@sh tests/demo.sh target/release/windhover $(DEMO)
@@ -73,8 +74,8 @@ bench: setup
 	$(CARGO) bench --locked
 
 # Latency and load of the daemon. Figures mean something on an idle machine only; the load is printed.
+load: PARTS = --bin windhover --example daemon_load
 load: build
-	$(CARGO) build --release --locked --example daemon_load
 	target/release/examples/daemon_load
 
 # The package: binary, unit, configuration, rules, manual and completions out of the command line.
@@ -84,9 +85,9 @@ deb: build
 	test -x target/tools/bin/cargo-deb || $(CARGO) install cargo-deb --version 3.8.0 --locked --root target/tools
 	target/tools/bin/cargo-deb --no-build --locked --strip
 
+hil hil-long: PARTS = --bin windhover --example hil_feed --example hil_frames --example hil_stream
 hil hil-long: deb
 	@sh tests/setup/packages.sh qemu-system-x86 mmdebstrap e2fsprogs python3
-	$(CARGO) build --release --locked --example hil_feed --example hil_frames --example hil_stream
 	sh hil/fly.sh $(if $(filter hil-long,$@),--long,$(SCENARIOS))
 
 hil-short:
