@@ -253,6 +253,7 @@ impl Recorder {
 
     /// Tries to record: begins the flight, or goes on with it.
     fn attempt(&mut self) {
+        let begins = self.flight.is_none();
         match self.try_open() {
             Ok(()) => {
                 let flight = self.flight.as_ref().map_or_else(String::new, |f| f.name().to_owned());
@@ -264,6 +265,11 @@ impl Recorder {
                     Some(_) => StoreNotice::Resumed { flight },
                     None => StoreNotice::Started { flight },
                 });
+                // Told after it: what the index tells follows from this.
+                if let (true, Some(flight)) = (begins, &self.flight) {
+                    let (session, name) = (flight.session(), flight.name().to_owned());
+                    self.send(Message::Begun { session, name });
+                }
             }
             Err(error) => self.stop(error.to_string()),
         }
@@ -300,7 +306,6 @@ impl Recorder {
         let mut head = Head { time_ns: now_ns, ..self.settings.head.clone() };
         head.metadata.insert("run".into(), run.to_string());
         let flight = FlightWriter::begin(&self.volume, session, start, head, self.settings.limits)?;
-        self.send(Message::Begun { session, name: flight.name().to_owned() });
         self.flight = Some(flight);
         Ok(())
     }
