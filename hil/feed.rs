@@ -4,9 +4,9 @@
 //! `hil_feed CAPTURE GPS_SOCKET COMPASS_SOCKET FRAMES_SOCKET PULSE_SOCKET [GREY|YUYV|UYVY|NV12|RGB3]`
 //!
 //! Each frame carries its number as 24 squares of 8 pixels in its top-left corner, so that the far end
-//! can tell which frame it saw. Serial bytes that nobody takes are lost after a second or so, as on a real
-//! line, and do not wait in the emulator for somebody to open the port. One line `start NS` on standard output tells when it began, and
-//! `frame N` each frame that was handed over.
+//! can tell which frame it saw. Serial bytes that nobody takes are lost after two seconds, as on a real line,
+//! and do not wait in the emulator for somebody to open the port. One line `start NS` on standard output tells
+//! when it began, and `frame N` each frame that was handed over.
 
 use std::io::Write;
 use std::os::unix::net::UnixStream;
@@ -116,10 +116,14 @@ impl Lines {
     }
 }
 
-/// A serial line: what waits in it is as little as the kernel allows, a handful of writes.
+/// What waits in a line: some 70 writes, two seconds of either device. An emulator that stalls for less loses
+/// nothing.
+const LINE_BYTES: usize = 32 << 10;
+
+/// A serial line.
 fn line(path: &str) -> Result<UnixStream, Trouble> {
     let stream = UnixStream::connect(path)?;
-    rustix::net::sockopt::set_socket_send_buffer_size(&stream, 1)?;
+    rustix::net::sockopt::set_socket_send_buffer_size(&stream, LINE_BYTES)?;
     stream.set_nonblocking(true)?;
     Ok(stream)
 }
