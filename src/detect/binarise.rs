@@ -39,6 +39,11 @@ const LEAST_RELATIVE: u8 = 70;
 const ENOUGH_RELATIVE: u8 = 160;
 const BUSY_SHARE: f32 = 0.3;
 
+/// Tiles on a side of the blocks whose light is compared, and by what factor it differs among a block and its
+/// neighbours where a shadow ends.
+const BLOCK: usize = 8;
+const LIGHT_STEP: f32 = 1.5;
+
 /// Thresholds an image against its surroundings, 12×12 pixels around each tile.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Binariser {
@@ -53,6 +58,16 @@ pub(super) struct Binariser {
     least_relative: u8,
     thresholds: Vec<u8>,
     tiles: (usize, usize),
+    /// Mean of the local maxima of each block of tiles.
+    lights: Vec<f32>,
+}
+
+/// Where dark pixels are looked for.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Where {
+    Everywhere,
+    /// Where light and shade are near each other.
+    LightChanges,
 }
 
 impl Binariser {
@@ -96,9 +111,14 @@ impl Binariser {
         self.least_relative = least;
     }
 
+    /// Whether more of the image has all the contrast a tag has than can be looked at cheaply.
+    pub fn is_busy(&self) -> bool {
+        self.least_relative == ENOUGH_RELATIVE
+    }
+
     /// Marks pixels below `fraction`/256 of the way from the local minimum to the local maximum, where
     /// the minimum is well below the maximum; elsewhere nothing is dark.
-    pub fn mark(&mut self, image: ImageView<'_>, fraction: u16, out: &mut Bitmap, simd: Simd) {
+    pub fn mark(&mut self, image: ImageView<'_>, fraction: u16, at: Where, out: &mut Bitmap, simd: Simd) {
         let (across, down) = self.tiles;
         self.thresholds.resize(across * down, 0);
         let least = self.least_relative;
@@ -107,12 +127,42 @@ impl Binariser {
             let above = (u16::from(high - low) * fraction + 128) >> 8;
             *t = if relative >= least { low + above as u8 } else { 0 };
         }
+        if at == Where::LightChanges {
+            self.clear_even_light();
+        }
         let per_row = image.width.div_ceil(64);
         (out.width, out.height) = (image.width, image.height);
         out.words.resize(per_row * image.height, 0);
         for (v, words) in out.words.chunks_exact_mut(per_row).enumerate() {
             let tile = v / TILE;
             simd.pack_below(image.row(v), &self.thresholds[tile * across..(tile + 1) * across], words);
+        }
+    }
+
+    /// Takes the thresholds away where the light of a block and its neighbours is much the same.
+    fn clear_even_light(&mut self) {
+        let (across, down) = self.tiles;
+        let (wide, high) = (across.div_ceil(BLOCK), down.div_ceil(BLOCK));
+        let span = |block: usize, tiles: usize| block * BLOCK..tiles.min((block + 1) * BLOCK);
+        self.lights.clear();
+        for (y, x) in (0..high).flat_map(|y| (0..wide).map(move |x| (y, x))) {
+            let (rows, columns) = (span(y, down), span(x, across));
+            let count = (rows.len() * columns.len()) as f32;
+            let row = |v: usize| &self.wide_high[v * across..][columns.clone()];
+            let sum: u32 = rows.flat_map(row).map(|&h| u32::from(h)).sum();
+            self.lights.push(sum as f32 / count);
+        }
+        for (y, x) in (0..high).flat_map(|y| (0..wide).map(move |x| (y, x))) {
+            let (mut least, mut most) = (f32::MAX, 0.0f32);
+            for v in y.saturating_sub(1)..(y + 2).min(high) {
+                for &light in &self.lights[v * wide + x.saturating_sub(1)..v * wide + (x + 2).min(wide)] {
+                    (least, most) = (least.min(light), most.max(light));
+                }
+            }
+            if most < LIGHT_STEP * least {
+                let columns = span(x, across);
+                span(y, down).for_each(|v| self.thresholds[v * across..][columns.clone()].fill(0));
+            }
         }
     }
 }
@@ -167,7 +217,7 @@ mod tests {
         }
         let (mut binariser, mut bits) = (Binariser::default(), Bitmap::default());
         binariser.measure(image.view(), 30, Simd::best());
-        binariser.mark(image.view(), 128, &mut bits, Simd::best());
+        binariser.mark(image.view(), 128, Where::Everywhere, &mut bits, Simd::best());
         for v in 0..30 {
             for u in 0..40 {
                 let dark = bits.row(v)[u / 64] >> (u % 64) & 1 == 1;
@@ -175,7 +225,7 @@ mod tests {
             }
         }
         binariser.measure(image.view(), 190, Simd::best());
-        binariser.mark(image.view(), 128, &mut bits, Simd::best());
+        binariser.mark(image.view(), 128, Where::Everywhere, &mut bits, Simd::best());
         assert!((0..30).all(|v| bits.row(v)[0] == 0), "a gate above the contrast leaves nothing");
     }
 

@@ -4,6 +4,8 @@
 //! those that have begun by its end are population counts of the row's words. That has no branches to
 //! mispredict, which on textured ground is where the time goes.
 
+use std::ops::Range;
+
 use super::binarise::Bitmap;
 use super::simd::{Kernel, Simd};
 
@@ -34,18 +36,33 @@ impl Component {
     pub fn height(&self) -> usize {
         usize::from(self.bottom - self.top) + 1
     }
+}
 
-    /// No pixel: what others are added to.
-    const NOTHING: Self = Self { left: u16::MAX, right: 0, top: u16::MAX, bottom: 0, area: 0, runs: 0 };
+/// What a component adds up to so far.
+#[derive(Clone, Copy, Debug)]
+struct Sums {
+    left: u16,
+    right: u16,
+    top: u16,
+    bottom: u16,
+    /// Area in the lower half, runs in the upper.
+    counts: u64,
+}
 
+impl Sums {
+    /// No pixel as yet, from row `v` on.
+    #[inline(always)]
+    fn from_row(v: u16) -> Self {
+        Self { left: u16::MAX, right: 0, top: v, bottom: v, counts: 0 }
+    }
+
+    /// Adds a run of a row that is not above any before.
     #[inline(always)]
     fn add(&mut self, run: &Run, v: u16) {
         self.left = self.left.min(run.start);
-        self.right = self.right.max(run.end - 1);
-        self.top = self.top.min(v);
+        self.right = self.right.max(run.end);
         self.bottom = v;
-        self.area += u32::from(run.end - run.start);
-        self.runs += 1;
+        self.counts += u64::from(run.end - run.start) | 1 << 32;
     }
 
     fn merge(&mut self, other: &Self) {
@@ -53,8 +70,13 @@ impl Component {
         self.right = self.right.max(other.right);
         self.top = self.top.min(other.top);
         self.bottom = self.bottom.max(other.bottom);
-        self.area += other.area;
-        self.runs += other.runs;
+        self.counts += other.counts;
+    }
+
+    fn component(&self) -> Component {
+        let &Self { left, right, top, bottom, counts } = self;
+        let (area, runs) = (counts as u32, (counts >> 32) as u32);
+        Component { left, right: right - 1, top, bottom, area, runs }
     }
 }
 
@@ -91,10 +113,10 @@ impl Marks {
 pub(super) struct Labeller {
     runs: Vec<Run>,
     labels: Vec<u32>,
-    /// Where each row's runs start, and where the last row's end.
+    /// Where each row's runs start.
     rows: Vec<u32>,
-    /// Marks of the row above and of the row at hand.
-    marks: [Vec<Marks>; 2],
+    /// Marks of every row, a row without runs before the first.
+    marks: Vec<Marks>,
     /// Label above each label; a root is its own.
     parents: Vec<u32>,
     /// How many labels there are; buffers only grow.
@@ -102,14 +124,11 @@ pub(super) struct Labeller {
     /// Labels found to be of one component, and how many pairs there are.
     joins: Vec<(u32, u32)>,
     joined: usize,
-    components: Vec<Component>,
-    /// Where a label's outline starts, `NOT_KEPT` where its component is not kept.
-    outline_at: Vec<u32>,
-    kept: Vec<(u32, u32)>,
+    sums: Vec<Sums>,
+    /// Components kept and the labels of their roots.
+    kept: Vec<(Component, u32)>,
     outlines: Vec<(u16, u16)>,
 }
-
-const NOT_KEPT: u32 = u32::MAX;
 
 impl Labeller {
     /// Finds the components of a bitmap (pixels that touch by a side or a corner) and outlines those that
@@ -117,14 +136,16 @@ impl Labeller {
     pub fn label(&mut self, bits: &Bitmap, simd: Simd, keep: impl Fn(&Component) -> bool) {
         simd.run(FindRuns { labeller: self, bits });
         self.gather(keep);
-        self.outline();
+        simd.run(FindOutlines { labeller: self, words: bits.width.div_ceil(64) });
     }
 
     /// The kept components with their outlines.
     pub fn kept(&self) -> impl Iterator<Item = (&Component, Outline<'_>)> {
-        self.kept.iter().map(|&(label, at)| {
-            let component = &self.components[label as usize];
-            (component, &self.outlines[at as usize..at as usize + component.height()])
+        let mut at = 0;
+        self.kept.iter().map(move |(component, _)| {
+            let from = at;
+            at += component.height();
+            (component, &self.outlines[from..at])
         })
     }
 
@@ -132,36 +153,32 @@ impl Labeller {
     #[inline(always)]
     fn find_runs(&mut self, bits: &Bitmap) {
         self.rows.clear();
-        let words = bits.width.div_ceil(64);
-        for marks in &mut self.marks {
-            // One more than there are words: a run may end just behind the last.
-            marks.clear();
-            marks.resize(words + 1, Marks::default());
-        }
+        // One more than there are words: a run may end just behind the last.
+        let marks = bits.width.div_ceil(64) + 1;
+        self.marks.resize((bits.height + 1) * marks, Marks::default());
+        self.marks[..marks].fill(Marks::default());
         let (mut above, mut first) = (0, 0);
         (self.count, self.joined) = (0, 0);
         for v in 0..bits.height {
             self.rows.push(first as u32);
-            let after = first + self.split_row(bits.row(v), first);
-            self.label_row(above, first..after, v as u16);
-            self.marks.swap(0, 1);
+            let after = first + self.split_row(bits.row(v), first, (v + 1) * marks);
+            self.label_row(above, first..after, v as u16, v * marks..(v + 1) * marks);
             (above, first) = (first, after);
         }
-        self.rows.push(first as u32);
         for &(a, b) in &self.joins[..self.joined] {
             union(&mut self.parents, a, b);
         }
     }
 
-    /// Writes the runs of a row from `first` on, and its marks; how many there are.
+    /// Writes the runs of a row from `first` on, and its marks from `marks` on; how many there are.
     #[inline(always)]
-    fn split_row(&mut self, words: &[u64], first: usize) -> usize {
+    fn split_row(&mut self, words: &[u64], first: usize, marks: usize) -> usize {
         // A pixel may start or end a run: in the worst case every second one starts one.
         let most = first + words.len() * 32 + 8;
         if self.runs.len() < most {
             self.runs.resize(most, Run::default());
         }
-        let marks = &mut self.marks[1][..words.len() + 1];
+        let marks = &mut self.marks[marks..marks + words.len() + 1];
         let (mut carry, mut started, mut ended) = (0, first, first);
         for (index, (&word, mark)) in words.iter().zip(marks.iter_mut()).enumerate() {
             let before = word << 1 | carry;
@@ -196,22 +213,22 @@ impl Labeller {
         started - first
     }
 
-    /// Labels the runs of a row; those of the row above start at `above`. Nothing branches on what a run
-    /// touches, save where it touches three or more.
+    /// Labels the runs of a row; those of the row above start at `above` and have these marks. Nothing branches
+    /// on what a run touches, save where it touches three or more.
     #[inline(always)]
-    fn label_row(&mut self, above: usize, row: std::ops::Range<usize>, v: u16) {
-        let marks = &self.marks[0][..];
+    fn label_row(&mut self, above: usize, row: Range<usize>, v: u16, marks: Range<usize>) {
+        let marks = &self.marks[marks];
         // One more than there can be: what is too much is written over.
         let most = row.end + 1;
         if self.labels.len() < most {
             self.labels.resize(most, 0);
             self.parents.resize(most, 0);
-            self.components.resize(most, Component::default());
+            self.sums.resize(most, Sums::from_row(0));
             self.joins.resize(most, (0, 0));
         }
         let (mut count, mut joined) = (self.count, self.joined);
         let (runs, labels) = (&self.runs[row.clone()], &mut self.labels[above..most]);
-        let (parents, components) = (&mut self.parents[..most], &mut self.components[..most]);
+        let (parents, sums) = (&mut self.parents[..most], &mut self.sums[..most]);
         let joins = &mut self.joins[..most];
         for (run, k) in runs.iter().zip(row.start - above..) {
             // Runs touch by corners too: one above may end where this starts, or start where it ends.
@@ -219,11 +236,11 @@ impl Labeller {
             let to = Marks::started_by(marks, run.end);
             let is_new = from >= to;
             parents[count] = count as u32;
-            components[count] = Component::NOTHING;
+            sums[count] = Sums::from_row(v);
             let own = if is_new { count as u32 } else { labels[from] };
             count += usize::from(is_new);
             labels[k] = own;
-            components[own as usize].add(run, v);
+            sums[own as usize].add(run, v);
             let other = labels[from + 1];
             joins[joined] = (own, other);
             joined += usize::from((to > from + 1) & (own != other));
@@ -236,7 +253,7 @@ impl Labeller {
         (self.count, self.joined) = (count, joined);
     }
 
-    /// Sums labels up into components and finds place for the outlines of those kept.
+    /// Sums labels up into components and finds which are kept.
     fn gather(&mut self, keep: impl Fn(&Component) -> bool) {
         for label in 0..self.count {
             let parent = self.parents[label] as usize;
@@ -244,44 +261,36 @@ impl Labeller {
                 // A parent comes before its children, so it is a root by now.
                 let root = self.parents[parent];
                 self.parents[label] = root;
-                let part = self.components[label];
-                self.components[root as usize].merge(&part);
+                let part = self.sums[label];
+                self.sums[root as usize].merge(&part);
             }
         }
         self.kept.clear();
-        self.outline_at.clear();
-        let mut total = 0;
         for (label, &parent) in self.parents[..self.count].iter().enumerate() {
-            let at = if parent as usize != label {
-                self.outline_at[parent as usize]
-            } else if keep(&self.components[label]) {
-                let at = total;
-                self.kept.push((label as u32, at));
-                total += self.components[label].height() as u32;
-                at
-            } else {
-                NOT_KEPT
-            };
-            self.outline_at.push(at);
+            if parent as usize == label {
+                let component = self.sums[label].component();
+                if keep(&component) {
+                    self.kept.push((component, parent));
+                }
+            }
         }
-        self.outlines.clear();
-        self.outlines.resize(total as usize, (u16::MAX, 0));
     }
 
-    fn outline(&mut self) {
-        if self.kept.is_empty() {
-            return;
-        }
-        for (v, bounds) in self.rows.windows(2).enumerate() {
-            let row = bounds[0] as usize..bounds[1] as usize;
-            for (run, &label) in self.runs[row.clone()].iter().zip(&self.labels[row]) {
-                let at = self.outline_at[label as usize];
-                if at != NOT_KEPT {
-                    let top = self.components[self.parents[label as usize] as usize].top;
-                    let (left, right) = &mut self.outlines[at as usize + v - usize::from(top)];
-                    *left = run.start.min(*left);
-                    *right = (run.end - 1).max(*right);
-                }
+    /// Finds the leftmost and the rightmost run of each row of the components kept.
+    #[inline(always)]
+    fn outline(&mut self, words: usize) {
+        let Self { runs, labels, rows, marks, parents, kept, outlines, .. } = self;
+        outlines.clear();
+        for (component, root) in kept {
+            let is_own = |k: &usize| parents[labels[*k] as usize] == *root;
+            for v in usize::from(component.top)..=usize::from(component.bottom) {
+                let (first, marks) = (rows[v] as usize, &marks[(v + 1) * (words + 1)..(v + 2) * (words + 1)]);
+                let mut within = first + Marks::ended_before(marks, component.left)
+                    ..first + Marks::started_by(marks, component.right);
+                // Every row of a component has a run of it.
+                let left = within.find(is_own).unwrap_or(first);
+                let right = within.rfind(is_own).unwrap_or(left);
+                outlines.push((runs[left].start, runs[right].end - 1));
             }
         }
     }
@@ -297,6 +306,19 @@ impl Kernel for FindRuns<'_> {
     #[inline(always)]
     fn run(self) {
         self.labeller.find_runs(self.bits);
+    }
+}
+
+/// `Labeller::outline`, likewise.
+struct FindOutlines<'a> {
+    labeller: &'a mut Labeller,
+    words: usize,
+}
+
+impl Kernel for FindOutlines<'_> {
+    #[inline(always)]
+    fn run(self) {
+        self.labeller.outline(self.words);
     }
 }
 
@@ -336,25 +358,13 @@ mod tests {
             if seen[first] || !dark(u, v) {
                 continue;
             }
-            let mut c = Component {
-                left: u as u16,
-                right: u as u16,
-                top: v as u16,
-                bottom: v as u16,
-                area: 0,
-                runs: 0,
-            };
+            let mut c = Sums::from_row(v as u16);
             let mut stack = vec![(u, v)];
             seen[first] = true;
             while let Some((u, v)) = stack.pop() {
-                c.merge(&Component {
-                    left: u as u16,
-                    right: u as u16,
-                    top: v as u16,
-                    bottom: v as u16,
-                    area: 1,
-                    runs: 0,
-                });
+                let mut pixel = Sums::from_row(v as u16);
+                pixel.add(&Run { start: u as u16, end: u as u16 + 1 }, v as u16);
+                c.merge(&pixel);
                 for nv in v.saturating_sub(1)..(v + 2).min(bits.height) {
                     for nu in u.saturating_sub(1)..(u + 2).min(bits.width) {
                         if dark(nu, nv) && !seen[nv * bits.width + nu] {
@@ -364,7 +374,7 @@ mod tests {
                     }
                 }
             }
-            found.push(c);
+            found.push(Component { runs: 0, ..c.component() });
         }
         found
     }

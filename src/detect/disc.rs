@@ -3,7 +3,7 @@
 
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
-use super::binarise::{Binariser, Bitmap};
+use super::binarise::{Binariser, Bitmap, Where};
 use super::components::{Component, Labeller, Outline};
 use super::quad::bilinear;
 use super::simd::Simd;
@@ -62,7 +62,7 @@ impl DiscFinder {
         }
         let least = sizes.0.max(LEAST_DIAMETER);
         self.binariser.measure(image, LEAST_STEP, self.simd);
-        self.binariser.mark(image, 128, &mut self.bits, self.simd);
+        self.binariser.mark(image, 128, Where::Everywhere, &mut self.bits, self.simd);
         let (width, height) = (image.width, image.height);
         let keep = |c: &Component| {
             let (w, h) = (c.width() as f64, c.height() as f64);

@@ -1,6 +1,6 @@
 //! The tag detector: from an image to tags with their corners.
 
-use super::binarise::{Binariser, Bitmap};
+use super::binarise::{Binariser, Bitmap, Where};
 use super::components::Labeller;
 use super::edges::{EdgeSearch, fit_sides};
 use super::family::{Family, Word};
@@ -177,7 +177,10 @@ impl TagDetector {
         let gate = (7.0 * self.noise / level.scale).clamp(12.0, 60.0) as u8;
         self.binariser.measure(level.image, gate, self.simd);
         for &fraction in fractions {
-            self.binariser.mark(level.image, fraction, &mut self.bits, self.simd);
+            let is_highest = Some(&fraction) == fractions.last();
+            let at =
+                if self.binariser.is_busy() && !is_highest { Where::LightChanges } else { Where::Everywhere };
+            self.binariser.mark(level.image, fraction, at, &mut self.bits, self.simd);
             self.labeller.label(&self.bits, self.simd, |c| may_be_border(c, limits, width, height));
             for (component, outline) in self.labeller.kept() {
                 let Some(quad) = self.finder.quad(component, outline, limits) else { continue };
