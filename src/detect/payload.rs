@@ -181,6 +181,17 @@ impl Grid {
         thresholds
     }
 
+    /// The same with each cell's difference from its four neighbours doubled: what blur took away.
+    fn sharpened(&self) -> Self {
+        let mut values = self.values;
+        let side = self.side;
+        for i in (1..side - 1).flat_map(|y| (1..side - 1).map(move |x| y * side + x)) {
+            let v = &self.values;
+            values[i] = 2.0 * v[i] - 0.25 * (v[i - 1] + v[i + 1] + v[i - side] + v[i + side]);
+        }
+        Self { values, ..*self }
+    }
+
     fn read(&self, thresholds: &[f32; MOST * MOST], family: &Family) -> Option<Reading> {
         let cells = self.side * self.side;
         let mut bits = [false; MOST * MOST];
@@ -210,6 +221,9 @@ pub(super) fn read(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family:
     let grid = Grid::sample(image, pyramid, quad, family)?;
     let thresholds = grid.plane_threshold()?;
     if let Some(reading) = grid.read(&thresholds, family) {
+        return Some(reading);
+    }
+    if let Some(reading) = grid.sharpened().read(&thresholds, family) {
         return Some(reading);
     }
     let border = grid.border_levels();

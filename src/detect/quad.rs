@@ -69,13 +69,10 @@ impl QuadFinder {
         if covered < 0.5 * limits.least * limits.least {
             return None;
         }
-        let quad = largest_quad(&self.hull)?;
-        let quad_area = polygon_area(&quad);
         // Corners are blunt by about a pixel: allow their area, and a tenth for bent edges.
-        if quad_area < 6.0 || quad_area < 0.9 * hull_area - 6.0 {
-            return None;
-        }
-        let quad = grow(&quad, 0.5)?;
+        let enough = (0.9 * hull_area - 6.0).max(6.0);
+        let inscribed = largest_quad(&self.hull).filter(|quad| polygon_area(quad) >= enough);
+        let quad = grow(&inscribed.or_else(|| blunt_rectangle(&self.hull, hull_area))?, 0.5)?;
         let sides: [f32; 4] = std::array::from_fn(|i| distance(quad[i], quad[(i + 1) % 4]));
         let longest = sides.iter().fold(0.0, |a: f32, &b| a.max(b));
         let shortest = sides.iter().fold(f32::MAX, |a, &b| a.min(b));
@@ -156,6 +153,37 @@ fn largest_quad(hull: &[Point]) -> Option<Quad> {
     }
     let convex = (0..4).all(|i| cross(quad[i], quad[(i + 1) % 4], quad[(i + 2) % 4]) > 0.0);
     convex.then_some(quad)
+}
+
+/// Area that blur takes off the four corners of a small tag, px², and its most in shares of the whole.
+const BLUNT_AREA: f32 = 24.0;
+const BLUNT_SHARE: f32 = 0.25;
+
+/// The smallest rectangle around a hull, where the hull fills it but for its corners: motion and blur round those
+/// of a small tag off by several pixels, and no four points of the hull are near them.
+fn blunt_rectangle(hull: &[Point], hull_area: f32) -> Option<Quad> {
+    let mut best: Option<(f32, Quad)> = None;
+    for (i, &a) in hull.iter().enumerate() {
+        let b = hull[(i + 1) % hull.len()];
+        let n = Line::through(a, b).n;
+        // `n` points out of the side, and the next side of a clockwise rectangle out along this one.
+        let t = [-n[1], n[0]];
+        let dot = |p: Point, d: Point| p[0] * d[0] + p[1] * d[1];
+        let (out, mut inner) = (dot(a, n), f32::MAX);
+        let (mut back, mut ahead) = (f32::MAX, f32::MIN);
+        for &p in hull {
+            inner = inner.min(dot(p, n));
+            (back, ahead) = (back.min(dot(p, t)), ahead.max(dot(p, t)));
+        }
+        let area = (out - inner) * (ahead - back);
+        if best.is_none_or(|b| area < b.0) {
+            let corner = |x: f32, y: f32| [x * t[0] + y * n[0], x * t[1] + y * n[1]];
+            best = Some((area, [corner(back, out), corner(ahead, out), corner(ahead, inner), corner(back, inner)]));
+        }
+    }
+    let (area, quad) = best?;
+    let lost = area - hull_area;
+    (area > 6.0 && lost <= BLUNT_AREA + 0.05 * area && lost <= BLUNT_SHARE * area).then_some(quad)
 }
 
 fn farthest(hull: &[Point], measure: impl Fn(Point) -> f32) -> Point {
