@@ -5,8 +5,8 @@ use super::quad::Point;
 use super::simd::Kernel;
 use crate::msg::ImageView;
 
-/// Of a tag's model: a homography and two bows.
-pub(super) const PARAMETERS: usize = 10;
+/// Of a tag's model: a homography, a bow and a barrel.
+pub(super) const PARAMETERS: usize = 11;
 /// `PARAMETERS` in whole vector registers.
 pub(super) const PADDED: usize = 12;
 
@@ -37,7 +37,7 @@ pub(super) struct Located {
 /// The model in single precision, for the many edge points.
 pub(super) struct NarrowModel {
     pub theta: [f32; PARAMETERS],
-    pub axes: [[f32; 2]; 2],
+    pub sides: [Point; 2],
     pub origin: Point,
 }
 
@@ -47,18 +47,21 @@ impl NarrowModel {
     #[inline(always)]
     fn edge_at(&self, point: &EdgePoint) -> (Point, Point, [f32; PADDED]) {
         let (t, xi, eta) = (&self.theta, point.xi, point.eta);
-        let [x, y] = self.axes;
+        let [a, b] = self.sides;
         let w = 1.0 / (t[6] * xi + t[7] * eta + 1.0);
         let (u, v) = ((t[0] * xi + t[1] * eta + t[2]) * w, (t[3] * xi + t[4] * eta + t[5]) * w);
-        let (bow_x, bow_y) = (eta * eta - 1.0, xi * xi - 1.0);
-        let p = [
-            self.origin[0] + u + x[0] * t[8] * bow_x + y[0] * t[9] * bow_y,
-            self.origin[1] + v + x[1] * t[8] * bow_x + y[1] * t[9] * bow_y,
-        ];
+        let q = [xi * a[0] + eta * b[0], xi * a[1] + eta * b[1]];
+        let far = q[0] * q[0] + q[1] * q[1] - 2.0;
+        let bend = [t[8] + t[10] * q[0], t[9] + t[10] * q[1]];
+        let p = [self.origin[0] + u + far * bend[0], self.origin[1] + v + far * bend[1]];
         // Images of the directions of ξ and η; the normal is across the one in which the edge runs.
-        let (bend_xi, bend_eta) = (2.0 * t[9] * xi, 2.0 * t[8] * eta);
-        let d_xi = [(t[0] - u * t[6]) * w + y[0] * bend_xi, (t[3] - v * t[6]) * w + y[1] * bend_xi];
-        let d_eta = [(t[1] - u * t[7]) * w + x[0] * bend_eta, (t[4] - v * t[7]) * w + x[1] * bend_eta];
+        let bent = |side: Point| {
+            let farther = 2.0 * (q[0] * side[0] + q[1] * side[1]);
+            [0, 1].map(|k| farther * bend[k] + far * t[10] * side[k])
+        };
+        let (bent_xi, bent_eta) = (bent(a), bent(b));
+        let d_xi = [(t[0] - u * t[6]) * w + bent_xi[0], (t[3] - v * t[6]) * w + bent_xi[1]];
+        let d_eta = [(t[1] - u * t[7]) * w + bent_eta[0], (t[4] - v * t[7]) * w + bent_eta[1]];
         let [lx, ly] = point.light;
         let along = [d_eta[0] * lx - d_xi[0] * ly, d_eta[1] * lx - d_xi[1] * ly];
         let towards = [d_xi[0] * lx + d_eta[0] * ly, d_xi[1] * lx + d_eta[1] * ly];
@@ -77,9 +80,9 @@ impl NarrowModel {
             ny,
             across * xi,
             across * eta,
-            (x[0] * n[0] + x[1] * n[1]) * bow_x,
-            (y[0] * n[0] + y[1] * n[1]) * bow_y,
-            0.0,
+            far * n[0],
+            far * n[1],
+            far * (q[0] * n[0] + q[1] * n[1]),
             0.0,
         ];
         (p, n, row)

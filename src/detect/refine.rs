@@ -1,9 +1,11 @@
 //! Corners of a decoded tag to a few hundredths of a pixel, with their covariance: every edge between its
 //! dark and light cells, not only the border, takes part in one fit.
 //!
-//! Model, with ξ, η ∈ [−1, 1] across the border square: `p = H(ξ, η) + c₁ (η² − 1) x̂ + c₂ (ξ² − 1) ŷ`, a
-//! homography and two bows, which is what a lens does to the straight sides of a large tag; x̂, ŷ are the
-//! tag's axes in the image. The bows vanish at the corners and are held near nought by what a wide lens
+//! Model, with ξ, η ∈ [−1, 1] across the border square: `p = H(ξ, η) + (|q|² − 2) (c + k q)`, q = ξ a + η b: a
+//! homography and what a lens with radial distortion adds to it over a small part of the image. With a point's
+//! place P off the optical axis that is `κ |P|² P`; to third order about a tag's middle what is no homography is
+//! `κ |q|² (P + q)`. a and b are half the tag's sides in the image over their mean length, so that the bow c and
+//! the barrel k change nothing at a square's corners; they are held near nought by what a wide lens
 //! does. Gauss–Newton on distances along edge normals, each weighed by how well its edge is placed, Cauchy's
 //! weights on top.
 
@@ -35,6 +37,10 @@ pub(super) struct Refined {
 /// Curvature that a wide lens gives straight lines, 1/px: 0.18 r² distortion at a focal length of 1000 px
 /// gives 2·10⁻⁴ to 6·10⁻⁴ towards the rim.
 const LENS_CURVATURE: f64 = 3e-4;
+
+/// What a wide lens bends a tag's sides outwards by, over the third power of half their length, 1/px²: 0.3 r² at a
+/// focal length of 1000 px.
+const LENS_BARREL: f64 = 3e-7;
 
 /// Cells on a side of a block: the errors of edges that near each other are alike, for they share pixels.
 const BLOCK: usize = 2;
@@ -86,8 +92,9 @@ impl Refiner {
         let cell = f64::from(edge) / family.width as f64;
         self.place_points(family, id, cell);
         let mut model = Model::of_corners(corners)?;
-        let bow = LENS_CURVATURE * f64::from(edge).powi(2) / 8.0;
-        let (covariance, windows) = self.fit(image, &mut model, family.width, bow)?;
+        let half = 0.5 * f64::from(edge);
+        let (bow, barrel) = (LENS_CURVATURE * half.powi(2) / 2.0, LENS_BARREL * half.powi(3));
+        let (covariance, windows) = self.fit(image, &mut model, family.width, [bow, bow, barrel])?;
         let (pitches, blurs) = (model.pitches(family.width), windows.blurs_squared());
         let neighbours = [0, 1].map(|k| (NEIGHBOURS * blurs[k] / pitches[k].powi(3)).min(0.2 * pitches[k]));
         let refined = model.result(&covariance, neighbours)?;
@@ -106,7 +113,7 @@ impl Refiner {
         image: ImageView<'_>,
         model: &mut Model,
         cells: usize,
-        bow: f64,
+        bends: [f64; 3],
     ) -> Option<(Information, Windows)> {
         let mut windows = Windows::default();
         let (mut coarse, mut settled, mut spread) = (true, false, 0.0);
@@ -122,7 +129,7 @@ impl Refiner {
             if !settled {
                 spread = self.spread();
             }
-            let solved = self.solve(model, bow, spread)?;
+            let solved = self.solve(model, bends, spread)?;
             let before = *model;
             let overstep = if coarse { 1.0 } else { (1.0 / solved.flattening).clamp(1.0, 1.6) };
             model.theta += solved.step * overstep;
@@ -217,7 +224,7 @@ impl Refiner {
         (1.4826 * median).max(0.08)
     }
 
-    fn solve(&self, model: &Model, bow: f64, spread: f64) -> Option<Solved> {
+    fn solve(&self, model: &Model, bends: [f64; 3], spread: f64) -> Option<Solved> {
         let mut sums = [[0.0f32; PADDED]; PARAMETERS];
         let mut rights = [0.0f32; PADDED];
         let (mut sum, mut weights, mut slopes) = (0.0, 0.0, 0.0);
@@ -235,8 +242,8 @@ impl Refiner {
         let variance = f64::from(sum / count * count / (count - 8.0));
         let mut information = Information::from_fn(|i, j| f64::from(sums[i.min(j)][i.max(j)]));
         let mut right = Row::from_fn(|i, _| f64::from(rights[i]));
-        for k in 8..PARAMETERS {
-            let hold = variance.max(1e-4) / (bow * bow);
+        for (k, bend) in (8..PARAMETERS).zip(bends) {
+            let hold = variance.max(1e-4) / (bend * bend);
             information[(k, k)] += hold;
             right[k] -= hold * model.theta[k];
         }
@@ -264,7 +271,7 @@ impl Refiner {
             sum += (pull.transpose() * solved.inverse * pull)[0];
             blocks += 1.0;
         }
-        // The fit takes up some of it, most in the corners. The bows are held: eight are free.
+        // The fit takes up some of it, most in the corners. Bow and barrel are held: eight are free.
         let lambda = sum / 8.0 / (1.0 - TAKEN_UP / blocks).max(0.5);
         let flattening = solved.flattening.clamp(0.4, 1.0);
         (blocks > 4.0).then(|| solved.inverse * (lambda / (flattening * flattening)))
@@ -295,11 +302,12 @@ fn add_scaled(to: &mut [f32; PADDED], factor: f32, row: &[f32; PADDED]) {
     to.iter_mut().zip(row).for_each(|(to, r)| *to += factor * r);
 }
 
-/// Homography in ξ, η (row by row, last entry 1), and the two bows.
+/// Homography in ξ, η (row by row, last entry 1), the bow and the barrel.
 #[derive(Clone, Copy, Debug)]
 struct Model {
     theta: Row,
-    axes: [Vector2<f64>; 2],
+    /// Half sides over the root mean square of their lengths: a and b.
+    sides: [Vector2<f64>; 2],
     /// Of the pixels meant here: near the tag, so that the parameters are of one size.
     origin: Vector2<f64>,
 }
@@ -319,11 +327,10 @@ impl Model {
         let entries =
             [h[0] * s, h[1] * s, moved[0] * s, h[3] * s, h[4] * s, moved[1] * s, h[6] * s, h[7] * s];
         theta.rows_mut(0, 8).copy_from_slice(&entries);
-        let unit = |a: usize, b: usize| {
-            let d = Vector2::new(wide[b][0] - wide[a][0], wide[b][1] - wide[a][1]);
-            d / d.norm().max(1e-9)
-        };
-        Some(Self { theta, axes: [unit(0, 1), unit(0, 3)], origin: origin.into() })
+        let side = |a: usize, b: usize| Vector2::new(wide[b][0] - wide[a][0], wide[b][1] - wide[a][1]);
+        let sides = [side(0, 1) + side(3, 2), side(0, 3) + side(1, 2)];
+        let length = (0.5 * (sides[0].norm_squared() + sides[1].norm_squared())).sqrt();
+        Some(Self { theta, sides: sides.map(|s| s / length.max(1e-9)), origin: origin.into() })
     }
 
     /// How far a corner is from where another model has it, at most.
@@ -337,13 +344,13 @@ impl Model {
         let t = &self.theta;
         let w = 1.0 / (t[6] * xi + t[7] * eta + 1.0);
         let (u, v) = ((t[0] * xi + t[1] * eta + t[2]) * w, (t[3] * xi + t[4] * eta + t[5]) * w);
-        let (bow_x, bow_y) = (eta * eta - 1.0, xi * xi - 1.0);
-        let (x, y) = (self.axes[0], self.axes[1]);
-        let p = Vector2::new(u, v) + x * (t[8] * bow_x) + y * (t[9] * bow_y);
+        let q = self.sides[0] * xi + self.sides[1] * eta;
+        let far = q.norm_squared() - 2.0;
+        let p = Vector2::new(u, v) + (Vector2::new(t[8], t[9]) + q * t[10]) * far;
         #[rustfmt::skip]
         let jacobian = SMatrix::<f64, 2, PARAMETERS>::from_row_slice(&[
-            xi * w, eta * w, w, 0.0, 0.0, 0.0, -u * xi * w, -u * eta * w, x.x * bow_x, y.x * bow_y,
-            0.0, 0.0, 0.0, xi * w, eta * w, w, -v * xi * w, -v * eta * w, x.y * bow_x, y.y * bow_y,
+            xi * w, eta * w, w, 0.0, 0.0, 0.0, -u * xi * w, -u * eta * w, far, 0.0, far * q.x,
+            0.0, 0.0, 0.0, xi * w, eta * w, w, -v * xi * w, -v * eta * w, 0.0, far, far * q.y,
         ]);
         (p, jacobian)
     }
@@ -351,7 +358,7 @@ impl Model {
     fn narrow(&self) -> NarrowModel {
         NarrowModel {
             theta: std::array::from_fn(|i| self.theta[i] as f32),
-            axes: self.axes.map(|a| [a.x as f32, a.y as f32]),
+            sides: self.sides.map(|a| [a.x as f32, a.y as f32]),
             origin: [self.origin.x as f32, self.origin.y as f32],
         }
     }
@@ -369,7 +376,8 @@ impl Model {
 
     /// Corners and centre with their covariances; `neighbours` are errors common to all edges along ξ and η.
     fn result(&self, covariance: &Information, neighbours: [f64; 2]) -> Option<Refined> {
-        let common = (0..2).map(|i| self.axes[i] * self.axes[i].transpose() * neighbours[i].powi(2));
+        let axes = self.sides.map(|s| s / s.norm().max(1e-9));
+        let common = (0..2).map(|i| axes[i] * axes[i].transpose() * neighbours[i].powi(2));
         let floor = common.fold(Matrix2::identity() * FLOOR_PX.powi(2), |sum, c| sum + c);
         let at = |xi: f64, eta: f64| {
             let (p, jacobian) = self.at(xi, eta);
