@@ -5,9 +5,12 @@ use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use windhover::config::TagFamily;
-use windhover::detect::{Simd, TagDetector, TagPattern, tag_pattern};
-use windhover::msg::{GrayImage, ImageView, MarkerDetection, MarkerId};
+use windhover::config::{Brightness, Config, MarkerConfig, MarkerKind, TagFamily};
+use windhover::detect::{FrameDetector, Simd, TagDetector, TagPattern, tag_pattern};
+use windhover::msg::{
+    FrameObservations, FramePrediction, GrayImage, ImageView, MarkerDetection, MarkerId, MarkerPrediction,
+    RgbImage,
+};
 
 /// A generated image and where its tag's corners are.
 struct Drawn {
@@ -182,6 +185,29 @@ fn noise_and_stripes_hold_no_tags() {
     }
 }
 
+/// The shipped configuration and a target of two discs, one of them of a colour or dark.
+fn with_discs(is_red: bool) -> Config {
+    let mut config =
+        Config::parse(include_str!("../config/windhover.toml")).expect("the shipped configuration");
+    config.detector.ground_features = 8;
+    let mut pair = config.target[0].clone();
+    pair.marker = [0, 1]
+        .map(|k| MarkerConfig {
+            kind: MarkerKind::Disc,
+            family: None,
+            id: None,
+            size_m: None,
+            diameter_m: Some(0.4 + 0.2 * f64::from(k)),
+            brightness: (!is_red).then_some(if k == 0 { Brightness::Dark } else { Brightness::Light }),
+            color: is_red.then(|| "#d02020".to_owned()),
+            position_m: [f64::from(k), 0.0, -0.5],
+            yaw_deg: 0.0,
+        })
+        .to_vec();
+    config.target.push(pair);
+    config
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
     #[test]
@@ -199,6 +225,43 @@ proptest! {
         for found in &out {
             let corners = found.corners_px.expect("a tag has corners");
             prop_assert!(corners.iter().all(|c| c.iter().all(|x| x.is_finite())));
+        }
+    }
+
+    #[test]
+    fn any_frames_are_survived_by_tags_discs_and_features(
+        sizes in prop::collection::vec((1usize..150, 1usize..150), 1..4), is_red in any::<bool>(),
+        pixels in prop::collection::vec(any::<u8>(), 1..600), coarse in 1usize..30,
+        place in (-300.0..300.0f64, -300.0..300.0f64), sigma_px in 0.0..1e4f64, size_px in 0.0..1e4f64,
+        search in any::<bool>(),
+    ) {
+        let ids = [
+            MarkerId::Tag { family: TagFamily::Tag36h11, id: 0 },
+            MarkerId::Disc { target: 1, marker: 0 },
+            MarkerId::Disc { target: 1, marker: 1 },
+        ];
+        let center_px = Vector2::new(place.0, place.1);
+        let prediction = FramePrediction {
+            markers: ids.map(|marker| MarkerPrediction { marker, center_px, sigma_px, size_px }).to_vec(),
+            search,
+            size_range_px: Some((0.5 * size_px, size_px)),
+            occupied: vec![(center_px, size_px)],
+        };
+        let mut detector = FrameDetector::new(&with_discs(is_red));
+        let mut seen = FrameObservations::default();
+        for (k, (width, height)) in sizes.into_iter().flat_map(|size| [size; 3]).enumerate() {
+            let at = |i: usize| pixels[((i % width + k) / coarse * 31 + i / width / coarse * 17) % pixels.len()];
+            let image = GrayImage::from_vec(width, height, (0..width * height).map(at).collect()).expect("size");
+            let data = (0..3 * width * height).map(|i| pixels[(i / coarse * 7 + k) % pixels.len()]).collect();
+            let rgb = RgbImage { width, height, data };
+            detector.process(image.view(), (k % 2 == 0).then_some(&rgb), (k > 0).then_some(&prediction), &mut seen);
+            prop_assert!(seen.features.len() <= 8);
+            for found in &seen.markers {
+                prop_assert!(found.center_px.iter().chain(found.center_cov_px2.iter()).all(|x| x.is_finite()));
+            }
+            for feature in &seen.features {
+                prop_assert!(feature.px.iter().all(|x| x.is_finite()) && feature.sigma_px > 0.0);
+            }
         }
     }
 }

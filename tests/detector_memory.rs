@@ -1,12 +1,13 @@
-//! The tag detector takes no memory after its first frames: an allocator that counts.
+//! The detector takes no memory after its first frames, for tags, discs and ground features: an allocator that
+//! counts.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
 use nalgebra::Vector2;
-use windhover::config::TagFamily;
-use windhover::detect::{Region, TagDetector, tag_pattern};
-use windhover::msg::GrayImage;
+use windhover::config::{Brightness, Config, MarkerConfig, MarkerKind, TagFamily};
+use windhover::detect::{FrameDetector, Region, TagDetector, tag_pattern};
+use windhover::msg::{FrameObservations, FramePrediction, GrayImage, MarkerId, MarkerPrediction, RgbImage};
 
 /// Counts what the calling thread asks for.
 struct Counting;
@@ -75,4 +76,104 @@ fn frames_after_the_first_take_no_memory() {
     assert!(before > 0, "the allocator counts");
     pass(&mut detector);
     assert_eq!(ASKED.with(Cell::get), before, "allocations in the second pass over the same frames");
+}
+
+/// The shipped configuration's target with tags 3 and 7, and a second one with a pair of dark discs.
+fn config() -> Config {
+    let text =
+        include_str!("../config/windhover.toml").replace("id = 0", "id = 3").replace("id = 1", "id = 7");
+    let mut config = Config::parse(&text).expect("the shipped configuration");
+    config.detector.ground_features = 8;
+    let mut pair = config.target[0].clone();
+    pair.marker = [0.4, 0.6]
+        .map(|diameter| MarkerConfig {
+            kind: MarkerKind::Disc,
+            family: None,
+            id: None,
+            size_m: None,
+            diameter_m: Some(diameter),
+            brightness: Some(Brightness::Dark),
+            color: None,
+            position_m: [10.0 * (diameter - 0.4), 0.0, -0.5],
+            yaw_deg: 0.0,
+        })
+        .to_vec();
+    config.target.push(pair);
+    config
+}
+
+/// Diameters of the discs, pixels.
+const DISCS: [f64; 2] = [30.0, 45.0];
+
+fn disc_at(frame: usize, disc: usize) -> Vector2<f64> {
+    Vector2::new(120.0 + 150.0 * disc as f64 + 4.0 * frame as f64, 380.0)
+}
+
+/// A frame with tags, discs and patches of light that have corners to follow, in grey and in colour.
+fn full_frame(n: usize) -> (GrayImage, RgbImage) {
+    let mut image = frame(60 + 4 * n);
+    for (i, p) in image.data.iter_mut().enumerate() {
+        let at = Vector2::new((i % 640) as f64, (i / 640) as f64);
+        let (u, v) = (i % 640 + 640 - 4 * n, i / 640);
+        if u % 97 < 20 && v % 83 < 20 && *p > 60 && *p < 170 {
+            *p = 200;
+        }
+        for (disc, diameter) in DISCS.into_iter().enumerate() {
+            match (at - disc_at(n, disc)).norm() {
+                r if r < 0.5 * diameter => *p = 20,
+                r if r < 0.5 * diameter + 14.0 => *p = 180,
+                _ => {}
+            }
+        }
+    }
+    let data = image.data.iter().flat_map(|&p| [p; 3]).collect();
+    (image, RgbImage { width: 640, height: 480, data })
+}
+
+/// Where everything of a frame is foretold.
+fn foretold(n: usize) -> FramePrediction {
+    let tag = |id, u: usize, v: usize, cell: usize| MarkerPrediction {
+        marker: MarkerId::Tag { family: TagFamily::Tag36h11, id },
+        center_px: Vector2::new((u + 5 * cell) as f64, (v + 5 * cell) as f64),
+        sigma_px: 2.0,
+        size_px: 8.0 * cell as f64,
+    };
+    let disc = |marker: usize| MarkerPrediction {
+        marker: MarkerId::Disc { target: 1, marker },
+        center_px: disc_at(n, marker),
+        sigma_px: 2.0,
+        size_px: DISCS[marker],
+    };
+    FramePrediction {
+        markers: vec![tag(3, 60 + 4 * n, 100, 4), tag(7, 300, 200, 9), disc(0), disc(1)],
+        search: false,
+        size_range_px: Some((20.0, 100.0)),
+        occupied: vec![(Vector2::new(345.0, 245.0), 70.0)],
+    }
+}
+
+#[test]
+fn whole_frames_with_discs_and_features_take_none_either() {
+    let frames = [full_frame(0), full_frame(1), full_frame(2)];
+    let predictions = [foretold(0), foretold(1), foretold(2)];
+    let mut detector = FrameDetector::new(&config());
+    let mut seen = FrameObservations::default();
+    let mut pass = |detector: &mut FrameDetector| {
+        // Tracked after the first, and over a cut in which most features are lost.
+        for (k, n) in [0, 1, 2, 1, 0, 2].into_iter().enumerate() {
+            let (gray, rgb) = &frames[n];
+            let prediction = (k > 0).then_some(&predictions[n]);
+            detector.process(gray.view(), Some(rgb), prediction, &mut seen);
+            assert_eq!(seen.markers.len(), 4, "two tags and two discs in frame {n}");
+            assert!(seen.features.len() >= 4, "{} features in frame {n}", seen.features.len());
+        }
+    };
+    for _ in 0..3 {
+        pass(&mut detector);
+    }
+    let before = ASKED.with(Cell::get);
+    for _ in 0..6 {
+        pass(&mut detector);
+    }
+    assert_eq!(ASKED.with(Cell::get), before, "allocations after three passes over the same frames");
 }

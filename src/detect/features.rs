@@ -46,6 +46,8 @@ pub(super) struct FeatureTracker {
     before: GrayImage,
     before_pyramid: Pyramid,
     scores: Vec<f64>,
+    /// The best corner of each part of the frame without a feature, and how good it is.
+    corners: Vec<(f32, [f32; 2])>,
     simd: Simd,
 }
 
@@ -58,12 +60,13 @@ impl FeatureTracker {
         Self {
             wanted,
             next_id: 0,
-            tracks: Vec::new(),
+            tracks: Vec::with_capacity(wanted),
             frame: GrayImage::default(),
             pyramid: Pyramid::default(),
             before: GrayImage::default(),
             before_pyramid: Pyramid::default(),
             scores: Vec::new(),
+            corners: Vec::new(),
             simd: Simd::best(),
         }
     }
@@ -135,20 +138,19 @@ impl FeatureTracker {
         if w < SIDE || h < SIDE {
             return;
         }
-        let mut order: Vec<(f32, [f32; 2])> = Vec::with_capacity(across * down);
+        self.corners.clear();
         for part in 0..across * down {
             let (u, v) = (part % across * w, part / across * h);
             let taken = self.tracks.iter().any(|t| {
                 let (tu, tv) = (level.of_frame(t.at[0]), level.of_frame(t.at[1]));
                 (tu as usize / w, tv as usize / h) == (part % across, part / across)
             });
-            if !taken && let Some((score, at)) = best_corner(level, (u, v, w, h), occupied, &mut self.scores)
-            {
-                order.push((score, at));
+            if !taken {
+                self.corners.extend(best_corner(level, (u, v, w, h), occupied, &mut self.scores));
             }
         }
-        order.sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
-        for (_, at) in order {
+        self.corners.sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
+        for &(_, at) in &self.corners {
             if self.tracks.len() >= self.wanted {
                 break;
             }

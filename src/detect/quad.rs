@@ -178,7 +178,10 @@ fn blunt_rectangle(hull: &[Point], hull_area: f32) -> Option<Quad> {
         let area = (out - inner) * (ahead - back);
         if best.is_none_or(|b| area < b.0) {
             let corner = |x: f32, y: f32| [x * t[0] + y * n[0], x * t[1] + y * n[1]];
-            best = Some((area, [corner(back, out), corner(ahead, out), corner(ahead, inner), corner(back, inner)]));
+            best = Some((
+                area,
+                [corner(back, out), corner(ahead, out), corner(ahead, inner), corner(back, inner)],
+            ));
         }
     }
     let (area, quad) = best?;

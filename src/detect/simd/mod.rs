@@ -1,11 +1,12 @@
 //! Pixel kernels: one scalar form of each, and the same result from vector instructions.
 //!
 //! All kernels are integer and exact, so that every machine finds the same tags. The choice is made
-//! once, at run time. NEON has no kernels of its own: on aarch64 vector instructions are always there and
-//! the compiler vectorises most of the scalar forms; it could not be tried on the machines at hand.
+//! once, at run time.
 
 #[cfg(target_arch = "x86_64")]
 mod avx2;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 mod scalar;
 
 /// Which kernels to use.
@@ -17,6 +18,8 @@ enum Kind {
     Scalar,
     #[cfg(target_arch = "x86_64")]
     Avx2,
+    #[cfg(target_arch = "aarch64")]
+    Neon,
 }
 
 /// Plain code that gains from being compiled for what the processor has; it must be `#[inline(always)]`.
@@ -40,6 +43,10 @@ impl Simd {
         {
             return Self(Kind::Avx2);
         }
+        #[cfg(target_arch = "aarch64")]
+        if std::arch::is_aarch64_feature_detected!("neon") {
+            return Self(Kind::Neon);
+        }
         Self(Kind::Scalar)
     }
 
@@ -56,6 +63,9 @@ impl Simd {
             // SAFETY: `best` made this variant only where the processor has these.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx2 => unsafe { avx2::run(kernel) },
+            // What aarch64 is compiled for by default has NEON.
+            #[cfg(target_arch = "aarch64")]
+            Kind::Neon => kernel.run(),
         }
     }
 
@@ -66,6 +76,9 @@ impl Simd {
             // SAFETY: `best` made this variant only where the processor has AVX2.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx2 => unsafe { avx2::halve_rows(above, below, to) },
+            // SAFETY: `best` made this variant only where the processor has NEON.
+            #[cfg(target_arch = "aarch64")]
+            Kind::Neon => unsafe { neon::halve_rows(above, below, to) },
         }
     }
 
@@ -77,6 +90,9 @@ impl Simd {
             // SAFETY: `best` made this variant only where the processor has AVX2.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx2 => unsafe { avx2::two_thirds_rows(rows, to) },
+            // SAFETY: `best` made this variant only where the processor has NEON.
+            #[cfg(target_arch = "aarch64")]
+            Kind::Neon => unsafe { neon::two_thirds_rows(rows, to) },
         }
     }
 
@@ -88,6 +104,9 @@ impl Simd {
             // SAFETY: `best` made this variant only where the processor has AVX2.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx2 => unsafe { avx2::tile_range(rows, low, high) },
+            // SAFETY: `best` made this variant only where the processor has NEON.
+            #[cfg(target_arch = "aarch64")]
+            Kind::Neon => unsafe { neon::tile_range(rows, low, high) },
         }
     }
 
@@ -98,6 +117,9 @@ impl Simd {
             // SAFETY: `best` made this variant only where the processor has AVX2.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx2 => unsafe { avx2::pack_below(row, thresholds, words) },
+            // SAFETY: `best` made this variant only where the processor has NEON.
+            #[cfg(target_arch = "aarch64")]
+            Kind::Neon => unsafe { neon::pack_below(row, thresholds, words) },
         }
     }
 }
