@@ -230,8 +230,8 @@ criterion_group!(benches, tags, tracked);
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<String> = std::env::args().collect();
     if let Some(at) = arguments.iter().position(|a| a == "--flights") {
-        let captures = arguments[at + 1..].iter().filter(|a| !a.starts_with("--"));
-        return captures.map(|capture| flight(Path::new(capture))).collect();
+        let mut captures = arguments[at + 1..].iter().filter(|a| !a.starts_with("--"));
+        return captures.try_for_each(|capture| flight(Path::new(capture)));
     }
     benches();
     Criterion::default().configure_from_args().final_summary();
