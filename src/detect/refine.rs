@@ -16,7 +16,7 @@ use super::family::Family;
 use super::homography::Homography;
 use super::quad::{Quad, distance};
 use super::simd::Simd;
-use super::windows::Windows;
+use super::windows::{WIDEST_CELL, Windows};
 use crate::msg::ImageView;
 
 type Information = SMatrix<f64, PARAMETERS, PARAMETERS>;
@@ -61,6 +61,12 @@ const FLOOR_PX: f64 = 0.02;
 const SETTLED_PX: f64 = 0.02;
 const MOST_ROUNDS: usize = 10;
 
+/// Share of the edges between a tag's cells that are seen where the fit is right. Where fewer are and windows reach
+/// from cell to cell, edges were taken for their neighbours: blur is wider than a cell then, and corners are wrong
+/// by so much of one, measured on generated tags.
+const ENOUGH_SEEN: f64 = 0.93;
+const MISTAKEN: f64 = 0.25;
+
 /// Fewest edge points.
 const LEAST_EDGES: usize = 24;
 
@@ -96,7 +102,12 @@ impl Refiner {
         let (bow, barrel) = (LENS_CURVATURE * half.powi(2) / 2.0, LENS_BARREL * half.powi(3));
         let (covariance, windows) = self.fit(image, &mut model, family.width, [bow, bow, barrel])?;
         let (pitches, blurs) = (model.pitches(family.width), windows.blurs_squared());
-        let neighbours = [0, 1].map(|k| (NEIGHBOURS * blurs[k] / pitches[k].powi(3)).min(0.2 * pitches[k]));
+        let seen = self.located.len() as f64 / self.points.len() as f64;
+        let mistaken = if seen < ENOUGH_SEEN && cell < WIDEST_CELL { MISTAKEN } else { 0.0 };
+        let neighbours = [0, 1].map(|k| {
+            let pitch = pitches[k];
+            (NEIGHBOURS * blurs[k] / pitch.powi(3)).min(0.2 * pitch).hypot(mistaken * pitch)
+        });
         let refined = model.result(&covariance, neighbours)?;
         let moved = (0..4).map(|i| {
             (refined.corners[i] - Vector2::new(f64::from(corners[i][0]), f64::from(corners[i][1]))).norm()

@@ -1,7 +1,7 @@
 //! The windows in which a tag's edges are looked for: as narrow as the blur allows, in either direction.
 
 /// Cells wider than this, pixels, have windows no wider: sharp edges are sampled too coarsely in wider ones.
-const WIDEST_CELL: f64 = 5.7;
+pub(super) const WIDEST_CELL: f64 = 5.7;
 
 /// Sharpness of edges that need a wider window, and of those that do with a narrower one: a Gaussian's whose
 /// sigma is a half and 0.3 of the half width.
