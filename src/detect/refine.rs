@@ -34,9 +34,9 @@ pub(super) struct Refined {
     pub center_cov: Matrix2<f64>,
 }
 
-/// Curvature that a wide lens gives straight lines, 1/px: 0.18 r² distortion at a focal length of 1000 px
-/// gives 2·10⁻⁴ to 6·10⁻⁴ towards the rim.
-const LENS_CURVATURE: f64 = 3e-4;
+/// Curvature that a wide lens gives a tag's middle lines, 1/px: 2·0.18 r over a focal length of 1000 px, where it
+/// distorts by 0.18 r², is 10⁻⁴ to 2·10⁻⁴ on the way to the rim.
+const LENS_CURVATURE: f64 = 1.5e-4;
 
 /// What a wide lens bends a tag's sides outwards by, over the third power of half their length, 1/px²: 0.3 r² at a
 /// focal length of 1000 px.
