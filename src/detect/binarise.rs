@@ -230,6 +230,28 @@ mod tests {
     }
 
     #[test]
+    fn low_divisions_look_where_light_changes() {
+        // A chequer of three pixels, the right half in shadow: all of it has all the contrast a tag has.
+        let light = |u: usize, v: usize| match (u / 3 + v / 3) % 2 {
+            0 => 20,
+            _ if u < 160 => 200,
+            _ => 100,
+        };
+        let pixels = (0..320 * 128).map(|i| light(i % 320, i / 320)).collect();
+        let image = GrayImage::from_vec(320, 128, pixels).expect("size");
+        let (mut binariser, mut bits) = (Binariser::default(), Bitmap::default());
+        binariser.measure(image.view(), 30, Simd::best());
+        assert!(binariser.is_busy());
+        let marked = |bits: &Bitmap| -> Vec<bool> {
+            (0..5).map(|word| (0..128).any(|v| bits.row(v)[word] != 0)).collect()
+        };
+        binariser.mark(image.view(), 72, Where::Everywhere, &mut bits, Simd::best());
+        assert_eq!(marked(&bits), [true; 5]);
+        binariser.mark(image.view(), 72, Where::LightChanges, &mut bits, Simd::best());
+        assert_eq!(marked(&bits), [false, false, true, false, false], "only about the shadow's edge");
+    }
+
+    #[test]
     fn reciprocals_divide_exactly() {
         for high in 1..=255u8 {
             for range in 0..=high {

@@ -309,3 +309,41 @@ pub(super) fn bilinear(image: ImageView<'_>, [u, v]: Point) -> f32 {
     let bottom = p[2] + fu * (p[3] - p[2]);
     top + fv * (bottom - top)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Component and outline of a square with an edge of `edge` pixels, `round` pixels cut off each corner's sides.
+    fn blunt_square(edge: usize, round: usize) -> (Component, Vec<(u16, u16)>) {
+        let cut = |row: usize| round.saturating_sub(row.min(edge - 1 - row));
+        let outline: Vec<(u16, u16)> =
+            (0..edge).map(|row| ((20 + cut(row)) as u16, (20 + edge - 1 - cut(row)) as u16)).collect();
+        let area = outline.iter().map(|(left, right)| u32::from(right - left) + 1).sum::<u32>() / 2;
+        let (first, last) = (20, 19 + edge as u16);
+        let runs = 2 * edge as u32;
+        (Component { left: first, right: last, top: first, bottom: last, area, runs }, outline)
+    }
+
+    #[test]
+    fn corners_of_squares_are_found_though_they_are_cut_off() {
+        let limits = SizeLimits { least: 8.0, most: f32::MAX };
+        for (edge, round) in [(14, 0), (14, 2), (14, 3), (40, 3)] {
+            let (component, outline) = blunt_square(edge, round);
+            let quad = QuadFinder::default().quad(&component, &outline, limits).expect("a square");
+            // Half a pixel outside the centres of the outermost pixels.
+            let (low, high) = (19.5, 19.5 + edge as f32);
+            for corner in [[low, low], [high, low], [high, high], [low, high]] {
+                let nearest = quad.iter().map(|&p| distance(p, corner)).fold(f32::MAX, f32::min);
+                let most = if round == 2 { 2.5 } else { 1.0 };
+                assert!(nearest < most, "{edge} {round}: {nearest} from {corner:?} in {quad:?}");
+            }
+        }
+        let disc: Vec<(u16, u16)> = (-12i32..=12)
+            .map(|v| f64::from(144 - v * v).sqrt() as u16)
+            .map(|reach| (30 - reach, 30 + reach))
+            .collect();
+        let component = Component { left: 18, right: 42, top: 18, bottom: 42, area: 220, runs: 50 };
+        assert_eq!(QuadFinder::default().quad(&component, &disc, limits), None, "a disc");
+    }
+}
