@@ -16,7 +16,7 @@ import traceback
 from pathlib import Path
 
 from flight import ERRORS, Flight
-from scenarios import LONG, SHORT
+from scenarios import LANDED, LONG, SHORT
 
 
 def fly_row(args, row, results):
@@ -41,6 +41,16 @@ def fly_row(args, row, results):
     ended(flight, args)
 
 
+def in_rows(scenarios):
+    """Scenarios named by hand in rows: a machine that has landed flies no further."""
+    rows = [[]]
+    for scenario in scenarios:
+        rows[-1].append(scenario)
+        if scenario in LANDED:
+            rows.append([])
+    return [row for row in rows if row]
+
+
 def ended(flight, args):
     if flight is not None:
         if args.stay:
@@ -60,7 +70,7 @@ def main():
     for tool in ("feed", "frames", "stream"):
         setattr(args, tool, str(Path(args.tools) / f"hil_{tool}"))
     every = {scenario.__name__: scenario for rows in (SHORT, LONG) for row in rows for scenario in row}
-    rows = [[every[name] for name in args.scenario]] if args.scenario else LONG if args.long else SHORT
+    rows = in_rows([every[name] for name in args.scenario]) if args.scenario else LONG if args.long else SHORT
     results = {}
     for row in rows:
         fly_row(args, row, results)

@@ -301,6 +301,8 @@ def power_cut_long(flight):
     return power_cut(flight, 10)
 
 
+# After these the machine is off.
+LANDED = (landing, power_cut, power_cut_long)
 # One boot serves all of a row, as long as they go well; each row begins with a new card.
 SHORT = [[cold_boot, unplug, camera_faults, hang, landing], [power_cut]]
 LONG = [[cold_boot, unplug, camera_faults, busy, pixel_formats, card_absent, card_full, card_errors, hang, landing],
