@@ -24,3 +24,4 @@ mod standard;
 pub use compass::{CompassDecoder, CompassReading, HeardAttitude};
 pub use counts::{DecodeCounts, Refusal};
 pub use gnss::{GnssDecoder, HeardEpoch};
+pub(crate) use sentence::{Sentence, framed};

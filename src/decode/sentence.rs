@@ -4,7 +4,7 @@ use super::counts::Refusal;
 
 /// A sentence whose checksum holds.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Sentence<'a> {
+pub struct Sentence<'a> {
     /// What stands between `$` and `*`.
     pub body: &'a str,
 }
@@ -15,13 +15,13 @@ pub(super) fn checksum(body: &[u8]) -> u8 {
 }
 
 /// The whole sentence on the wire, without its line end.
-pub(super) fn framed(body: &str) -> String {
+pub fn framed(body: &str) -> String {
     format!("${body}*{:02X}", checksum(body.as_bytes()))
 }
 
 impl<'a> Sentence<'a> {
     /// From a line `$body*HH`, nothing after the checksum.
-    pub(super) fn of_line(line: &'a [u8]) -> Result<Self, Refusal> {
+    pub fn of_line(line: &'a [u8]) -> Result<Self, Refusal> {
         let line = std::str::from_utf8(line).map_err(|_| Refusal::NotAscii)?;
         if !line.bytes().all(|byte| (0x20..0x7F).contains(&byte)) {
             return Err(Refusal::NotAscii);

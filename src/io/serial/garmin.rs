@@ -4,6 +4,7 @@
 //! sentence means accepted; an echo with other values means refused.
 
 use super::GARMIN_ANSWER;
+use crate::decode::framed;
 use crate::time::{MonoTime, Span};
 
 /// What to do now.
@@ -106,10 +107,9 @@ impl GarminSetup {
     }
 }
 
-/// A sentence with its frame and checksum.
+/// A sentence as it goes over the line.
 pub(super) fn sentence(body: &str) -> String {
-    let checksum = body.bytes().fold(0u8, |sum, byte| sum ^ byte);
-    format!("${body}*{checksum:02X}\r\n")
+    framed(body) + "\r\n"
 }
 
 #[cfg(test)]

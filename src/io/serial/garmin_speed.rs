@@ -10,6 +10,7 @@ use serialport::{SerialPort as _, TTYPort};
 
 use super::garmin::sentence;
 use super::{IoKind, READ_BYTES, SerialSettings, unplugged};
+use crate::decode::Sentence;
 use crate::io::clock::HostClock;
 use crate::io::device::{Fault, NoteKind, Report, Stop};
 use crate::time::Span;
@@ -105,10 +106,10 @@ impl Settling<'_> {
 
 /// Bodies of the sentences in a text whose checksums are right.
 fn bodies(text: &str) -> impl Iterator<Item = &str> {
-    text.split('$').skip(1).filter_map(|rest| {
-        let (body, after) = rest.split_once('*')?;
-        let whole = sentence(body);
-        whole.trim_end().ends_with(&format!("*{}", after.get(..2)?)).then_some(body)
+    text.match_indices('$').filter_map(|(at, _)| {
+        let rest = &text[at..];
+        let line = rest.get(..rest.find('*')? + 3)?;
+        Sentence::of_line(line.as_bytes()).ok().map(|sentence| sentence.body)
     })
 }
 

@@ -3,7 +3,7 @@
 //! Opens the index (or moves it aside and makes it again), commits its changes, seals what a power
 //! cut left, brings the index up to what lies on the card, and deletes old flights.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::Duration;
@@ -289,16 +289,16 @@ impl Keeper {
                 self.held.push(Change::Forget(*run));
             }
         }
-        let segments = self.index.as_ref().map_or(Vec::new(), Index::segments);
+        let mut segments = BTreeMap::new();
+        for ((run, _), _) in self.index.as_ref().map_or(Vec::new(), Index::segments) {
+            *segments.entry(run).or_insert(0) += 1;
+        }
         for name in on_card {
             let dir = root.join(FLIGHTS).join(&name);
             let closed = dir.join(flight::FLIGHT_FILE).exists();
-            let whole = |run: u32| {
-                let known = segments.iter().filter(|((of, _), _)| *of == run).count();
-                known >= flight::segment_names(&dir).len()
-            };
+            let whole = |run| segments.get(run).copied().unwrap_or(0) >= flight::segment_names(&dir).len();
             let indexed =
-                self.index.is_none() || known.iter().any(|(run, known)| *known == name && whole(*run));
+                self.index.is_none() || known.iter().any(|(run, known)| *known == name && whole(run));
             if !closed || !indexed {
                 self.tasks.push_back(Task::Settle(name));
             }
