@@ -45,7 +45,7 @@ fn the_unit_watches_and_restarts() {
 #[test]
 fn the_cards_units_are_what_systemd_takes() {
     for unit in ["var-lib-windhover.mount", "windhover-card.service"] {
-        let path = format!("{}/systemd/{unit}", env!("CARGO_MANIFEST_DIR"));
+        let path = format!("{}/systemd/card/{unit}", env!("CARGO_MANIFEST_DIR"));
         let run = Command::new("systemd-analyze").args(["verify", "--man=no", &path]).output();
         let Ok(output) = run else {
             eprintln!("skipped: systemd-analyze is not installed");
