@@ -5,7 +5,7 @@ CARGO ?= cargo
 VENV  ?= target/venv
 DEMO  ?= demo
 
-.PHONY: help setup setup-python build demo test test-python test-web test-zenoh check lint docs bench load clean deb hil hil-long hil-short
+.PHONY: help setup setup-python build demo test test-python test-web test-zenoh check lint docs bench load clean deb hil hil-long hil-short hil-tools
 
 help:
 	@echo "make demo     build, simulate a flight, replay it, compare with the truth, write a report page"
@@ -86,9 +86,11 @@ deb: build
 	target/tools/bin/cargo-deb --no-build --locked --strip
 
 hil hil-long: PARTS = --bin windhover --example hil_feed --example hil_frames --example hil_stream
-hil hil-long: deb
-	@sh tests/setup/packages.sh qemu-system-x86 mmdebstrap e2fsprogs python3
+hil hil-long: deb hil-tools
 	sh hil/fly.sh $(if $(filter hil-long,$@),--long,$(SCENARIOS))
+
+hil-tools:
+	@sh tests/setup/packages.sh qemu-system-x86 mmdebstrap e2fsprogs python3
 
 hil-short:
 	@sh hil/short.sh

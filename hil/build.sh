@@ -7,8 +7,6 @@ here=$(cd "$(dirname "$0")" && pwd)
 deb=$(realpath "$1")
 windhover=$(realpath "$2")
 out=$(realpath -m "${3:-target/hil}")
-suite=${SUITE:-bookworm}
-packages=linux-image-amd64,systemd,systemd-sysv,udev,kmod,v4l-utils,iproute2,dbus,dmsetup,e2fsprogs
 mkdir -p "$out"
 
 if [ "$(id -u)" != 0 ]; then
@@ -16,13 +14,7 @@ if [ "$(id -u)" != 0 ]; then
     exit 1
 fi
 
-base="$out/base-$suite-$(echo "$packages" | sha256sum | cut -c1-8).tar"
-if [ ! -f "$base" ]; then
-    echo "== Debian $suite"
-    mmdebstrap --quiet --format=tar --variant=minbase --include="$packages" "$suite" "$base.part"
-    mv "$base.part" "$base"
-fi
-
+base=$(sh "$here/base.sh" "$out")
 root="$out/root"
 rm -rf "$root"
 mkdir "$root"
