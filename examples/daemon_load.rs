@@ -65,6 +65,7 @@ fn main() -> Result<()> {
     let mut daemon = Command::new(&args.windhover)
         .args(["run", "--config"])
         .arg(&config)
+        .envs(environment())
         .stdin(Stdio::null())
         .stderr(File::create(&log)?)
         .spawn()?;
@@ -75,6 +76,12 @@ fn main() -> Result<()> {
     daemon.wait()?;
     feeder.stop();
     report(&fs::read_to_string(&log)?, args.seconds, &memory, &tasks)
+}
+
+/// What the unit puts into the daemon's environment.
+fn environment() -> impl Iterator<Item = (&'static str, &'static str)> {
+    let unit = include_str!("../systemd/windhover.service");
+    unit.lines().filter_map(|line| line.strip_prefix("Environment=")?.split_once('='))
 }
 
 fn simulate(args: &Args, flight: &Path) -> Result<()> {
@@ -173,8 +180,27 @@ impl Feeder {
     }
 }
 
-/// Resident memory in megabytes, once a second for so long.
-fn watch(daemon: &mut Child, seconds: u64) -> Result<Vec<f64>> {
+/// Resident memory, megabytes.
+#[derive(Clone, Copy, Default)]
+struct Resident {
+    all: f64,
+    /// What is the daemon's own, not a file's.
+    own: f64,
+}
+
+impl Resident {
+    fn of(pid: u32) -> Result<Self> {
+        let status = fs::read_to_string(format!("/proc/{pid}/status"))?;
+        let megabytes = |name: &str| -> Result<f64> {
+            let text = status.lines().find_map(|line| line.strip_prefix(name)?.strip_suffix("kB"));
+            Ok(text.ok_or("no memory in /proc")?.trim().parse::<f64>()? * 1024.0 / 1e6)
+        };
+        Ok(Self { all: megabytes("VmRSS:")?, own: megabytes("RssAnon:")? })
+    }
+}
+
+/// Resident memory once a second for so long.
+fn watch(daemon: &mut Child, seconds: u64) -> Result<Vec<Resident>> {
     let mut memory = Vec::new();
     let began = Instant::now();
     while began.elapsed() < Duration::from_secs(seconds) {
@@ -182,10 +208,7 @@ fn watch(daemon: &mut Child, seconds: u64) -> Result<Vec<f64>> {
         if let Some(status) = daemon.try_wait()? {
             return Err(format!("the daemon ended: {status}").into());
         }
-        let status = fs::read_to_string(format!("/proc/{}/status", daemon.id()))?;
-        let resident = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
-        let kb = resident.and_then(|text| text.trim().trim_end_matches(" kB").parse::<f64>().ok());
-        memory.extend(kb.map(|kb| kb * 1024.0 / 1e6));
+        memory.push(Resident::of(daemon.id())?);
     }
     Ok(memory)
 }
@@ -210,7 +233,7 @@ fn field<'a>(line: &'a str, name: &str) -> &'a str {
     found.unwrap_or("none")
 }
 
-fn report(log: &str, seconds: u64, memory: &[f64], tasks: &[(String, f64)]) -> Result<()> {
+fn report(log: &str, seconds: u64, memory: &[Resident], tasks: &[(String, f64)]) -> Result<()> {
     let last = |event: &str| {
         let words = format!("event={event}");
         log.lines().rev().find(|line| line.split_whitespace().any(|word| word == words)).unwrap_or_default()
@@ -233,10 +256,16 @@ fn report(log: &str, seconds: u64, memory: &[f64], tasks: &[(String, f64)]) -> R
     for (name, used) in tasks.iter().filter(|task| task.1 > 0.0005 * seconds as f64) {
         println!("  {name:15} {:5.1} %", used / seconds as f64 * 100.0);
     }
-    let settled = memory.get(memory.len() / 4).copied().unwrap_or_default();
-    let end = memory.last().copied().unwrap_or_default();
-    let most = memory.iter().copied().fold(0.0, f64::max);
-    println!("resident, MB: {settled:.0} after a quarter, {end:.0} at the end, {most:.0} at most");
+    let most = |part: &[Resident]| {
+        part.iter().fold(Resident::default(), |most, now| if now.all > most.all { *now } else { most })
+    };
+    let largest = most(memory);
+    println!(
+        "resident, MB: {:.0} at most, {:.0} of it the daemon's own; at most in each tenth of the time:",
+        largest.all, largest.own
+    );
+    let tenths = memory.chunks(memory.len().div_ceil(10).max(1));
+    println!("  {}", tenths.map(|part| format!("{:.0}", most(part).all)).collect::<Vec<_>>().join(" "));
     let load = fs::read_to_string("/proc/loadavg")?;
     println!(
         "load of the machine: {}on {} processors",
