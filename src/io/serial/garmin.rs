@@ -4,7 +4,7 @@
 //! sentence means accepted; an echo with other values means refused.
 
 use super::GARMIN_ANSWER;
-use crate::decode::framed;
+use crate::decode::{Sentence, framed};
 use crate::time::{MonoTime, Span};
 
 /// What to do now.
@@ -95,10 +95,7 @@ impl GarminSetup {
     fn answer(&self, body: &str) -> Option<bool> {
         let text = String::from_utf8_lossy(&self.heard);
         let name = body.split(',').next().unwrap_or(body);
-        let echo = text
-            .split('$')
-            .filter_map(|rest| rest.split_once('*').map(|(echo, _)| echo))
-            .find(|echo| echo.split(',').next() == Some(name))?;
+        let echo = bodies(&text).find(|echo| echo.split(',').next() == Some(name))?;
         let same = body
             .split(',')
             .zip(echo.split(',').chain(std::iter::repeat("")))
@@ -110,6 +107,15 @@ impl GarminSetup {
 /// A sentence as it goes over the line.
 pub(super) fn sentence(body: &str) -> String {
     framed(body) + "\r\n"
+}
+
+/// Bodies of the sentences in a text whose checksums are right.
+pub(super) fn bodies(text: &str) -> impl Iterator<Item = &str> {
+    text.match_indices('$').filter_map(|(at, _)| {
+        let rest = &text[at..];
+        let line = rest.get(..rest.find('*')? + 3)?;
+        Sentence::of_line(line.as_bytes()).ok().map(|sentence| sentence.body)
+    })
 }
 
 #[cfg(test)]
@@ -147,8 +153,10 @@ mod tests {
         assert_eq!(run(|sentence| Some(sentence.to_owned())), Step::Accepted(7));
         let silent = run(|_| None);
         assert!(matches!(&silent, Step::Refused(why) if why.contains("did not answer PGRMC1")), "{silent:?}");
-        let other = run(|s| Some(s.replace("1,1,1,", "1,1,2,")));
+        let other = run(|s| bodies(s).next().map(|body| sentence(&body.replace("1,1,1,", "1,1,2,"))));
         assert!(matches!(&other, Step::Refused(why) if why.contains("other values")), "{other:?}");
+        let damaged = run(|s| Some(s.replace("1,1,1,", "1,1,2,")));
+        assert!(matches!(&damaged, Step::Refused(why) if why.contains("did not answer")), "{damaged:?}");
     }
 
     #[test]

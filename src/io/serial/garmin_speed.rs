@@ -8,9 +8,8 @@ use std::io::Read as _;
 
 use serialport::{SerialPort as _, TTYPort};
 
-use super::garmin::sentence;
+use super::garmin::{bodies, sentence};
 use super::{IoKind, READ_BYTES, SerialSettings, unplugged};
-use crate::decode::Sentence;
 use crate::io::clock::HostClock;
 use crate::io::device::{Fault, NoteKind, Report, Stop};
 use crate::time::Span;
@@ -102,15 +101,6 @@ impl Settling<'_> {
         }
         Ok(false)
     }
-}
-
-/// Bodies of the sentences in a text whose checksums are right.
-fn bodies(text: &str) -> impl Iterator<Item = &str> {
-    text.match_indices('$').filter_map(|(at, _)| {
-        let rest = &text[at..];
-        let line = rest.get(..rest.find('*')? + 3)?;
-        Sentence::of_line(line.as_bytes()).ok().map(|sentence| sentence.body)
-    })
 }
 
 fn holds_a_sentence(text: &str) -> bool {
