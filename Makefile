@@ -18,7 +18,7 @@ help:
 	@echo "make deb      a Debian package in target/debian"
 	@echo "make hil      the virtual payload computer: install, boot, fly, compare (as root)"
 	@echo "make hil-long the same with every scenario"
-	@echo "make hil-short the same with cold boot, unplugged devices and landing; skips where it cannot run"
+	@echo "make hil-short the same with cold boot, unplugged devices and landing; skips where it cannot run (a check)"
 
 # What the build needs of the system: a C compiler for the compression libraries, CMake and an assembler
 # for JPEG, and clang's library for the camera bindings.
