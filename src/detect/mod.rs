@@ -7,6 +7,7 @@ mod disc;
 mod disc_pairs;
 mod edge_points;
 mod edges;
+mod equations;
 mod family;
 mod features;
 mod frame;

@@ -9,18 +9,16 @@
 //! does. Gauss–Newton on distances along edge normals, each weighed by how well its edge is placed, Cauchy's
 //! weights on top.
 
-use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
+use nalgebra::{Cholesky, Const, Matrix2, SMatrix, Vector2};
 
-use super::edge_points::{EdgePoint, Locate, Located, NarrowModel, PADDED, PARAMETERS};
+use super::edge_points::{EdgePoint, Locate, Located, NarrowModel, PARAMETERS};
+use super::equations::{Accumulate, Advance, Equations, Information, Row, weigh};
 use super::family::Family;
 use super::homography::Homography;
 use super::quad::{Quad, distance};
 use super::simd::Simd;
 use super::windows::{WIDEST_CELL, Windows};
 use crate::msg::ImageView;
-
-type Information = SMatrix<f64, PARAMETERS, PARAMETERS>;
-type Row = SVector<f64, PARAMETERS>;
 
 /// Where the corners are in ξ and η.
 const CORNERS: [(f64, f64); 4] = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
@@ -60,6 +58,7 @@ const FLOOR_PX: f64 = 0.02;
 /// A step that moves no corner further is the last, pixels: each is about a third of the one before.
 const SETTLED_PX: f64 = 0.02;
 const MOST_ROUNDS: usize = 10;
+const MOST_STEPS: usize = 4;
 
 /// Share of the edges between a tag's cells that are seen where the fit is right. Where fewer are and windows reach
 /// from cell to cell, edges were taken for their neighbours: blur is wider than a cell then, and corners are wrong
@@ -74,15 +73,23 @@ const LEAST_EDGES: usize = 24;
 #[derive(Clone, Debug)]
 pub(super) struct Refiner {
     simd: Simd,
-    points: Vec<EdgePoint>,
+    /// On edges crossed along ξ, and along η.
+    points: [Vec<EdgePoint>; 2],
     located: Vec<Located>,
+    equations: Equations,
     /// Whether the tag's cells, its ring included, are light, row by row.
     lights: Vec<bool>,
 }
 
 impl Refiner {
     pub fn new(simd: Simd) -> Self {
-        Self { simd, points: Vec::new(), located: Vec::new(), lights: Vec::new() }
+        Self {
+            simd,
+            points: [Vec::new(), Vec::new()],
+            located: Vec::new(),
+            equations: Equations::default(),
+            lights: Vec::new(),
+        }
     }
 
     /// Refines corners given in the tag's own order; `None` where too few edges are seen or the fit leaves
@@ -102,7 +109,7 @@ impl Refiner {
         let (bow, barrel) = (LENS_CURVATURE * half.powi(2) / 2.0, LENS_BARREL * half.powi(3));
         let (covariance, windows) = self.fit(image, &mut model, family.width, [bow, bow, barrel])?;
         let (pitches, blurs) = (model.pitches(family.width), windows.blurs_squared());
-        let seen = self.located.len() as f64 / self.points.len() as f64;
+        let seen = self.count() as f64 / self.points.iter().map(Vec::len).sum::<usize>() as f64;
         let mistaken = if seen < ENOUGH_SEEN && cell < WIDEST_CELL { MISTAKEN } else { 0.0 };
         let neighbours = [0, 1].map(|k| {
             let pitch = pitches[k];
@@ -133,18 +140,15 @@ impl Refiner {
             let pitches = model.pitches(cells);
             windows.half = windows.halves(pitches, coarse);
             self.locate(image, model, windows.half, if coarse { 2 } else { 1 });
-            if self.located.len() < LEAST_EDGES {
+            if self.count() < LEAST_EDGES {
                 return None;
             }
             self.normalise();
             if !settled {
                 spread = self.spread();
             }
-            let solved = self.solve(model, bends, spread)?;
             let before = *model;
-            let overstep = if coarse { 1.0 } else { (1.0 / solved.flattening).clamp(1.0, 1.6) };
-            model.theta += solved.step * overstep;
-            last = Some(solved);
+            last = Some(self.settle(model, bends, spread)?);
             let moved = model.moved(&before);
             windows.sharpness = self.sharpness();
             if windows.widen() && round + 2 < MOST_ROUNDS {
@@ -164,9 +168,26 @@ impl Refiner {
         Some((self.covariance(&last?, spread)?, windows))
     }
 
+    /// Moves a model to where the located edges have it, their places left as they are.
+    fn settle(&mut self, model: &mut Model, bends: [f64; 3], spread: f64) -> Option<Solved> {
+        let mut last = None;
+        for _ in 0..MOST_STEPS {
+            let solved = self.solve(model, bends, spread)?;
+            let before = *model;
+            model.theta += solved.step;
+            let step = std::array::from_fn(|k| solved.step[k] as f32);
+            self.simd.run(Advance { located: &mut self.located, step });
+            last = Some(solved);
+            if model.moved(&before) < 0.25 * SETTLED_PX {
+                break;
+            }
+        }
+        last
+    }
+
     /// Points along every edge between cells of different colour.
     fn place_points(&mut self, family: &Family, id: u32, cell: f64) {
-        self.points.clear();
+        self.points.iter_mut().for_each(Vec::clear);
         let w = family.width as i32;
         let per_cell = (cell / 1.4).clamp(2.0, 4.0) as usize;
         self.lights.clear();
@@ -183,15 +204,15 @@ impl Refiner {
             if before == after {
                 continue;
             }
-            let sign = if after { 1.0 } else { -1.0 };
+            let light = if after { 1.0 } else { -1.0 };
             let across = x as f32 * scale - 1.0;
             let (x, y) = (x as usize, y as usize);
             for k in 0..per_cell {
                 let along = (y as f32 + (k as f32 + 0.5) / per_cell as f32) * scale - 1.0;
-                self.points.push(match upright {
-                    true => EdgePoint { xi: across, eta: along, light: [sign, 0.0], block: block(x, y) },
-                    false => EdgePoint { xi: along, eta: across, light: [0.0, sign], block: block(y, x) },
-                });
+                match upright {
+                    true => self.points[0].push(EdgePoint { xi: across, eta: along, light, block: block(x, y) }),
+                    false => self.points[1].push(EdgePoint { xi: along, eta: across, light, block: block(y, x) }),
+                }
             }
         }
     }
@@ -201,19 +222,26 @@ impl Refiner {
         self.simd.run(Locate { points, located, image, model: model.narrow(), half, every });
     }
 
+    /// How many edges are located.
+    fn count(&self) -> usize {
+        self.located.iter().map(|l| l.count).sum()
+    }
+
     /// Makes strengths relative to their mean. Strong edges are located better, up to the point where noise no
     /// longer tells.
     fn normalise(&mut self) {
-        let mean = self.located.iter().map(|l| l.strength).sum::<f32>() / self.located.len() as f32;
-        self.located.iter_mut().for_each(|l| l.strength = (l.strength / mean).min(1.5));
+        let mean = self.located.iter().flat_map(|l| l.strength).sum::<f32>() / self.count() as f32;
+        for strength in self.located.iter_mut().flat_map(|l| &mut l.strength) {
+            *strength = (*strength / mean).min(1.5);
+        }
     }
 
     /// Mean sharpness of the edges crossed along ξ and along η.
     fn sharpness(&self) -> [f64; 2] {
         let mut sums = [(0.0f32, 1e-3f32); 2];
         for l in &self.located {
-            sums[l.axis].0 += l.sharpness;
-            sums[l.axis].1 += 1.0;
+            sums[l.axis].0 += l.sharpness.iter().sum::<f32>();
+            sums[l.axis].1 += l.count as f32;
         }
         sums.map(|(sum, count)| f64::from(sum / count))
     }
@@ -221,13 +249,15 @@ impl Refiner {
     /// Robust spread of the residuals of edges of mean strength, pixels.
     fn spread(&self) -> f64 {
         let mut histogram = [0u32; 100];
-        for l in &self.located {
-            histogram[((l.residual.abs() * l.strength * 32.0) as usize).min(99)] += 1;
+        for (residual, strength) in
+            self.located.iter().flat_map(|l| l.residual.iter().zip(&l.strength)).filter(|(_, s)| **s > 0.0)
+        {
+            histogram[((residual.abs() * strength * 32.0) as usize).min(99)] += 1;
         }
-        let (mut below, mut median) = (0, 2.0);
+        let (mut below, mut median, all) = (0, 2.0, histogram.iter().sum::<u32>());
         for (bin, count) in histogram.iter().enumerate() {
             below += count;
-            if 2 * below as usize >= self.located.len() {
+            if 2 * below >= all {
                 median = (bin as f64 + 0.5) / 32.0;
                 break;
             }
@@ -235,33 +265,22 @@ impl Refiner {
         (1.4826 * median).max(0.08)
     }
 
-    fn solve(&self, model: &Model, bends: [f64; 3], spread: f64) -> Option<Solved> {
-        let mut sums = [[0.0f32; PADDED]; PARAMETERS];
-        let mut rights = [0.0f32; PADDED];
-        let (mut sum, mut weights, mut slopes) = (0.0, 0.0, 0.0);
-        let count = self.located.len() as f32;
-        for l in &self.located {
-            let (weight, slope) = weigh(l, l.residual, spread as f32);
-            for (sums, r) in sums.iter_mut().zip(l.row) {
-                add_scaled(sums, weight * r, &l.row);
-            }
-            add_scaled(&mut rights, weight * l.residual, &l.row);
-            sum += weight * l.residual * l.residual;
-            weights += weight;
-            slopes += slope;
-        }
-        let variance = f64::from(sum / count * count / (count - 8.0));
-        let mut information = Information::from_fn(|i, j| f64::from(sums[i.min(j)][i.max(j)]));
-        let mut right = Row::from_fn(|i, _| f64::from(rights[i]));
+    fn solve(&mut self, model: &Model, bends: [f64; 3], spread: f64) -> Option<Solved> {
+        let sums = &mut self.equations;
+        self.simd.run(Accumulate { located: &self.located, spread: spread as f32, to: sums });
+        let count = self.located.iter().map(|l| l.count).sum::<usize>() as f64;
+        let variance = sums.squares() / (count - 8.0);
+        let mut information = sums.matrix();
+        let mut right = sums.right();
         for (k, bend) in (8..PARAMETERS).zip(bends) {
             let hold = variance.max(1e-4) / (bend * bend);
             information[(k, k)] += hold;
             right[k] -= hold * model.theta[k];
         }
-        let inverse = information.cholesky()?.inverse();
-        let step = inverse * right;
-        let flattening = f64::from(slopes / weights);
-        step.iter().all(|s| s.is_finite()).then_some(Solved { step, inverse, flattening })
+        let information = information.cholesky()?;
+        let step = information.solve(&right);
+        let flattening = sums.flattening();
+        step.iter().all(|s| s.is_finite()).then_some(Solved { step, information, flattening })
     }
 
     /// Covariance of the parameters: of M-estimates, with errors that are alike within a block. How much more
@@ -269,48 +288,34 @@ impl Refiner {
     /// `λ = Σ gᵀ A⁻¹ g / p`, which counts noise and whatever else the model leaves over; the covariance is
     /// `λ A⁻¹ / ρ²`, ρ being how much Cauchy's weights flatten the residuals.
     fn covariance(&self, solved: &Solved, spread: f64) -> Option<Information> {
-        let mut pulls = [[0.0f32; PADDED]; MOST_BLOCKS];
+        let mut pulls = [[0.0f32; PARAMETERS]; MOST_BLOCKS];
         for l in &self.located {
-            let moved: f64 = (0..PARAMETERS).map(|k| f64::from(l.row[k]) * solved.step[k]).sum();
-            let residual = l.residual - moved as f32;
-            let (weight, _) = weigh(l, residual, spread as f32);
-            add_scaled(&mut pulls[usize::from(l.block)], weight * residual, &l.row);
+            let (weights, _) = weigh(l, spread as f32);
+            for (lane, weight) in weights.into_iter().enumerate() {
+                let pull = weight * l.residual[lane];
+                let to = &mut pulls[usize::from(l.block[lane])];
+                to.iter_mut().zip(&l.rows).for_each(|(to, row)| *to += pull * row[lane]);
+            }
         }
         let (mut sum, mut blocks) = (0.0, 0.0f64);
         for pull in pulls.iter().filter(|b| b.iter().any(|x| *x != 0.0)) {
-            let pull = Row::from_fn(|i, _| f64::from(pull[i]));
-            sum += (pull.transpose() * solved.inverse * pull)[0];
+            let mut pull = Row::from_fn(|i, _| f64::from(pull[i]));
+            solved.information.l_dirty().solve_lower_triangular_mut(&mut pull);
+            sum += pull.norm_squared();
             blocks += 1.0;
         }
         // The fit takes up some of it, most in the corners. Bow and barrel are held: eight are free.
         let lambda = sum / 8.0 / (1.0 - TAKEN_UP / blocks).max(0.5);
         let flattening = solved.flattening.clamp(0.4, 1.0);
-        (blocks > 4.0).then(|| solved.inverse * (lambda / (flattening * flattening)))
+        (blocks > 4.0).then(|| solved.information.inverse() * (lambda / (flattening * flattening)))
     }
 }
 
 /// One step of the fit.
 struct Solved {
     step: Row,
-    /// Of the information matrix.
-    inverse: Information,
-    /// Mean slope of the weighted residuals over the mean weight.
+    information: Cholesky<f64, Const<PARAMETERS>>,
     flattening: f64,
-}
-
-/// Weight of an edge at a residual, inverse to its variance and Cauchy's in units of `spread`, and the slope of
-/// weight times residual there.
-#[inline(always)]
-fn weigh(l: &Located, residual: f32, spread: f32) -> (f32, f32) {
-    let normalised = residual * l.strength / (2.0 * spread);
-    let square = normalised * normalised;
-    let weight = l.strength * l.strength;
-    (weight / (1.0 + square), weight * (1.0 - square) / ((1.0 + square) * (1.0 + square)))
-}
-
-#[inline(always)]
-fn add_scaled(to: &mut [f32; PADDED], factor: f32, row: &[f32; PADDED]) {
-    to.iter_mut().zip(row).for_each(|(to, r)| *to += factor * r);
 }
 
 /// Homography in ξ, η (row by row, last entry 1), the bow and the barrel.
