@@ -5,8 +5,8 @@ use super::quad::Point;
 use super::simd::Kernel;
 use crate::msg::ImageView;
 
-/// Of a tag's model: a homography, a bow and a barrel.
-pub(super) const PARAMETERS: usize = 11;
+/// Of a tag's model: a homography, a bow, a barrel and what neighbouring cells do to edges along ξ and along η.
+pub(super) const PARAMETERS: usize = 13;
 
 /// How many edges are dealt with side by side, in loops that a compiler turns into vector instructions.
 pub(super) const LANES: usize = 16;
@@ -19,6 +19,8 @@ pub(super) struct EdgePoint {
     pub eta: f32,
     /// 1 where light is towards larger ξ or η, −1 where it is towards smaller.
     pub light: f32,
+    /// 1 where the dark cell is one wide and the light one is not, −1 where it is the other way round.
+    pub narrow: f32,
     /// Which part of the tag it is in.
     pub block: u8,
 }
@@ -53,6 +55,8 @@ pub(super) struct NarrowModel {
 struct Projected {
     at: [Lanes; 2],
     normal: [Lanes; 2],
+    /// How far from there neighbouring cells let the edge appear, along the normal.
+    shift: Lanes,
     rows: [Lanes; PARAMETERS],
 }
 
@@ -102,6 +106,9 @@ impl NarrowModel {
             (rows[6][lane], rows[7][lane]) = (across * xi, across * eta);
             (rows[8][lane], rows[9][lane]) = (far * n[0], far * n[1]);
             rows[10][lane] = far * (q[0] * n[0] + q[1] * n[1]);
+            let narrow = points[lane].narrow;
+            (rows[11][lane], rows[12][lane]) = (narrow * lx, narrow * ly);
+            to.shift[lane] = narrow * (lx * t[11] + ly * t[12]);
         }
     }
 }
@@ -282,7 +289,10 @@ impl Kernel for Locate<'_> {
                 if inside == [0.0; LANES] {
                     continue;
                 }
-                let (residual, strength, sharpness) = profile.balance(&inside);
+                let (mut residual, strength, sharpness) = profile.balance(&inside);
+                for lane in 0..LANES {
+                    residual[lane] -= projected.shift[lane];
+                }
                 let count = strength.iter().filter(|s| **s > 0.0).count();
                 let (rows, block) = (projected.rows, lanes.map(|p| p.block));
                 if count > 0 {

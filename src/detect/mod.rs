@@ -21,6 +21,8 @@ mod quad;
 mod refine;
 mod simd;
 mod tag;
+mod tag_edges;
+mod tag_model;
 mod windows;
 
 pub use frame::FrameDetector;
