@@ -159,12 +159,18 @@ fn largest_quad(hull: &[Point]) -> Option<Quad> {
 const BLUNT_AREA: f32 = 24.0;
 const BLUNT_SHARE: f32 = 0.25;
 
+/// Square of the length over the longest's from which a side of a hull may be a rectangle's.
+const LONG_SQUARED: f32 = 0.3;
+
 /// The smallest rectangle around a hull, where the hull fills it but for its corners: motion and blur round those
 /// of a small tag off by several pixels, and no four points of the hull are near them.
 fn blunt_rectangle(hull: &[Point], hull_area: f32) -> Option<Quad> {
     let mut best: Option<(f32, Quad)> = None;
-    for (i, &a) in hull.iter().enumerate() {
-        let b = hull[(i + 1) % hull.len()];
+    // One of its sides is along one of the hull's; short ones are of corners.
+    let side = |i: usize| (hull[i], hull[(i + 1) % hull.len()]);
+    let square = |(a, b): (Point, Point)| (a[0] - b[0]) * (a[0] - b[0]) + (a[1] - b[1]) * (a[1] - b[1]);
+    let longest = (0..hull.len()).map(|i| square(side(i))).fold(0.0, f32::max);
+    for (a, b) in (0..hull.len()).map(side).filter(|&ab| square(ab) >= LONG_SQUARED * longest) {
         let n = Line::through(a, b).n;
         // `n` points out of the side, and the next side of a clockwise rectangle out along this one.
         let t = [-n[1], n[0]];
