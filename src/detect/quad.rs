@@ -65,12 +65,14 @@ impl QuadFinder {
         self.find_hull(component, outline);
         let hull_area = polygon_area(&self.hull);
         // What its pixels cover, not only their centres.
-        let covered = hull_area + 1.0 + 0.5 * perimeter(&self.hull);
+        let perimeter = perimeter(&self.hull);
+        let covered = hull_area + 1.0 + 0.5 * perimeter;
         if covered < 0.5 * limits.least * limits.least {
             return None;
         }
-        // Corners are blunt by about a pixel: allow their area, and a tenth for bent edges.
-        let enough = (0.9 * hull_area - 6.0).max(6.0);
+        // Corners are blunt by about a pixel, sharp ones by more: allow their area, and a tenth for bent edges.
+        let blunt = 0.375 * perimeter * perimeter / hull_area.max(1.0);
+        let enough = (0.9 * hull_area - blunt).max(6.0);
         let inscribed = largest_quad(&self.hull).filter(|quad| polygon_area(quad) >= enough);
         let quad = grow(&inscribed.or_else(|| blunt_rectangle(&self.hull, hull_area))?, 0.5)?;
         let sides: [f32; 4] = std::array::from_fn(|i| distance(quad[i], quad[(i + 1) % 4]));

@@ -189,10 +189,12 @@ impl TagDetector {
                 if self.found.iter().any(|f| same_place(&f.corners, &in_frame)) {
                     continue;
                 }
-                let Some(quad) = straighten(level, &quad, gate) else { continue };
-                let families = self.families.iter().filter(|f| f.inverted == inverted);
-                let found =
-                    families.filter_map(|f| decode(image, &self.pyramid, &quad, f, &mut self.refiner)).next();
+                let Some(straight) = straighten(level, &quad, gate) else { continue };
+                // Of a small tag a side may be drawn to what is beside it: then as it was.
+                let found = [straight, in_frame].iter().find_map(|quad| {
+                    let mut families = self.families.iter().filter(|f| f.inverted == inverted);
+                    families.find_map(|f| decode(image, &self.pyramid, quad, f, &mut self.refiner))
+                });
                 self.found.extend(found);
             }
         }

@@ -59,11 +59,6 @@ impl Model {
         CORNERS.into_iter().map(moved).fold(0.0, f64::max)
     }
 
-    /// Pixel of a tag point.
-    pub fn pixel(&self, xi: f64, eta: f64) -> [f64; 2] {
-        (self.at(xi, eta).0 + self.origin).into()
-    }
-
     /// Pixel of a tag point, from the origin, and ∂pixel/∂parameters.
     fn at(&self, xi: f64, eta: f64) -> (Vector2<f64>, SMatrix<f64, 2, PARAMETERS>) {
         let t = &self.theta;
