@@ -1,11 +1,13 @@
 //! The tag detector on generated tags: honest covariance, one answer on every machine, nothing out of noise.
 
+mod common;
+
 use nalgebra::{Matrix3, Vector2, Vector3};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use windhover::config::{Brightness, Config, MarkerConfig, MarkerKind, TagFamily};
+use windhover::config::{Brightness, Config, TagFamily};
 use windhover::detect::{FrameDetector, Simd, TagDetector, TagPattern, tag_pattern};
 use windhover::msg::{
     FrameObservations, FramePrediction, GrayImage, ImageView, MarkerDetection, MarkerId, MarkerPrediction,
@@ -191,18 +193,8 @@ fn with_discs(is_red: bool) -> Config {
         Config::parse(include_str!("../config/windhover.toml")).expect("the shipped configuration");
     config.detector.ground_features = 8;
     let mut pair = config.target[0].clone();
-    pair.marker = [0, 1]
-        .map(|k| MarkerConfig {
-            kind: MarkerKind::Disc,
-            family: None,
-            id: None,
-            size_m: None,
-            diameter_m: Some(0.4 + 0.2 * f64::from(k)),
-            brightness: (!is_red).then_some(if k == 0 { Brightness::Dark } else { Brightness::Light }),
-            color: is_red.then(|| "#d02020".to_owned()),
-            position_m: [f64::from(k), 0.0, -0.5],
-            yaw_deg: 0.0,
-        })
+    pair.marker = [(0.4, Brightness::Dark, 0.0), (0.6, Brightness::Light, 1.0)]
+        .map(|(diameter, brightness, ahead)| common::disc(diameter, (!is_red).then_some(brightness), ahead))
         .to_vec();
     config.target.push(pair);
     config

@@ -1,11 +1,13 @@
 //! The detector takes no memory after its first frames, for tags, discs and ground features: an allocator that
 //! counts.
 
+mod common;
+
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
 use nalgebra::Vector2;
-use windhover::config::{Brightness, Config, MarkerConfig, MarkerKind, TagFamily};
+use windhover::config::{Brightness, Config, TagFamily};
 use windhover::detect::{FrameDetector, Region, TagDetector, tag_pattern};
 use windhover::msg::{FrameObservations, FramePrediction, GrayImage, MarkerId, MarkerPrediction, RgbImage};
 
@@ -85,18 +87,8 @@ fn config() -> Config {
     let mut config = Config::parse(&text).expect("the shipped configuration");
     config.detector.ground_features = 8;
     let mut pair = config.target[0].clone();
-    pair.marker = [0.4, 0.6]
-        .map(|diameter| MarkerConfig {
-            kind: MarkerKind::Disc,
-            family: None,
-            id: None,
-            size_m: None,
-            diameter_m: Some(diameter),
-            brightness: Some(Brightness::Dark),
-            color: None,
-            position_m: [10.0 * (diameter - 0.4), 0.0, -0.5],
-            yaw_deg: 0.0,
-        })
+    pair.marker = [(0.4, 0.0), (0.6, 2.0)]
+        .map(|(diameter, ahead)| common::disc(diameter, Some(Brightness::Dark), ahead))
         .to_vec();
     config.target.push(pair);
     config

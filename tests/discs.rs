@@ -1,11 +1,13 @@
 //! Disc pairs drawn in perspective: centres to a fraction of a pixel, ambiguity refused, and no look beyond the
 //! foretold places while tracking.
 
+mod common;
+
 use nalgebra::{Rotation3, Unit, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use windhover::config::{Brightness, Config, MarkerConfig, MarkerKind};
+use windhover::config::{Brightness, Config};
 use windhover::detect::FrameDetector;
 use windhover::msg::{
     FrameObservations, FramePrediction, GrayImage, MarkerDetection, MarkerId, MarkerPrediction, RgbImage,
@@ -35,6 +37,15 @@ impl Look {
             Self::Red => [0.7, 0.1, 0.1],
         }
     }
+
+    /// As configured; red has none.
+    fn brightness(self) -> Option<Brightness> {
+        match self {
+            Self::Light => Some(Brightness::Light),
+            Self::Dark => Some(Brightness::Dark),
+            Self::Red => None,
+        }
+    }
 }
 
 fn config(look: Look, diameters: [f64; 2]) -> Config {
@@ -45,23 +56,8 @@ fn config(look: Look, diameters: [f64; 2]) -> Config {
     config.camera.intrinsics.cy = 0.5 * HEIGHT as f64;
     config.detector.ground_features = 0;
     config.target.truncate(1);
-    config.target[0].marker = [0, 1]
-        .map(|k| MarkerConfig {
-            kind: MarkerKind::Disc,
-            family: None,
-            id: None,
-            size_m: None,
-            diameter_m: Some(diameters[k]),
-            brightness: match look {
-                Look::Light => Some(Brightness::Light),
-                Look::Dark => Some(Brightness::Dark),
-                Look::Red => None,
-            },
-            color: (look == Look::Red).then(|| "#d02020".to_owned()),
-            position_m: [k as f64, 0.0, -0.5],
-            yaw_deg: 0.0,
-        })
-        .to_vec();
+    config.target[0].marker =
+        [0, 1].map(|k| common::disc(diameters[k], look.brightness(), k as f64)).to_vec();
     config
 }
 

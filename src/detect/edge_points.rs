@@ -5,8 +5,9 @@ use super::quad::Point;
 use super::simd::Kernel;
 use crate::msg::ImageView;
 
-/// Of a tag's model: a homography, a bow, a barrel and what neighbouring cells do to edges along ξ and along η.
-pub(super) const PARAMETERS: usize = 13;
+/// Of a tag's model: a homography, a bow, a barrel, a twist and what neighbouring cells do to edges along ξ and
+/// along η.
+pub(super) const PARAMETERS: usize = 15;
 
 /// How many edges are dealt with side by side, in loops that a compiler turns into vector instructions.
 pub(super) const LANES: usize = 16;
@@ -76,9 +77,10 @@ impl NarrowModel {
             let q = [xi * a[0] + eta * b[0], xi * a[1] + eta * b[1]];
             let far = q[0] * q[0] + q[1] * q[1] - 2.0;
             let bend = [t[8] + t[10] * q[0], t[9] + t[10] * q[1]];
-            to.at[0][lane] = self.origin[0] + u + far * bend[0];
-            to.at[1][lane] = self.origin[1] + v + far * bend[1];
-            // Images of the directions of ξ and η.
+            let (even, odd) = (q[0] * q[0] - q[1] * q[1], 2.0 * q[0] * q[1]);
+            to.at[0][lane] = self.origin[0] + u + far * bend[0] + t[11] * even - t[12] * odd;
+            to.at[1][lane] = self.origin[1] + v + far * bend[1] - t[11] * odd - t[12] * even;
+            // Images of the directions of ξ and η; of the twist it is too little.
             let (farther_xi, farther_eta) =
                 (2.0 * (q[0] * a[0] + q[1] * a[1]), 2.0 * (q[0] * b[0] + q[1] * b[1]));
             let bow = far * t[10];
@@ -107,8 +109,9 @@ impl NarrowModel {
             (rows[8][lane], rows[9][lane]) = (far * n[0], far * n[1]);
             rows[10][lane] = far * (q[0] * n[0] + q[1] * n[1]);
             let narrow = points[lane].narrow;
-            (rows[11][lane], rows[12][lane]) = (narrow * lx, narrow * ly);
-            to.shift[lane] = narrow * (lx * t[11] + ly * t[12]);
+            (rows[11][lane], rows[12][lane]) = (even * n[0] - odd * n[1], -odd * n[0] - even * n[1]);
+            (rows[13][lane], rows[14][lane]) = (narrow * lx, narrow * ly);
+            to.shift[lane] = narrow * (lx * t[13] + ly * t[14]);
         }
     }
 }

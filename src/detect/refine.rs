@@ -1,12 +1,13 @@
 //! Corners of a decoded tag to a few hundredths of a pixel, with their covariance: every edge between its
 //! dark and light cells, not only the border, takes part in one fit.
 //!
-//! Model, with ξ, η ∈ [−1, 1] across the border square: `p = H(ξ, η) + (|q|² − 2) (c + k q)`, q = ξ a + η b: a
-//! homography and what a lens with radial distortion adds to it over a small part of the image. With a point's
-//! place P off the optical axis that is `κ |P|² P`; to third order about a tag's middle what is no homography is
-//! `κ |q|² (P + q)`. a and b are half the tag's sides in the image over their mean length, so that the bow c and
-//! the barrel k change nothing at a square's corners; they are held near nought by what a wide lens
-//! does. Beside a cell that is one wide, blur lets an edge appear nearer the other cell; by how much is one more
+//! Model, with ξ, η ∈ [−1, 1] across the border square, q = ξ a + η b and d(q) = (d₁ e − d₂ o, −d₁ o − d₂ e),
+//! e = q₁² − q₂², o = 2 q₁ q₂: `p = H(ξ, η) + (|q|² − 2) (c + k q) + d(q)`: a homography and what a lens with radial
+//! distortion adds to it over a small part of the image. With a point's place P off the optical axis that is
+//! `κ |P|² P`; to third order about a tag's middle what is no homography is `κ |q|² (P + q)`, and as lengths shrink
+//! more along P than across, |q|² of the image has a part besides that of the tag: the twist d, which with H and c
+//! makes up every quadratic. a and b are half the tag's sides in the image over their mean length, so that the bow c
+//! and the barrel k change nothing at a square's corners; all are held near nought by what a wide lens does. Beside a cell that is one wide, blur lets an edge appear nearer the other cell; by how much is one more
 //! unknown for edges along ξ and one for those along η. Gauss–Newton on distances along edge normals, each weighed
 //! by how well its edge is placed, Cauchy's weights on top.
 
@@ -30,11 +31,15 @@ const LENS_CURVATURE: f64 = 1.5e-4;
 /// focal length of 1000 px.
 const LENS_BARREL: f64 = 3e-7;
 
+/// What a wide lens twists a tag by, over the square of half its length, 1/px: of the bow, the difference between
+/// what it shrinks lengths by along the radius and across, a third where it shrinks them by 5 and 15 %.
+const LENS_TWIST: f64 = 2.5e-5;
+
 /// Parameters after the homography's eight, which are held near nought: their sigmas are given.
 const HELD: usize = PARAMETERS - 8;
 
-/// How many blocks' worth the fit takes up of the errors it is made from.
-const TAKEN_UP: f64 = 3.0;
+/// How many blocks' worth the fit takes up, for each parameter, of the errors it is made from.
+const TAKEN_UP: f64 = 0.375;
 
 /// Most that a neighbouring cell's nearness shifts an edge, in cells: what the shift is held near nought by.
 const NARROW_SHIFT: f64 = 0.1;
@@ -42,7 +47,7 @@ const NARROW_SHIFT: f64 = 0.1;
 /// Error that neighbouring cells leave on all edges of one direction alike, their shift being fitted, pixels, at a
 /// blur of one pixel and one pixel a cell: it grows with the square of the blur and falls with the cube of the cell.
 /// Measured on generated tags.
-const NEIGHBOURS: f64 = 1.7;
+const NEIGHBOURS: f64 = 2.1;
 
 /// A round that moves no corner further is the last, pixels.
 const SETTLED_PX: f64 = 0.02;
@@ -71,12 +76,7 @@ pub(super) struct Refiner {
 
 impl Refiner {
     pub fn new(simd: Simd) -> Self {
-        Self {
-            simd,
-            edges: TagEdges::default(),
-            located: Vec::new(),
-            equations: Equations::default(),
-        }
+        Self { simd, edges: TagEdges::default(), located: Vec::new(), equations: Equations::default() }
     }
 
     /// Refines corners given in the tag's own order; `None` where too few edges are seen or the fit leaves
@@ -95,7 +95,9 @@ impl Refiner {
         let half = 0.5 * f64::from(edge);
         let shift = NARROW_SHIFT * cell;
         let (bow, barrel) = (LENS_CURVATURE * half.powi(2) / 2.0, LENS_BARREL * half.powi(3));
-        let (covariance, windows) = self.fit(image, &mut model, family.width, [bow, bow, barrel, shift, shift])?;
+        let twist = LENS_TWIST * half.powi(2);
+        let (covariance, windows) =
+            self.fit(image, &mut model, family.width, [bow, bow, barrel, twist, twist, shift, shift])?;
         let (pitches, blurs) = (model.pitches(family.width), windows.blurs_squared());
         let seen = self.count() as f64 / self.edges.count() as f64;
         let mistaken = if seen < ENOUGH_SEEN && cell < WIDEST_CELL { MISTAKEN } else { 0.0 };
@@ -228,20 +230,20 @@ impl Refiner {
         let variance = sums.squares() / (count - 8.0);
         let mut information = sums.matrix();
         let mut right = sums.right();
-        for (k, sigma) in (PARAMETERS - HELD..PARAMETERS).zip(held) {
-            let hold = variance.max(1e-4) / (sigma * sigma);
+        let holds = held.map(|sigma| variance.max(1e-4) / (sigma * sigma));
+        for (k, hold) in (PARAMETERS - HELD..PARAMETERS).zip(holds) {
             information[(k, k)] += hold;
             right[k] -= hold * model.theta[k];
         }
         let information = information.cholesky()?;
         let step = information.solve(&right);
         let flattening = sums.flattening();
-        step.iter().all(|s| s.is_finite()).then_some(Solved { step, information, flattening })
+        step.iter().all(|s| s.is_finite()).then_some(Solved { step, information, holds, flattening })
     }
 
     /// Covariance of the parameters: of M-estimates, with errors that are alike within a block. How much more
     /// they err together than each by itself is one number, from the blocks' pulls `g` on the parameters:
-    /// `λ = Σ gᵀ A⁻¹ g / p`, which counts noise and whatever else the model leaves over; the covariance is
+    /// `λ = Σ gᵀ A⁻¹ g / p`, p being how many parameters the image tells, which counts noise and whatever else the model leaves over; the covariance is
     /// `λ A⁻¹ / ρ²`, ρ being how much Cauchy's weights flatten the residuals.
     fn covariance(&self, solved: &Solved, spread: f64) -> Option<Information> {
         let mut pulls = [[0.0f32; PARAMETERS]; MOST_BLOCKS];
@@ -260,10 +262,15 @@ impl Refiner {
             sum += pull.norm_squared();
             blocks += 1.0;
         }
-        // The fit takes up some of it, most in the corners. Eight parameters are free, the others held.
-        let lambda = sum / 8.0 / (1.0 - TAKEN_UP / blocks).max(0.5);
+        let inverse = solved.information.inverse();
+        // As many parameters as the image tells: of those held, the share that is not what they are held by.
+        let held =
+            solved.holds.iter().zip(PARAMETERS - HELD..).map(|(hold, k)| hold * inverse[(k, k)]).sum::<f64>();
+        let told = PARAMETERS as f64 - held;
+        // The fit takes up some of it, most in the corners.
+        let lambda = sum / told / (1.0 - TAKEN_UP * told / blocks).max(0.5);
         let flattening = solved.flattening.clamp(0.4, 1.0);
-        (blocks > 4.0).then(|| solved.information.inverse() * (lambda / (flattening * flattening)))
+        (blocks > 4.0).then(|| inverse * (lambda / (flattening * flattening)))
     }
 }
 
@@ -271,5 +278,7 @@ impl Refiner {
 struct Solved {
     step: Row,
     information: Cholesky<f64, Const<PARAMETERS>>,
+    /// What of the information is not the image's.
+    holds: [f64; HELD],
     flattening: f64,
 }

@@ -22,7 +22,7 @@ pub(super) struct Refined {
 /// What stays of an edge's error when noise is averaged away: sampling, neighbouring cells, print. Pixels.
 const FLOOR_PX: f64 = 0.02;
 
-/// Homography in ξ, η (row by row, last entry 1), the bow and the barrel.
+/// Homography in ξ, η (row by row, last entry 1), the bow, the barrel, the twist and the shifts of edges.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Model {
     pub theta: Row,
@@ -66,11 +66,13 @@ impl Model {
         let (u, v) = ((t[0] * xi + t[1] * eta + t[2]) * w, (t[3] * xi + t[4] * eta + t[5]) * w);
         let q = self.sides[0] * xi + self.sides[1] * eta;
         let far = q.norm_squared() - 2.0;
-        let p = Vector2::new(u, v) + (Vector2::new(t[8], t[9]) + q * t[10]) * far;
+        let (even, odd) = (q.x * q.x - q.y * q.y, 2.0 * q.x * q.y);
+        let twist = Vector2::new(t[11] * even - t[12] * odd, -t[11] * odd - t[12] * even);
+        let p = Vector2::new(u, v) + (Vector2::new(t[8], t[9]) + q * t[10]) * far + twist;
         #[rustfmt::skip]
         let jacobian = SMatrix::<f64, 2, PARAMETERS>::from_row_slice(&[
-            xi * w, eta * w, w, 0.0, 0.0, 0.0, -u * xi * w, -u * eta * w, far, 0.0, far * q.x, 0.0, 0.0,
-            0.0, 0.0, 0.0, xi * w, eta * w, w, -v * xi * w, -v * eta * w, 0.0, far, far * q.y, 0.0, 0.0,
+            xi * w, eta * w, w, 0.0, 0.0, 0.0, -u * xi * w, -u * eta * w, far, 0.0, far * q.x, even, -odd, 0.0, 0.0,
+            0.0, 0.0, 0.0, xi * w, eta * w, w, -v * xi * w, -v * eta * w, 0.0, far, far * q.y, -odd, -even, 0.0, 0.0,
         ]);
         (p, jacobian)
     }
