@@ -49,12 +49,14 @@ const NARROW_SHIFT: f64 = 0.1;
 /// Measured on generated tags.
 const NEIGHBOURS: f64 = 2.1;
 
-/// A round that moves no corner further is the last, pixels.
-const SETTLED_PX: f64 = 0.02;
+/// A round that moves no corner further is the last, pixels: another would move them by a twentieth of it.
+const SETTLED_PX: f64 = 0.08;
 const MOST_ROUNDS: usize = 10;
 
-/// Most steps of the fit between looking for edges and looking again.
+/// Steps of the fit between looking for edges and looking again: at most so many, or one no corner is moved further
+/// by, pixels.
 const MOST_STEPS: usize = 4;
+const LEAST_STEP_PX: f64 = 0.005;
 
 /// Share of the edges between a tag's cells that are seen where the fit is right. Where fewer are and windows reach
 /// from cell to cell, edges were taken for their neighbours: blur is wider than a cell then, and corners are wrong
@@ -168,7 +170,7 @@ impl Refiner {
             let step = std::array::from_fn(|k| solved.step[k] as f32);
             self.simd.run(Advance { located: &mut self.located, step });
             last = Some(solved);
-            if model.moved(&before) < 0.25 * SETTLED_PX {
+            if model.moved(&before) < LEAST_STEP_PX {
                 break;
             }
         }
