@@ -21,6 +21,28 @@ struct Drawn {
     id: u32,
 }
 
+/// Radial distortion of a lens: κ |p|² p is added to a place p off its axis, which is in the image.
+#[derive(Clone, Copy)]
+struct Lens {
+    kappa: f64,
+    axis: Vector2<f64>,
+}
+
+impl Lens {
+    const NONE: Self = Self { kappa: 0.0, axis: Vector2::new(0.0, 0.0) };
+
+    fn distorted(self, at: Vector2<f64>) -> Vector2<f64> {
+        let p = at - self.axis;
+        at + p * (self.kappa * p.norm_squared())
+    }
+
+    fn undistorted(self, at: Vector2<f64>) -> Vector2<f64> {
+        let bent = at - self.axis;
+        let step = |p: Vector2<f64>, _| bent / (1.0 + self.kappa * p.norm_squared());
+        self.axis + (0..8).fold(bent, step)
+    }
+}
+
 /// Takes tag coordinates (border square from −1 to 1) to pixels: a tilted square seen in perspective.
 fn random_view(rng: &mut ChaCha8Rng, edge: f64, size: f64) -> Matrix3<f64> {
     let (turn, tilt, towards) = (
@@ -52,7 +74,7 @@ fn reflectance(pattern: &TagPattern, x: f64, y: f64) -> f64 {
     }
 }
 
-fn draw(rng: &mut ChaCha8Rng, edge: f64) -> Drawn {
+fn draw(rng: &mut ChaCha8Rng, edge: f64, lens: Lens) -> Drawn {
     let size = (edge * 1.5 + 40.0).ceil();
     let view = random_view(rng, edge, size);
     let id = rng.random_range(0..587);
@@ -81,7 +103,7 @@ fn draw(rng: &mut ChaCha8Rng, edge: f64) -> Drawn {
         let light: f64 = kernel
             .iter()
             .map(|k| {
-                let p = back * Vector3::new(at.x + k.x, at.y + k.y, 1.0);
+                let p = back * lens.undistorted(at + k).push(1.0);
                 reflectance(&pattern, p.x / p.z, p.y / p.z)
             })
             .sum();
@@ -90,7 +112,7 @@ fn draw(rng: &mut ChaCha8Rng, edge: f64) -> Drawn {
     }
     let corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)].map(|(x, y)| {
         let p = view * Vector3::new(x, y, 1.0);
-        Vector2::new(p.x / p.z, p.y / p.z)
+        lens.distorted(Vector2::new(p.x / p.z, p.y / p.z))
     });
     Drawn { image, corners, id }
 }
@@ -101,34 +123,74 @@ fn found_in(detector: &mut TagDetector, drawn: &Drawn) -> Option<MarkerDetection
     out.into_iter().find(|m| m.marker == MarkerId::Tag { family: TagFamily::Tag36h11, id: drawn.id })
 }
 
+/// What corners of many tags come to.
+#[derive(Default)]
+struct Score {
+    nes: f64,
+    square: f64,
+    sum: Vector2<f64>,
+    corners: f64,
+}
+
+impl Score {
+    fn add(&mut self, found: &MarkerDetection, drawn: &Drawn) {
+        let seen = found.corners_px.expect("a tag has corners");
+        for (i, (seen, truth)) in seen.iter().zip(drawn.corners).enumerate() {
+            let error = seen - truth;
+            let inverse = found.corner_cov_px2[i].try_inverse().expect("a covariance");
+            self.nes += (error.transpose() * inverse * error)[0];
+            self.square += error.norm_squared();
+            self.sum += error;
+            self.corners += 1.0;
+        }
+    }
+
+    /// Mean normalised error squared, RMS and mean error, pixels.
+    fn means(&self) -> (f64, f64, Vector2<f64>) {
+        (self.nes / self.corners, (self.square / self.corners).sqrt(), self.sum / self.corners)
+    }
+}
+
 /// Mean normalised error squared, RMS error, mean error and share found, of `count` tags of a class.
 fn score(edges: std::ops::Range<f64>, count: usize, seed: u64) -> (f64, f64, Vector2<f64>, f64) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut detector = TagDetector::new(&[TagFamily::Tag36h11], 16.0, 2);
-    let (mut nes, mut square, mut sum, mut corners, mut tags) = (0.0, 0.0, Vector2::zeros(), 0.0, 0.0);
+    let (mut score, mut tags) = (Score::default(), 0.0);
     for _ in 0..count {
         let edge = rng.random_range(edges.clone());
-        let drawn = draw(&mut rng, edge);
+        let drawn = draw(&mut rng, edge, Lens::NONE);
         let Some(found) = found_in(&mut detector, &drawn) else { continue };
         tags += 1.0;
-        let seen = found.corners_px.expect("a tag has corners");
-        for i in 0..4 {
-            let error = seen[i] - drawn.corners[i];
-            let inverse = found.corner_cov_px2[i].try_inverse().expect("a covariance");
-            nes += (error.transpose() * inverse * error)[0];
-            square += error.norm_squared();
-            sum += error;
-            corners += 1.0;
-        }
+        score.add(&found, &drawn);
     }
-    (nes / corners, (square / corners).sqrt(), sum / corners, tags / count as f64)
+    let (nes, rms, bias) = score.means();
+    (nes, rms, bias, tags / count as f64)
 }
 
 #[test]
 fn corner_covariance_is_honest_in_the_middle_class() {
     let (nes, rms, bias, found) = score(36.0..60.0, 120, 4);
     assert!((1.4..=2.6).contains(&nes), "normalised error squared {nes}, seed 4");
-    assert!(rms < 0.15 && bias.amax() < 0.03 && found > 0.95, "{rms} {bias} {found}, seed 4");
+    assert!(rms < 0.1 && bias.amax() < 0.02 && found > 0.98, "{rms} {bias} {found}, seed 4");
+}
+
+#[test]
+fn a_wide_lens_shifts_no_corner_at_the_frames_rim() {
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    let mut detector = TagDetector::new(&[TagFamily::Tag36h11], 24.0, 2);
+    let mut score = Score::default();
+    for k in 0..12 {
+        // −0.17 r² at a focal length of 1000 px, half a frame's diagonal off the axis.
+        let towards = f64::from(k) * std::f64::consts::TAU / 12.0;
+        let lens = Lens {
+            kappa: -0.17e-6,
+            axis: Vector2::new(100.0 + 560.0 * towards.cos(), 100.0 + 560.0 * towards.sin()),
+        };
+        let drawn = draw(&mut rng, 130.0, lens);
+        score.add(&found_in(&mut detector, &drawn).expect("a large tag"), &drawn);
+    }
+    let (nes, rms, _) = score.means();
+    assert!(rms < 0.075 && nes < 3.0, "RMS {rms} px, normalised error squared {nes}, seed 8");
 }
 
 #[test]
@@ -136,7 +198,7 @@ fn corner_covariance_is_honest_in_the_middle_class() {
 fn corner_covariance_is_honest_in_every_size_class() {
     let mut failures = Vec::new();
     for (edges, worst_rms, least_found) in
-        [(22.0..36.0, 0.3, 0.85), (36.0..60.0, 0.15, 0.95), (60.0..100.0, 0.1, 0.98)]
+        [(22.0..36.0, 0.25, 0.95), (36.0..60.0, 0.1, 0.99), (60.0..100.0, 0.08, 0.99)]
     {
         let (nes, rms, bias, found) = score(edges.clone(), 550, 11);
         println!(
@@ -161,7 +223,7 @@ fn scalar_and_vector_kernels_find_the_same_bit_for_bit() {
         let mut scalar = best.clone().with_simd(Simd::scalar());
         for _ in 0..12 {
             let edge = rng.random_range(24.0..80.0);
-            let drawn = draw(&mut rng, edge);
+            let drawn = draw(&mut rng, edge, Lens::NONE);
             let (mut a, mut b) = (Vec::new(), Vec::new());
             best.detect(drawn.image.view(), &mut a);
             scalar.detect(drawn.image.view(), &mut b);
