@@ -44,10 +44,11 @@ const TAKEN_UP: f64 = 0.375;
 /// Most that a neighbouring cell's nearness shifts an edge, in cells: what the shift is held near nought by.
 const NARROW_SHIFT: f64 = 0.1;
 
-/// Error that neighbouring cells leave on all edges of one direction alike, their shift being fitted, pixels, at a
-/// blur of one pixel and one pixel a cell: it grows with the square of the blur and falls with the cube of the cell.
-/// Measured on generated tags.
-const NEIGHBOURS: f64 = 2.1;
+/// Error that neighbouring cells leave on all edges of one direction alike, their shift being fitted: pixels, at a
+/// blur of one pixel and one pixel a cell (it grows with the square of the blur and falls with the cube of the cell),
+/// and a share of the shift. Measured on generated tags.
+const NEIGHBOURS: f64 = 1.2;
+const SHIFT_ERROR: f64 = 0.3;
 
 /// A round that moves no corner further is the last, pixels: another would move them by a twentieth of it.
 const SETTLED_PX: f64 = 0.08;
@@ -105,7 +106,8 @@ impl Refiner {
         let mistaken = if seen < ENOUGH_SEEN && cell < WIDEST_CELL { MISTAKEN } else { 0.0 };
         let neighbours = [0, 1].map(|k| {
             let pitch = pitches[k];
-            (NEIGHBOURS * blurs[k] / pitch.powi(3)).min(0.2 * pitch).hypot(mistaken * pitch)
+            let left = (NEIGHBOURS * blurs[k] / pitch.powi(3)).hypot(SHIFT_ERROR * model.shift(k));
+            left.min(0.2 * pitch).hypot(mistaken * pitch)
         });
         let refined = model.result(&covariance, neighbours)?;
         let moved = (0..4).map(|i| {

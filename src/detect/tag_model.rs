@@ -96,6 +96,12 @@ impl Model {
         [area / d_eta.norm().max(1e-9), area / d_xi.norm().max(1e-9)]
     }
 
+    /// By how much blur lets edges beside cells that are one wide appear nearer the other cell, of edges crossed along
+    /// ξ (0) or η (1), pixels.
+    pub fn shift(&self, axis: usize) -> f64 {
+        self.theta[PARAMETERS - 2 + axis]
+    }
+
     /// Corners and centre with their covariances; `neighbours` are errors common to all edges along ξ and η.
     pub fn result(&self, covariance: &Information, neighbours: [f64; 2]) -> Option<Refined> {
         let axes = self.sides.map(|s| s / s.norm().max(1e-9));
