@@ -1,37 +1,42 @@
-//! Static ground features followed from frame to frame: corners found where nothing else is, tracked by
-//! pyramidal Lucas–Kanade (Bouguet 2000), checked forwards and backwards, and held to the patch they were
-//! born with so that they do not drift.
+//! Static ground features followed from frame to frame: corners found where nothing else is, carried over by
+//! pyramidal Lucas–Kanade (Bouguet 2000), then put where the patch they were born with is found, however it is
+//! turned, scaled or slanted by now ([`Template`]). A feature whose patch is no longer found ends; what is found
+//! later at its place is another one, so that no drift adds up within one.
 
 use nalgebra::Vector2;
 
-use super::pyramid::{Base, Level, Pyramid};
-use super::quad::bilinear;
+use super::corners::{Corner, Corners};
+use super::flow::Flow;
+use super::pyramid::{Base, Pyramid};
 use super::simd::Simd;
-use crate::msg::{FeatureTrack, GrayImage, ImageView};
+use super::template::{Template, Warp};
+use crate::msg::{FeatureTrack, ImageView};
 
-/// Half width of the patch compared, pixels of a level.
-const HALF: usize = 6;
-const SIDE: usize = 2 * HALF + 1;
-const AREA: usize = SIDE * SIDE;
+/// Least correlation with the patch a feature was born with.
+const LEAST_CORRELATION: f32 = 0.85;
 
-/// Coarsest level used: motions up to about 16 pixels a level are followed, 60 in all.
-const LEVELS: usize = 4;
+/// Most that the contrast of a patch changes from one frame to the next, as a factor.
+const MOST_GAIN: f32 = 2.0;
 
-/// Tracks further apart than this after going there and back are dropped, pixels.
-const MOST_RETURN_ERROR: f32 = 0.4;
+/// Largest sigma of a place at birth for a noise of one grey level, pixels.
+const MOST_SIGMA_A_LEVEL: f32 = 0.02;
 
-/// Least correlation with the patch it was born with.
-const LEAST_CORRELATION: f32 = 0.8;
+/// Parts of the frame, across and down; each is to have a feature before any has two.
+const PARTS: (usize, usize) = (4, 3);
+
+/// What interpolation leaves, pixels.
+const LEAST_SIGMA: f32 = 0.03;
 
 /// A feature followed.
 #[derive(Clone, Debug)]
 struct Track {
     id: u64,
-    at: [f32; 2],
-    /// Grey levels around the place it was last anchored, row by row.
-    patch: [f32; AREA],
-    /// Error that re-anchoring has added up, px².
-    drift: f32,
+    warp: Warp,
+    /// By how much it moved from the frame before, pixels.
+    shift: [f32; 2],
+    template: Template,
+    /// Contrast over that at birth, in the last frame.
+    gain: f32,
     sigma: f32,
 }
 
@@ -41,13 +46,14 @@ pub(super) struct FeatureTracker {
     wanted: usize,
     next_id: u64,
     tracks: Vec<Track>,
-    frame: GrayImage,
+    /// Size of the frame before.
+    size: (usize, usize),
     pyramid: Pyramid,
-    before: GrayImage,
-    before_pyramid: Pyramid,
-    scores: Vec<f64>,
-    /// The best corner of each part of the frame without a feature, and how good it is.
-    corners: Vec<(f32, [f32; 2])>,
+    before: Pyramid,
+    /// By how much the features found in this frame have moved.
+    shifts: Vec<[f32; 2]>,
+    search: Corners,
+    corners: Vec<Corner>,
     simd: Simd,
 }
 
@@ -61,12 +67,12 @@ impl FeatureTracker {
             wanted,
             next_id: 0,
             tracks: Vec::with_capacity(wanted),
-            frame: GrayImage::default(),
+            size: (0, 0),
             pyramid: Pyramid::default(),
-            before: GrayImage::default(),
-            before_pyramid: Pyramid::default(),
-            scores: Vec::new(),
-            corners: Vec::new(),
+            before: Pyramid::default(),
+            shifts: Vec::with_capacity(wanted),
+            search: Corners::default(),
+            corners: Vec::with_capacity(PARTS.0 * PARTS.1),
             simd: Simd::best(),
         }
     }
@@ -77,76 +83,58 @@ impl FeatureTracker {
         if self.wanted == 0 {
             return;
         }
-        std::mem::swap(&mut self.frame, &mut self.before);
-        std::mem::swap(&mut self.pyramid, &mut self.before_pyramid);
-        copy(image, &mut self.frame);
-        self.pyramid.build(self.frame.view(), Base::Half, 32, self.simd);
-        if (self.before.width, self.before.height) == (image.width, image.height) {
-            self.follow(occupied);
+        std::mem::swap(&mut self.pyramid, &mut self.before);
+        self.pyramid.build(image, Base::Half, 32, self.simd);
+        if self.size == (image.width, image.height) {
+            self.follow(image, occupied);
         } else {
             self.tracks.clear();
         }
+        self.size = (image.width, image.height);
         if self.tracks.len() < self.wanted {
-            self.find(occupied);
+            self.find(image, occupied);
         }
         out.extend(self.tracks.iter().map(|t| FeatureTrack {
             id: t.id,
-            px: Vector2::new(f64::from(t.at[0]), f64::from(t.at[1])),
-            sigma_px: f64::from((t.sigma * t.sigma + t.drift).sqrt()),
+            px: Vector2::new(f64::from(t.warp.at[0]), f64::from(t.warp.at[1])),
+            sigma_px: f64::from(t.sigma.hypot(LEAST_SIGMA)),
         }));
     }
 
-    fn follow(&mut self, occupied: &[Circle]) {
-        let now = Stack { frame: self.frame.view(), pyramid: &self.pyramid };
-        let then = Stack { frame: self.before.view(), pyramid: &self.before_pyramid };
+    fn follow(&mut self, image: ImageView<'_>, occupied: &[Circle]) {
+        let flow = Flow { from: &self.before, to: &self.pyramid, image };
+        let (shifts, simd) = (&mut self.shifts, self.simd);
+        shifts.clear();
         self.tracks.retain_mut(|track| {
-            let Some(guess) = carry(&then, &now, track.at) else { return false };
-            let Some(back) = carry(&now, &then, guess) else { return false };
-            let (du, dv) = (back[0] - track.at[0], back[1] - track.at[1]);
-            let returned = (du * du + dv * dv).sqrt();
-            if returned > MOST_RETURN_ERROR {
+            let from = track.warp.at;
+            let likely = shifts.iter().chain([&track.shift, &[0.0; 2]]);
+            let guess = Warp { at: flow.carry(from, likely.copied()), ..track.warp };
+            let Some(found) = track.template.find(image, guess, simd) else { return false };
+            let brighter = found.gain / track.gain;
+            if found.correlation < LEAST_CORRELATION || brighter.max(1.0 / brighter) > MOST_GAIN {
                 return false;
             }
-            let anchored = align(now.frame, &track.patch, guess)
-                .filter(|a| a.correlation >= LEAST_CORRELATION && near(a.at, guess, 1.5));
-            match anchored {
-                Some(found) => {
-                    track.at = found.at;
-                    track.sigma = found.sigma;
-                }
-                None => {
-                    // The ground looks different by now: go on from how it looked a frame ago.
-                    track.patch = patch(then.frame, track.at);
-                    let Some(found) = align(now.frame, &track.patch, guess) else { return false };
-                    if found.correlation < LEAST_CORRELATION || !near(found.at, guess, 1.5) {
-                        return false;
-                    }
-                    track.drift += track.sigma * track.sigma;
-                    track.at = found.at;
-                    track.sigma = found.sigma;
-                }
-            }
-            inside(now.frame, track.at) && free(track.at, occupied)
+            (track.warp, track.gain, track.sigma) = (found.warp, found.gain, found.sigma);
+            track.shift = [track.warp.at[0] - from[0], track.warp.at[1] - from[1]];
+            shifts.push(track.shift);
+            free(track.warp.at, occupied)
         });
     }
 
     /// The best corner of each part of the frame that has no feature yet.
-    fn find(&mut self, occupied: &[Circle]) {
-        let level = self.pyramid.level(self.frame.view(), 2.min(self.pyramid.len() - 1));
-        let (across, down) = (4, 3);
-        let (w, h) = (level.image.width / across, level.image.height / down);
-        if w < SIDE || h < SIDE {
-            return;
-        }
+    fn find(&mut self, image: ImageView<'_>, occupied: &[Circle]) {
+        let level = self.pyramid.level(image, 2.min(self.pyramid.len() - 1));
+        let (w, h) = (level.image.width / PARTS.0, level.image.height / PARTS.1);
         self.corners.clear();
-        for part in 0..across * down {
-            let (u, v) = (part % across * w, part / across * h);
-            let taken = self.tracks.iter().any(|t| {
-                let (tu, tv) = (level.of_frame(t.at[0]), level.of_frame(t.at[1]));
-                (tu as usize / w, tv as usize / h) == (part % across, part / across)
-            });
-            if !taken {
-                self.corners.extend(best_corner(level, (u, v, w, h), occupied, &mut self.scores));
+        for (across, down) in (0..PARTS.1).flat_map(|down| (0..PARTS.0).map(move |across| (across, down))) {
+            let (u, v) = (across * w, down * h);
+            let within = |c: f32, first: usize, length: usize| {
+                (first..first + length).contains(&(level.of_frame(c).max(0.0) as usize))
+            };
+            let here = |t: &Track| within(t.warp.at[0], u, w) && within(t.warp.at[1], v, h);
+            if !self.tracks.iter().any(here) {
+                let wanted = |at| Template::fits(image, at) && free(at, occupied);
+                self.corners.extend(self.search.best(level, (u, v, w, h), self.simd, wanted));
             }
         }
         self.corners.sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
@@ -154,39 +142,21 @@ impl FeatureTracker {
             if self.tracks.len() >= self.wanted {
                 break;
             }
-            let frame = self.frame.view();
-            if inside(frame, at) && free(at, occupied) {
-                let patch = patch(frame, at);
-                let sigma = align(frame, &patch, at).map_or(0.1, |a| a.sigma);
-                self.tracks.push(Track { id: self.next_id, at, patch, drift: 0.0, sigma });
+            let Some((template, warp)) = Template::new(image, at, self.simd) else { continue };
+            if template.sigma_a_level() < MOST_SIGMA_A_LEVEL && free(warp.at, occupied) {
+                let sigma = template.sigma_a_level();
+                self.tracks.push(Track {
+                    id: self.next_id,
+                    warp,
+                    shift: [0.0; 2],
+                    template,
+                    gain: 1.0,
+                    sigma,
+                });
                 self.next_id += 1;
             }
         }
     }
-}
-
-struct Stack<'a> {
-    frame: ImageView<'a>,
-    pyramid: &'a Pyramid,
-}
-
-fn copy(image: ImageView<'_>, to: &mut GrayImage) {
-    (to.width, to.height, to.stride) = (image.width, image.height, image.width);
-    to.data.clear();
-    (0..image.height).for_each(|v| to.data.extend_from_slice(image.row(v)));
-}
-
-fn near(a: [f32; 2], b: [f32; 2], radius: f32) -> bool {
-    (a[0] - b[0]).abs() <= radius && (a[1] - b[1]).abs() <= radius
-}
-
-/// Whether a patch around a place lies within the image, with a margin for its gradients.
-fn inside(image: ImageView<'_>, at: [f32; 2]) -> bool {
-    let margin = (HALF + 2) as f32;
-    at[0] >= margin
-        && at[1] >= margin
-        && at[0] + margin < image.width as f32
-        && at[1] + margin < image.height as f32
 }
 
 fn free(at: [f32; 2], occupied: &[Circle]) -> bool {
@@ -194,168 +164,91 @@ fn free(at: [f32; 2], occupied: &[Circle]) -> bool {
     occupied.iter().all(|(center, radius)| (p - center).norm() > *radius)
 }
 
-/// Where a place in one frame is in another: coarse to fine.
-fn carry(from: &Stack<'_>, to: &Stack<'_>, at: [f32; 2]) -> Option<[f32; 2]> {
-    let levels = from.pyramid.len().min(to.pyramid.len()).min(LEVELS);
-    let mut shift = [0.0, 0.0];
-    for n in (0..levels).rev() {
-        let (a, b) = (from.pyramid.level(from.frame, n), to.pyramid.level(to.frame, n));
-        let here = at.map(|c| a.of_frame(c));
-        let guess = [here[0] + shift[0] / b.scale, here[1] + shift[1] / b.scale];
-        if !inside(a.image, here) || !inside(b.image, guess) {
-            if n > 0 {
-                continue;
-            }
-            return None;
-        }
-        let reference = patch(a.image, here);
-        match align(b.image, &reference, guess) {
-            Some(found) if found.correlation > 0.5 => {
-                shift = [(found.at[0] - here[0]) * b.scale, (found.at[1] - here[1]) * b.scale];
-            }
-            _ if n > 0 => {}
-            _ => return None,
-        }
-    }
-    Some([at[0] + shift[0], at[1] + shift[1]])
-}
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Rotation2, Similarity2};
 
-fn patch(image: ImageView<'_>, at: [f32; 2]) -> [f32; AREA] {
-    std::array::from_fn(|i| {
-        let (x, y) = ((i % SIDE) as f32 - HALF as f32, (i / SIDE) as f32 - HALF as f32);
-        bilinear(image, [at[0] + x, at[1] + y])
-    })
-}
+    use super::*;
+    use crate::msg::GrayImage;
 
-/// A patch found in an image.
-struct Aligned {
-    at: [f32; 2],
-    correlation: f32,
-    sigma: f32,
-}
+    const SIZE: (usize, usize) = (480, 400);
 
-/// Inverse compositional alignment of a patch, mean taken off (Baker and Matthews 2004).
-fn align(image: ImageView<'_>, reference: &[f32; AREA], guess: [f32; 2]) -> Option<Aligned> {
-    let (gx, gy) = gradients(reference);
-    let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
-    for (x, y) in gx.iter().zip(&gy) {
-        xx += x * x;
-        xy += x * y;
-        yy += y * y;
-    }
-    let det = xx * yy - xy * xy;
-    if !(det > 1e-3 * (xx + yy) * (xx + yy).max(1.0) * 0.04) {
-        return None;
-    }
-    let mean = reference.iter().sum::<f32>() / AREA as f32;
-    let mut at = guess;
-    let mut here = [0.0; AREA];
-    let mut here_mean = 0.0;
-    for _ in 0..10 {
-        if !inside(image, at) || !near(at, guess, 1.3 * HALF as f32) {
-            return None;
+    /// A view of ground without end, of waves of many lengths and directions: `frame = view · ground`.
+    fn frame(view: &Similarity2<f64>, light: f64) -> GrayImage {
+        let back = view.inverse();
+        let mut image = GrayImage::new(SIZE.0, SIZE.1);
+        for (i, level) in image.data.iter_mut().enumerate() {
+            let at = back * nalgebra::Point2::new((i % SIZE.0) as f64, (i / SIZE.0) as f64);
+            let waves = (0..24).map(|k| {
+                let k = f64::from(k);
+                let (s, c) = (2.4 * k).sin_cos();
+                let length = 5.0 * 1.17_f64.powf(k);
+                (std::f64::consts::TAU * (c * at.x + s * at.y) / length + k * k).sin()
+            });
+            *level = (light * (110.0 + 16.0 * waves.sum::<f64>())).clamp(0.0, 255.0) as u8;
         }
-        here = patch(image, at);
-        here_mean = here.iter().sum::<f32>() / AREA as f32;
-        let (mut bx, mut by) = (0.0, 0.0);
-        for i in 0..AREA {
-            let e = (here[i] - here_mean) - (reference[i] - mean);
-            bx += gx[i] * e;
-            by += gy[i] * e;
-        }
-        let step = [(yy * bx - xy * by) / det, (xx * by - xy * bx) / det];
-        at = [at[0] - step[0], at[1] - step[1]];
-        if step[0].abs().max(step[1].abs()) < 0.01 {
-            break;
-        }
+        image
     }
-    let (mut cross, mut a2, mut b2, mut residual) = (0.0, 0.0, 0.0, 0.0);
-    for i in 0..AREA {
-        let (a, b) = (here[i] - here_mean, reference[i] - mean);
-        cross += a * b;
-        a2 += a * a;
-        b2 += b * b;
-        residual += (a - b) * (a - b);
-    }
-    // σ² (JᵀJ)⁻¹, its larger axis, with σ² from what is left unexplained; and what interpolation leaves.
-    let variance = residual / (AREA - 3) as f32;
-    let half_trace = 0.5 * (xx + yy);
-    let least = half_trace - (half_trace * half_trace - det).max(0.0).sqrt();
-    let sigma = (variance / least.max(1e-6) + 0.03 * 0.03).sqrt();
-    Some(Aligned { at, correlation: cross / (a2 * b2).sqrt().max(1e-6), sigma })
-}
 
-/// Central differences inside a patch; one-sided at its rim.
-fn gradients(p: &[f32; AREA]) -> ([f32; AREA], [f32; AREA]) {
-    let difference = |i: usize, k: usize, stride: usize| match k {
-        0 => p[i + stride] - p[i],
-        k if k == SIDE - 1 => p[i] - p[i - stride],
-        _ => 0.5 * (p[i + stride] - p[i - stride]),
-    };
-    (
-        std::array::from_fn(|i| difference(i, i % SIDE, 1)),
-        std::array::from_fn(|i| difference(i, i / SIDE, SIDE)),
-    )
-}
+    /// Helicopter that drifts, turns and sinks: the picture moves 6 px, turns 2° and grows 1 % a frame.
+    fn view(n: i32) -> Similarity2<f64> {
+        let middle = nalgebra::Translation2::new(240.0, 200.0);
+        let turned = Rotation2::new(f64::from(2 * n).to_radians());
+        let grown = Similarity2::from_parts(
+            nalgebra::Translation2::identity(),
+            nalgebra::UnitComplex::from_rotation_matrix(&turned),
+            1.01_f64.powi(n),
+        );
+        nalgebra::Translation2::new(6.0 * f64::from(n), -2.0 * f64::from(n))
+            * (middle * grown * middle.inverse())
+    }
 
-/// The place in part `(u, v, w, h)` of a level with the largest smaller eigenvalue of the gradient matrix
-/// (Shi and Tomasi 1994), in frame coordinates, off the occupied circles. Every second pixel is tried.
-fn best_corner(
-    level: Level<'_>,
-    (u, v, w, h): (usize, usize, usize, usize),
-    occupied: &[Circle],
-    scores: &mut Vec<f64>,
-) -> Option<(f32, [f32; 2])> {
-    const REACH: usize = 3;
-    let image = level.image;
-    // Products of gradients, summed over squares through running sums along rows then columns.
-    let margin = REACH + 1;
-    let (u0, v0) = (u.max(margin), v.max(margin));
-    let (u1, v1) = ((u + w).min(image.width - margin), (v + h).min(image.height - margin));
-    if u0 >= u1 || v0 >= v1 {
-        return None;
-    }
-    let (cols, rows) = (u1 - u0 + 2 * REACH, v1 - v0 + 2 * REACH);
-    scores.clear();
-    scores.resize(3 * cols * rows, 0.0);
-    for y in 0..rows {
-        let at = v0 - REACH + y;
-        let (above, here, below) = (image.row(at - 1), image.row(at), image.row(at + 1));
-        let mut sums = [0.0f64; 3];
-        for x in 0..cols {
-            let c = u0 - REACH + x;
-            let gx = f64::from(here[c + 1]) - f64::from(here[c - 1]);
-            let gy = f64::from(below[c]) - f64::from(above[c]);
-            for (k, g) in [gx * gx, gx * gy, gy * gy].into_iter().enumerate() {
-                sums[k] += g;
-                let up = if y > 0 { scores[((y - 1) * cols + x) * 3 + k] } else { 0.0 };
-                scores[(y * cols + x) * 3 + k] = up + sums[k];
-            }
-        }
-    }
-    let sum = |x: usize, y: usize, k: usize| {
-        let s = |x: usize, y: usize| scores[(y * cols + x) * 3 + k];
-        let d = 2 * REACH;
-        let (left, top) = (x.checked_sub(1), y.checked_sub(1));
-        s(x + d, y + d) - left.map_or(0.0, |l| s(l, y + d)) - top.map_or(0.0, |t| s(x + d, t))
-            + left.zip(top).map_or(0.0, |(l, t)| s(l, t))
-    };
-    let mut best: Option<(f32, [f32; 2])> = None;
-    for y in (0..v1 - v0).step_by(2) {
-        for x in (0..u1 - u0).step_by(2) {
-            let [xx, xy, yy] = [0, 1, 2].map(|k| sum(x, y, k) as f32);
-            let half = 0.5 * (xx + yy);
-            let least = half - (half * half - (xx * yy - xy * xy)).max(0.0).sqrt();
-            if best.is_none_or(|b| least > b.0) && least > LEAST_CORNER {
-                let at = [level.to_frame((u0 + x) as f32), level.to_frame((v0 + y) as f32)];
-                if free(at, occupied) {
-                    best = Some((least, at));
+    #[test]
+    fn features_stay_on_their_ground_however_the_view_turns() {
+        let mut tracker = FeatureTracker::new(8);
+        let mut births: Vec<(u64, nalgebra::Point2<f64>, i32)> = Vec::new();
+        let (mut longest, mut n_held) = (0, 0);
+        for n in 0..24 {
+            let light = 1.0 - 0.01 * f64::from(n);
+            let mut out = Vec::new();
+            tracker.process(frame(&view(n), light).view(), &[], &mut out);
+            assert_eq!(out.len(), 8, "frame {n}");
+            for track in &out {
+                let ground = view(n).inverse() * nalgebra::Point2::from(track.px);
+                match births.iter().find(|b| b.0 == track.id) {
+                    Some((_, born, since)) => {
+                        let off = (view(n) * born - view(n) * ground).norm();
+                        assert!(off < 0.15, "feature {} is off by {off:.2} px in frame {n}", track.id);
+                        longest = longest.max(n - since);
+                        n_held += 1;
+                    }
+                    None => births.push((track.id, ground, n)),
                 }
             }
         }
+        assert!(longest >= 20, "the longest lived {longest} frames");
+        assert!(n_held > 100, "{n_held} sightings of features already known");
     }
-    best
-}
 
-/// Least smaller eigenvalue over 49 pixels, from differences two pixels apart: about six grey levels a pixel.
-const LEAST_CORNER: f32 = 49.0 * 36.0 * 2.0;
+    #[test]
+    fn a_cut_ends_every_feature() {
+        let mut tracker = FeatureTracker::new(8);
+        let (mut before, mut after) = (Vec::new(), Vec::new());
+        tracker.process(frame(&view(0), 1.0).view(), &[], &mut before);
+        let elsewhere = nalgebra::Translation2::new(5000.0, 3000.0) * view(0);
+        tracker.process(frame(&elsewhere, 1.0).view(), &[], &mut after);
+        assert_eq!((before.len(), after.len()), (8, 8));
+        assert!(after.iter().all(|a| before.iter().all(|b| b.id != a.id)), "all are new");
+    }
+
+    #[test]
+    fn occupied_places_are_kept_clear() {
+        let mut tracker = FeatureTracker::new(8);
+        let circle = (Vector2::new(240.0, 200.0), 120.0);
+        for n in 0..4 {
+            let mut out = Vec::new();
+            tracker.process(frame(&view(n), 1.0).view(), &[circle], &mut out);
+            assert!(!out.is_empty() && out.iter().all(|t| (t.px - circle.0).norm() > circle.1), "frame {n}");
+        }
+    }
+}

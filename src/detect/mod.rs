@@ -3,6 +3,7 @@
 mod binarise;
 mod codes;
 mod components;
+mod corners;
 mod disc;
 mod disc_pairs;
 mod edge_points;
@@ -10,6 +11,7 @@ mod edges;
 mod equations;
 mod family;
 mod features;
+mod flow;
 mod frame;
 mod homography;
 mod noise;
@@ -23,6 +25,7 @@ mod simd;
 mod tag;
 mod tag_edges;
 mod tag_model;
+mod template;
 mod windows;
 
 pub use frame::FrameDetector;
