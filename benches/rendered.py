@@ -155,7 +155,7 @@ def main():
     parser.add_argument("--seeds", type=lambda text: text.split(","), default=["1"])
     parser.add_argument("--folder", type=pathlib.Path, default=pathlib.Path("target/rendered"))
     parser.add_argument("--set", action="append", default=[])
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     listed = options.scenarios or [line.split()[0] for line in run(options.binary, "simulate", "--list").splitlines()]
     line = lambda name, figures: print(f"| {name} | " + " | ".join(map(format, figures, FORMATS)) + " |", flush=True)
     print("| flight | " + " | ".join(COLUMNS) + " |\n|" + "---|" * (len(COLUMNS) + 1))

@@ -33,7 +33,7 @@ impl Core {
         let heading_var = if heading_known { 1.0 } else { UNKNOWN_HEADING.powi(2) };
         let (speed_var, rate_var) = if moving { (9.0, 1.0) } else { (0.0, 0.0) };
         self.state.renew(start, &[900.0, 900.0, heading_var, speed_var, rate_var]);
-        self.fuse_ungated(index, markers);
+        self.fuse_first(index, markers);
         self.state.settle(index);
     }
 
@@ -69,17 +69,21 @@ impl Core {
         };
         self.state.learnt.target_q[index] = self.learning.start.target_q[index];
         self.state.renew(s, &[900.0, 900.0, 1.0, motion[0], motion[1]]);
-        self.fuse_ungated(index, markers);
+        self.fuse_first(index, markers);
         self.state.settle(index);
         true
     }
 
-    fn fuse_ungated(&mut self, index: usize, markers: &[MarkerDetection]) {
+    /// Fuses what a new prior was guessed from: the first marker as it is, the others through the gate, since one that
+    /// was found elsewhere than it is would bend the helicopter's attitude to make the two agree.
+    fn fuse_first(&mut self, index: usize, markers: &[MarkerDetection]) {
+        let mut gated = false;
         for detection in markers {
             if let Some((t, marker)) = self.models.find(detection.marker)
                 && t == index
             {
-                self.fuse_marker(index, marker, detection, false);
+                self.fuse_marker(index, marker, detection, gated);
+                gated = true;
             }
         }
     }

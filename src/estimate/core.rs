@@ -81,6 +81,8 @@ impl Core {
             heading_var: config.compass.heading_noise_deg.to_radians().powi(2),
             marker_factor: vec![1.0; config.target.len()],
             feature_factor: 1.0,
+            gps_factor: 1.0,
+            gps_velocity_factor: 1.0,
             t_target: MonoTime::default(),
         };
         let lag_frames = (e.smoother_lag_ms * 1e-3 * config.camera.fps).ceil() as usize;

@@ -33,6 +33,9 @@ pub(super) struct Learnt {
     /// Factors on the variance of each target's marker pixels, and of ground features.
     pub(super) marker_factor: Vec<f64>,
     pub(super) feature_factor: f64,
+    /// Factors on the variance of the receiver's position and velocity noise.
+    pub(super) gps_factor: f64,
+    pub(super) gps_velocity_factor: f64,
     /// When the targets' intensities were last fitted.
     pub(super) t_target: MonoTime,
 }
@@ -66,6 +69,8 @@ impl Learnt {
         self.heading_var = other.heading_var;
         self.marker_factor.clone_from(&other.marker_factor);
         self.feature_factor = other.feature_factor;
+        self.gps_factor = other.gps_factor;
+        self.gps_velocity_factor = other.gps_velocity_factor;
         self.t_target = other.t_target;
     }
 }
@@ -256,12 +261,17 @@ pub(super) fn blend_noise(
     }
 }
 
+/// Farther outside the gate than this a measurement teaches nothing of the noise of good ones.
+pub(super) const LEARN_RATIO: f64 = 4.0;
+
 /// Moves a factor on a measurement's noise toward what its misfit (one where the noise is right) shows.
-pub(super) fn blend_factor(value: &mut f64, misfit: f64, samples: f64) {
+pub(super) fn blend_factor(value: &mut f64, misfit: f64, samples: f64, limits: (f64, f64)) {
     if misfit.is_finite() {
-        *value = (*value * (1.0 + (misfit - 1.0) / samples)).clamp(FACTORS.0, FACTORS.1);
+        *value = (*value * (1.0 + (misfit - 1.0) / samples)).clamp(limits.0, limits.1);
     }
 }
 
 /// Limits of a factor on the variance of pixels: from a tenth of the sigma assumed to five times as much.
-const FACTORS: (f64, f64) = (0.01, 25.0);
+pub(super) const PIXEL_FACTORS: (f64, f64) = (0.01, 25.0);
+/// Likewise of the receiver's noise. What it filters is not white, so little is made of a small residual.
+pub(super) const GPS_FACTORS: (f64, f64) = (0.25, 25.0);

@@ -9,10 +9,10 @@ use crate::msg::{AttitudeSample, Disposition, FixKind, FusionSource, GnssEpoch};
 use crate::time::MonoTime;
 
 use super::core::Core;
-use super::learn::blend_noise;
+use super::learn::{GPS_FACTORS, LEARN_RATIO, Learnt, blend_factor, blend_noise};
 use super::models::Models;
 use super::state::{Own, Rejections, State, at};
-use super::update::Measurement;
+use super::update::{Measurement, Outcome};
 
 /// What an epoch measures, metres and metres a second in NED.
 struct GnssValues {
@@ -80,6 +80,7 @@ impl Core {
         let delay = z.columns(at::GPS_DELAY, 1);
         let d_attitude = -skew(&arm);
         let d_delay = -velocity + own.acceleration() * tau;
+        let noise_var = models.gps_noise_var * self.state.learnt.gps_factor;
         for i in 0..m {
             z.residual[i] = position[i] - expected[i];
             z.set(i, p + i, 1.0);
@@ -87,7 +88,7 @@ impl Core {
             z.set(i, bias + i, 1.0);
             z.set(i, delay, d_delay[i]);
             set_row(z, i, attitude, &d_attitude);
-            z.noise[i][i] = models.gps_noise_var * if i == 2 { 4.0 } else { 1.0 };
+            z.noise[i][i] = noise_var * if i == 2 { 4.0 } else { 1.0 };
         }
     }
 
@@ -95,6 +96,7 @@ impl Core {
         self.expect_gps_position(position, has_height);
         let error = self.receiver_error();
         let outcome = self.fuse_gated(FusionSource::GpsPosition);
+        self.learn_gps(outcome, |learnt| &mut learnt.gps_factor);
         let rejections = &mut self.state.rejections;
         rejections.gps_position = counted(rejections.gps_position, outcome.ratio);
         let before = std::mem::replace(&mut rejections.gps_error, error);
@@ -128,14 +130,22 @@ impl Core {
             set_row(z, i, rate, &d_rate);
             set_row(z, i, force, &d_force);
             z.set(i, delay, -acceleration[i]);
-            z.noise[i][i] = models.gps_velocity_var;
+            z.noise[i][i] = models.gps_velocity_var * self.state.learnt.gps_velocity_factor;
         }
         let outcome = self.fuse_gated(FusionSource::GpsVelocity);
+        self.learn_gps(outcome, |learnt| &mut learnt.gps_velocity_factor);
         self.state.rejections.gps_velocity = counted(self.state.rejections.gps_velocity, outcome.ratio);
         if self.state.rejections.gps_velocity >= self.restart_after {
             self.state.rejections.gps_velocity = 0;
             self.state.renew(at::VELOCITY, &[4.0; 3]);
             self.state.own.velocity = *velocity;
+        }
+    }
+
+    /// Fits a factor on the receiver's noise to what became of a measurement.
+    fn learn_gps(&mut self, outcome: Outcome, factor: impl Fn(&mut Learnt) -> &mut f64) {
+        if self.learning.on && outcome.ratio < LEARN_RATIO {
+            blend_factor(factor(&mut self.state.learnt), outcome.misfit, GPS_SAMPLES, GPS_FACTORS);
         }
     }
 
@@ -174,7 +184,7 @@ impl Core {
         z.noise[0][0] = self.state.learnt.heading_var;
         let residual = z.residual[0];
         let outcome = self.fuse_gated(FusionSource::CompassHeading);
-        if self.learning.on && outcome.ratio < 4.0 {
+        if self.learning.on && outcome.ratio < LEARN_RATIO {
             let start = self.learning.start.heading_var;
             let gain = SAMPLE_GAIN_S / self.learning.over_s;
             let value = &mut self.state.learnt.heading_var;
@@ -211,7 +221,7 @@ impl Core {
         }
         let residual = [z.residual[0], z.residual[1]];
         let outcome = self.fuse_gated(FusionSource::CompassTilt);
-        if self.learning.on && outcome.ratio < 4.0 {
+        if self.learning.on && outcome.ratio < LEARN_RATIO {
             let start = self.learning.start.tilt_var;
             let gain = 0.5 * SAMPLE_GAIN_S / self.learning.over_s;
             let value = &mut self.state.learnt.tilt_var;
@@ -233,6 +243,9 @@ impl Core {
         }
     }
 }
+
+/// Fixes the fitted noise of the receiver remembers: ten seconds at 5 Hz.
+const GPS_SAMPLES: f64 = 50.0;
 
 /// What one compass reading counts in a sliding mean, s: the interval of a 30 Hz compass.
 const SAMPLE_GAIN_S: f64 = 1.0 / 30.0;

@@ -8,7 +8,7 @@ use crate::msg::{Disposition, FeatureTrack, FrameObservations, FusionSource, Mar
 
 use super::begin::ground_point;
 use super::core::Core;
-use super::learn::blend_factor;
+use super::learn::{LEARN_RATIO, PIXEL_FACTORS, blend_factor};
 use super::models::Models;
 use super::state::{Own, State, Target, at};
 use super::track::{BLINK_S, FRAMES_TO_START};
@@ -164,7 +164,7 @@ impl Core {
             let settled = curvature < LITTLE_CURVATURE * self.z.noise[0][0];
             let outcome = self.fuse_gated(FusionSource::Marker);
             if self.learning.on && settled && outcome.ratio < LEARN_RATIO {
-                blend_factor(&mut self.state.learnt.marker_factor[index], outcome.misfit, MARKER_SAMPLES);
+                blend_factor(&mut self.state.learnt.marker_factor[index], outcome.misfit, MARKER_SAMPLES, PIXEL_FACTORS);
             }
             return outcome.ratio <= 1.0;
         }
@@ -244,7 +244,7 @@ impl Core {
         }
         let outcome = self.fuse_gated(FusionSource::Feature);
         if self.learning.on && curvature < LITTLE_CURVATURE * noise[(0, 0)] && outcome.ratio < LEARN_RATIO {
-            blend_factor(&mut self.state.learnt.feature_factor, outcome.misfit, FEATURE_SAMPLES);
+            blend_factor(&mut self.state.learnt.feature_factor, outcome.misfit, FEATURE_SAMPLES, PIXEL_FACTORS);
         }
         if outcome.ratio > 1.0 {
             self.state.features[slot].rejected += 1;
@@ -259,8 +259,6 @@ impl Core {
 
 /// Noise of pixels is fitted where tilt is known: what the linear model leaves out is this part of it.
 const LITTLE_CURVATURE: f64 = 0.2;
-/// Farther outside the gate than this a measurement teaches nothing of the noise of good ones.
-const LEARN_RATIO: f64 = 4.0;
 /// Sightings the fitted noise remembers: some seconds of one vehicle's tags, of eight features.
 const MARKER_SAMPLES: f64 = 100.0;
 const FEATURE_SAMPLES: f64 = 400.0;
