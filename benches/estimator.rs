@@ -292,31 +292,27 @@ fn bound_pass(world: &World, site: &Site, config: &Config, taken: &Taken) -> Bou
 #[derive(Clone, Copy)]
 struct Figures([f64; 8]);
 
-/// Mean square over runs (plain mean of the NEES and coverage) with the spread over runs.
+/// Mean (or root mean square) over runs, and the spread about it.
+fn mean_and_spread(values: impl Iterator<Item = f64> + Clone, squared: bool) -> (f64, f64) {
+    let n = values.clone().count().max(1) as f64;
+    let mean = if squared {
+        (values.clone().map(|x| x * x).sum::<f64>() / n).sqrt()
+    } else {
+        values.clone().sum::<f64>() / n
+    };
+    (mean, (values.map(|x| (x - mean).powi(2)).sum::<f64>() / n).sqrt())
+}
+
+/// A row of the table: root mean squares of the errors over runs, means of NEES and coverage, with their spread.
 fn summary(runs: &[Figures]) -> String {
-    let n = runs.len() as f64;
     let mut text = String::new();
     for i in 0..8 {
-        let values = runs.iter().map(|f| f.0[i]);
-        let mean = if i < 4 {
-            (values.clone().map(|x| x * x).sum::<f64>() / n).sqrt()
-        } else {
-            values.clone().sum::<f64>() / n
-        };
-        let spread = (values.map(|x| (x - mean).powi(2)).sum::<f64>() / n).sqrt();
+        let (mean, spread) = mean_and_spread(runs.iter().map(|f| f.0[i]), i < 4);
         let cell = if i == 7 { format!("{mean:6.3}") } else { format!("{mean:7.3}±{spread:<6.3}") };
         text += &cell;
         text.push(' ');
     }
     text
-}
-
-/// Mean and spread over runs.
-fn summary_of(values: impl Iterator<Item = f64> + Clone) -> String {
-    let n = values.clone().count().max(1) as f64;
-    let mean = values.clone().sum::<f64>() / n;
-    let spread = (values.map(|x| (x - mean).powi(2)).sum::<f64>() / n).sqrt();
-    format!("{mean:.2}±{spread:.2}")
 }
 
 struct Run {
@@ -478,7 +474,10 @@ fn main() {
         println!("{name:<18} of the bound, in view: {:.3} {:.3} {:.3}", ratio(1), ratio(2), ratio(3));
         let n = results.len() as f64;
         let mean = |pick: fn(&Run) -> f64| results.iter().map(pick).sum::<f64>() / n;
-        let apart = |i: usize| summary_of(results.iter().map(|r| r.apart[i]));
+        let apart = |i: usize| {
+            let (mean, spread) = mean_and_spread(results.iter().map(|r| r.apart[i]), false);
+            format!("{mean:.2}±{spread:.2}")
+        };
         println!("{name:<18} NEES of heading {}, speed {}, yaw rate {}", apart(0), apart(1), apart(2));
         println!(
             "{name:<18} {:.0} us of processor a frame, {} resets, GPS delay error {:.1} ms rms",

@@ -126,7 +126,7 @@ impl State {
             if self.targets[i].held && self.targets[i].last_seen == now {
                 self.learn_rest(learning, i, since_s);
                 for k in 0..2 {
-                    self.learn_target(learning, i, k, since_s / learning.over_s);
+                    self.learn_target(learning, i, k, since_s);
                 }
             }
         }
@@ -138,9 +138,10 @@ impl State {
     /// variance; since then the smoother has moved that value, and knows by how much it should have: `P_f − P_s`,
     /// and more where motion is smooth ([`more_than_found`]). The logarithm of the intensity moves by what the
     /// ratio of the two differs from one, so that the mean ratio over time is one.
-    fn learn_target(&mut self, learning: &Learning, i: usize, k: usize, gain: f64) {
+    fn learn_target(&mut self, learning: &Learning, i: usize, k: usize, since_s: f64) {
         let (column, row) = (self.target_at(i) + 3 + k, at::TARGET * i + 3 + k);
-        let q = self.learnt.target_q[i][k];
+        let start = learning.start.target_q[i][k];
+        let q = self.walk_seen(i, k, start);
         let memory_s = self.cov.at(column, column) / q;
         self.targets[i].memory_s[k] = memory_s;
         let target = &self.targets[i];
@@ -162,11 +163,12 @@ impl State {
         }
         let due = found * (1.0 + more_than_found(memory_s, age_s, frame_s));
         let ratio = (echo.mean[row] - value).powi(2) / due;
-        let start = learning.start.target_q[i][k];
+        let gain = since_s / learning.over_s.max(MEMORIES * memory_s);
         if ratio.is_finite() && ratio > 0.0 {
             // Never beyond what explains this one.
             let grown = q * (gain * (ratio - 1.0)).min(ratio.ln().max(0.0)).exp();
             self.learnt.target_q[i][k] = grown.clamp(start * STILL * STILL, start * MOST * MOST);
+            self.targets[i].fitted_memory_s[k] = memory_s;
         }
     }
 }
@@ -215,6 +217,8 @@ pub(super) const MOVING: f64 = 20.0;
 
 /// How much later than the filter's memory P/q an estimate is compared with what became of it.
 const LAG: f64 = 2.0;
+/// Memories over which it is fitted at the least: what lies closer together tells the same.
+const MEMORIES: f64 = 4.0;
 /// Least share of a variance that must have been found out since.
 const LEAST_TOLD: f64 = 0.2;
 /// Shortest increment looked at, s.

@@ -189,19 +189,31 @@ impl State {
         add_walk(p, s + 2, s + 4, yaw_rate_q, dt);
     }
 
-    /// How target `i` walks at present: as it was learnt to while it is seen. What was learnt is true at the scale
-    /// of the filter's memory T; motion is smoother than a walk, so that over a longer time t out of sight its
-    /// increments grow as `q t²/T`, a walk of intensity `2 q t/T`, until it may do whatever is configured.
+    /// How target `i`'s speed (`k` = 0) or yaw rate (`k` = 1) walks while it is seen: as was learnt, which is true at
+    /// the scale of the memory the filter had then. Where it remembers for longer now (a marker is hidden) and nothing
+    /// is learnt, motion, smoother than a walk, goes farther: its intensity grows as the memory does.
+    pub(super) fn walk_seen(&self, i: usize, k: usize, most: f64) -> f64 {
+        let (target, learnt) = (&self.targets[i], self.learnt.target_q[i][k]);
+        if target.fitted_memory_s[k] <= 0.0 {
+            return learnt;
+        }
+        (learnt * (target.memory_s[k] / target.fitted_memory_s[k]).max(1.0)).min(most).max(learnt)
+    }
+
+    /// How target `i` walks at present. What was learnt is true at the scale of the filter's memory T; motion is
+    /// smoother than a walk, so that over a longer time t out of sight its increments grow as `q t²/T`, a walk of
+    /// intensity `2 q t/T`, until it may do whatever is configured.
     fn present_walks(&self, i: usize, models: &Models) -> [f64; 2] {
         let target = &self.targets[i];
         let away_s = (self.t - target.last_seen).s();
-        let learnt = self.learnt.target_q[i];
-        if away_s < super::track::BLINK_S {
-            return learnt;
-        }
         std::array::from_fn(|k| {
-            let grown = learnt[k] * (2.0 * away_s / target.memory_s[k].max(SHORTEST_S)).max(1.0);
-            grown.min(models.target_walks[k]).max(learnt[k])
+            let most = models.target_walks[k];
+            let seen = self.walk_seen(i, k, most);
+            if away_s < super::track::BLINK_S {
+                return seen;
+            }
+            let grown = seen * (2.0 * away_s / target.memory_s[k].max(SHORTEST_S)).max(1.0);
+            grown.min(most).max(seen)
         })
     }
 

@@ -110,8 +110,10 @@ pub(super) struct Target {
     pub(super) seen: u32,
     /// Sliding mean of the test that it stands still; see `learn_rest`.
     pub(super) motion: f64,
-    /// Over how long its speed's and its yaw rate's increments were last looked at, s.
+    /// Over how long the filter remembers its speed and its yaw rate, s, and did when their walks were last fitted
+    /// (zero where they have not been).
     pub(super) memory_s: [f64; 2],
+    pub(super) fitted_memory_s: [f64; 2],
     /// When the present track was (last) started: nothing ties it to copies from before.
     pub(super) started: MonoTime,
     /// When and where (north, east) it was first seen since it was last unknown.

@@ -35,6 +35,7 @@ pub(super) fn started(mean: [f64; at::TARGET], t: MonoTime) -> Target {
         motion: MOVING,
         placed_anew: false,
         memory_s: [0.0; 2],
+        fitted_memory_s: [0.0; 2],
         started: t,
         first_seen,
     }

@@ -164,7 +164,12 @@ impl Core {
             let settled = curvature < LITTLE_CURVATURE * self.z.noise[0][0];
             let outcome = self.fuse_gated(FusionSource::Marker);
             if self.learning.on && settled && outcome.ratio < LEARN_RATIO {
-                blend_factor(&mut self.state.learnt.marker_factor[index], outcome.misfit, MARKER_SAMPLES, PIXEL_FACTORS);
+                blend_factor(
+                    &mut self.state.learnt.marker_factor[index],
+                    outcome.misfit,
+                    MARKER_SAMPLES,
+                    PIXEL_FACTORS,
+                );
             }
             return outcome.ratio <= 1.0;
         }
@@ -244,7 +249,12 @@ impl Core {
         }
         let outcome = self.fuse_gated(FusionSource::Feature);
         if self.learning.on && curvature < LITTLE_CURVATURE * noise[(0, 0)] && outcome.ratio < LEARN_RATIO {
-            blend_factor(&mut self.state.learnt.feature_factor, outcome.misfit, FEATURE_SAMPLES, PIXEL_FACTORS);
+            blend_factor(
+                &mut self.state.learnt.feature_factor,
+                outcome.misfit,
+                FEATURE_SAMPLES,
+                PIXEL_FACTORS,
+            );
         }
         if outcome.ratio > 1.0 {
             self.state.features[slot].rejected += 1;
