@@ -24,6 +24,8 @@ const MOST_SIGMA_A_LEVEL: f32 = 0.02;
 /// Parts of the frame, across and down; each is to have a feature before any has two.
 const PARTS: (usize, usize) = (4, 3);
 
+const UPRIGHT: [f32; 4] = [1.0, 0.0, 0.0, 1.0];
+
 /// What interpolation leaves, pixels.
 const LEAST_SIGMA: f32 = 0.03;
 
@@ -52,6 +54,10 @@ pub(super) struct FeatureTracker {
     before: Pyramid,
     /// By how much the features found in this frame have moved.
     shifts: Vec<[f32; 2]>,
+    /// And by what their patches have turned; the whole view turns about alike.
+    turns: Vec<[f32; 4]>,
+    /// By what the view turned from frame to frame the last time it was seen to.
+    turn: [f32; 4],
     search: Corners,
     corners: Vec<Corner>,
     simd: Simd,
@@ -71,6 +77,8 @@ impl FeatureTracker {
             pyramid: Pyramid::default(),
             before: Pyramid::default(),
             shifts: Vec::with_capacity(wanted),
+            turns: Vec::with_capacity(wanted),
+            turn: UPRIGHT,
             search: Corners::default(),
             corners: Vec::with_capacity(PARTS.0 * PARTS.1),
             simd: Simd::best(),
@@ -103,17 +111,20 @@ impl FeatureTracker {
 
     fn follow(&mut self, image: ImageView<'_>, occupied: &[Circle]) {
         let flow = Flow { from: &self.before, to: &self.pyramid, image };
-        let (shifts, simd) = (&mut self.shifts, self.simd);
+        let (shifts, turns, turn, simd) = (&mut self.shifts, &mut self.turns, &mut self.turn, self.simd);
         shifts.clear();
+        turns.clear();
         self.tracks.retain_mut(|track| {
             let from = track.warp.at;
             let likely = shifts.iter().chain([&track.shift, &[0.0; 2]]);
-            let guess = Warp { at: flow.carry(from, likely.copied()), ..track.warp };
+            let guess = track.warp.moved(flow.carry(from, likely.copied()), turn);
             let Some(found) = track.template.find(image, guess, simd) else { return false };
             let brighter = found.gain / track.gain;
             if found.correlation < LEAST_CORRELATION || brighter.max(1.0 / brighter) > MOST_GAIN {
                 return false;
             }
+            turns.extend(found.warp.turn_since(&track.warp));
+            *turn = middle(turns);
             (track.warp, track.gain, track.sigma) = (found.warp, found.gain, found.sigma);
             track.shift = [track.warp.at[0] - from[0], track.warp.at[1] - from[1]];
             shifts.push(track.shift);
@@ -157,6 +168,16 @@ impl FeatureTracker {
             }
         }
     }
+}
+
+/// The median of each element.
+fn middle(turns: &[[f32; 4]]) -> [f32; 4] {
+    std::array::from_fn(|k| {
+        // The element that half of the others lie on either side of; of two middle ones the lower.
+        let below = |x: f32| turns.iter().filter(|t| t[k] < x).count();
+        let rank = |x: f32| below(x).abs_diff(turns.len() / 2);
+        turns.iter().map(|t| t[k]).min_by_key(|x| rank(*x)).unwrap_or(UPRIGHT[k])
+    })
 }
 
 fn free(at: [f32; 2], occupied: &[Circle]) -> bool {

@@ -17,7 +17,13 @@ const AREA: usize = (SIDE * SIDE).div_ceil(LANES) * LANES;
 const WIDE: usize = SIDE + 2;
 /// Parameters of the warp: shift, then the matrix row by row.
 const PARAMETERS: usize = 6;
+/// Pixels on a side of a block, and blocks on a side of the patch.
+const BLOCK: usize = 5;
+const BLOCKS: usize = SIDE / BLOCK;
 const STEPS: usize = 12;
+/// Weight of the matrix foretold: what residuals of four grey levels are to a hundredth of its elements. A disc says
+/// nothing of its turning, a corner little of its scale.
+const FORETOLD: f32 = 4.0 * 4.0 * 1e4;
 /// Farthest a patch may be from where it was guessed, pixels.
 const FARTHEST: f32 = 3.0;
 
@@ -35,6 +41,20 @@ impl Warp {
     /// Neither turned nor scaled.
     pub fn upright(at: [f32; 2]) -> Self {
         Self { at, matrix: [1.0, 0.0, 0.0, 1.0] }
+    }
+
+    /// The same at another place, its matrix turned, scaled and slanted by `turn` (row by row) besides.
+    pub fn moved(&self, at: [f32; 2], turn: &[f32; 4]) -> Self {
+        let ([a, b, c, d], [ta, tb, tc, td]) = (self.matrix, *turn);
+        Self { at, matrix: [ta * a + tb * c, ta * b + tb * d, tc * a + td * c, tc * b + td * d] }
+    }
+
+    /// What turned the matrix of an earlier warp into that of this: `self before⁻¹`.
+    pub fn turn_since(&self, before: &Self) -> Option<[f32; 4]> {
+        let [a, b, c, d] = self.matrix;
+        let [oa, ob, oc, od] = before.matrix;
+        let turn = Matrix2::new(a, b, c, d) * Matrix2::new(oa, ob, oc, od).try_inverse()?;
+        Some([turn[(0, 0)], turn[(0, 1)], turn[(1, 0)], turn[(1, 1)]])
     }
 
     /// Whether the whole patch lies inside an image.
@@ -57,6 +77,14 @@ impl Warp {
         (0.3..3.0).contains(&determinant) && squares < 2.6 * determinant
     }
 
+    /// By what its matrix differs from another's, in the patch's coordinates: `other⁻¹ self − 1`.
+    fn apart(&self, other: &Self) -> Option<[f32; 4]> {
+        let [a, b, c, d] = self.matrix;
+        let [oa, ob, oc, od] = other.matrix;
+        let apart = Matrix2::new(oa, ob, oc, od).try_inverse()? * Matrix2::new(a, b, c, d);
+        Some([apart[(0, 0)] - 1.0, apart[(0, 1)], apart[(1, 0)], apart[(1, 1)] - 1.0])
+    }
+
     /// `self ∘ (x ↦ (1 + D) x + d)⁻¹`
     fn less(&self, step: &SVector<f32, PARAMETERS>) -> Option<Self> {
         let inverse = Matrix2::new(1.0 + step[2], step[3], step[4], 1.0 + step[5]).try_inverse()?;
@@ -77,7 +105,7 @@ pub(super) struct Found {
     pub correlation: f32,
     /// Its contrast over that of the patch looked for.
     pub gain: f32,
-    /// One sigma of the place along its worse axis as far as what is left unexplained tells, pixels.
+    /// One sigma of the place along its worse axis, pixels.
     pub sigma: f32,
 }
 
@@ -89,7 +117,10 @@ pub(super) struct Template {
     power: f32,
     /// Grey levels' derivatives by the parameters, less what gain and offset of the light explain.
     steepest: [Patch; PARAMETERS],
+    /// `(Σ sᵀ s + Λ)⁻¹` with the steepest descent s and the weight Λ of what is foretold of the matrix.
     inverse: SMatrix<f32, PARAMETERS, PARAMETERS>,
+    /// By how much a residual moves the place found along u and along v, pixels a grey level.
+    influence: [Patch; 2],
     /// Larger variance of the place for residuals of variance one.
     spread: f32,
 }
@@ -134,11 +165,23 @@ impl Template {
         let hessian = SMatrix::<f64, PARAMETERS, PARAMETERS>::from_fn(|i, j| {
             f64::from(dot(&steepest[i], &steepest[j]))
         });
-        let inverse = hessian.cholesky()?.inverse();
-        let place = inverse.fixed_view::<2, 2>(0, 0).into_owned();
+        let place = hessian.cholesky()?.inverse().fixed_view::<2, 2>(0, 0).into_owned();
+        let foretold =
+            SVector::<f64, PARAMETERS>::from_fn(|i, _| if i < 2 { 0.0 } else { f64::from(FORETOLD) });
+        let inverse = (hessian + SMatrix::from_diagonal(&foretold)).cholesky()?.inverse();
         let spread = place.symmetric_eigenvalues().max() as f32;
-        (spread.is_finite() && spread > 0.0)
-            .then(|| (Self { grey, power, steepest, inverse: inverse.cast(), spread }, warp))
+        if !(spread.is_finite() && spread > 0.0) {
+            return None;
+        }
+        let inverse: SMatrix<f32, PARAMETERS, PARAMETERS> = inverse.cast();
+        let mut influence = [[0.0; AREA]; 2];
+        for (axis, influence) in influence.iter_mut().enumerate() {
+            for (k, steepest) in steepest.iter().enumerate() {
+                let weight = inverse[(axis, k)];
+                influence.iter_mut().zip(steepest).for_each(|(w, s)| *w += weight * s);
+            }
+        }
+        Some((Self { grey, power, steepest, inverse, influence, spread }, warp))
     }
 
     /// Sigma of the place where pixels have noise of one grey level, pixels.
@@ -146,7 +189,7 @@ impl Template {
         self.spread.sqrt()
     }
 
-    /// The patch near a guess; `None` where it runs away or out of the image.
+    /// The patch near a guess, whose matrix counts as foretold; `None` where it runs away or out of the image.
     pub fn find(&self, image: ImageView<'_>, guess: Warp, simd: Simd) -> Option<Found> {
         let mut warp = guess;
         let mut seen = [0.0; AREA];
@@ -159,7 +202,11 @@ impl Template {
             if !(gain > 0.05) {
                 return None;
             }
-            let pull = SVector::<f32, PARAMETERS>::from_fn(|i, _| dot(&self.steepest[i], &seen) / gain);
+            let astray = warp.apart(&guess)?;
+            let pull = SVector::<f32, PARAMETERS>::from_fn(|i, _| {
+                let foretold = i.checked_sub(2).map_or(0.0, |i| FORETOLD * astray[i]);
+                dot(&self.steepest[i], &seen) / gain + foretold
+            });
             let step = self.inverse * pull;
             warp = warp.less(&step)?;
             let far = (warp.at[0] - guess.at[0]).abs().max((warp.at[1] - guess.at[1]).abs());
@@ -178,9 +225,30 @@ impl Template {
         let (cross, power) = (dot(&seen, &self.grey), dot(&seen, &seen));
         let correlation = cross / (power * self.power).sqrt().max(1e-6);
         let gain = cross / self.power;
-        let left = (power - gain * cross).max(0.0) / (SIDE * SIDE - PARAMETERS - 2) as f32;
-        let sigma = (left * self.spread).sqrt() / gain;
+        let sigma = self.sigma(&seen, gain);
         Some(Found { warp, correlation, gain, sigma })
+    }
+
+    /// One sigma of the place along its worse axis, from what is left unexplained. Pixels near each other are wrong
+    /// together (blur is another one, the ground is not flat), so what whole blocks of them pull the place by counts,
+    /// as often as it occurs: `Σ (Σ w e)²`, the inner sum over a block, with the influence w of a residual e.
+    fn sigma(&self, seen: &Patch, gain: f32) -> f32 {
+        let mut pulls = [[0.0f32; BLOCKS * BLOCKS]; 2];
+        for i in 0..SIDE * SIDE {
+            let residual = seen[i] / gain - self.grey[i];
+            let block = i / SIDE / BLOCK * BLOCKS + i % SIDE / BLOCK;
+            for (pulls, influence) in pulls.iter_mut().zip(&self.influence) {
+                pulls[block] += influence[i] * residual;
+            }
+        }
+        let product = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
+        let (uu, vv, uv) =
+            (product(&pulls[0], &pulls[0]), product(&pulls[1], &pulls[1]), product(&pulls[0], &pulls[1]));
+        let half = 0.5 * (uu + vv);
+        let most = half + (half * half - (uu * vv - uv * uv)).max(0.0).sqrt();
+        // The fit has taken its share of them.
+        let share = (BLOCKS * BLOCKS) as f32 / (BLOCKS * BLOCKS - PARAMETERS) as f32;
+        (share * most).sqrt()
     }
 }
 
