@@ -308,7 +308,12 @@ fn summary(runs: &[Figures]) -> String {
     let mut text = String::new();
     for i in 0..8 {
         let (mean, spread) = mean_and_spread(runs.iter().map(|f| f.0[i]), i < 4);
-        let cell = if i == 7 { format!("{mean:6.3}") } else { format!("{mean:7.3}±{spread:<6.3}") };
+        let cell = match i {
+            // An estimator without a covariance has no NEES.
+            4..7 if mean == 0.0 => format!("{:>7} {:6}", "–", ""),
+            7 => format!("{mean:6.3}"),
+            _ => format!("{mean:7.3}±{spread:<6.3}"),
+        };
         text += &cell;
         text.push(' ');
     }
