@@ -192,7 +192,7 @@ mod tests {
     use super::*;
     use crate::msg::GrayImage;
 
-    const SIZE: (usize, usize) = (480, 400);
+    const SIZE: (usize, usize) = (400, 320);
 
     /// A view of ground without end, of waves of many lengths and directions: `frame = view · ground`.
     fn frame(view: &Similarity2<f64>, light: f64) -> GrayImage {
@@ -200,20 +200,20 @@ mod tests {
         let mut image = GrayImage::new(SIZE.0, SIZE.1);
         for (i, level) in image.data.iter_mut().enumerate() {
             let at = back * nalgebra::Point2::new((i % SIZE.0) as f64, (i / SIZE.0) as f64);
-            let waves = (0..24).map(|k| {
+            let waves = (0..12).map(|k| {
                 let k = f64::from(k);
                 let (s, c) = (2.4 * k).sin_cos();
-                let length = 5.0 * 1.17_f64.powf(k);
+                let length = 5.0 * 1.37_f64.powf(k);
                 (std::f64::consts::TAU * (c * at.x + s * at.y) / length + k * k).sin()
             });
-            *level = (light * (110.0 + 16.0 * waves.sum::<f64>())).clamp(0.0, 255.0) as u8;
+            *level = (light * (110.0 + 20.0 * waves.sum::<f64>())).clamp(0.0, 255.0) as u8;
         }
         image
     }
 
     /// Helicopter that drifts, turns and sinks: the picture moves 6 px, turns 2° and grows 1 % a frame.
     fn view(n: i32) -> Similarity2<f64> {
-        let middle = nalgebra::Translation2::new(240.0, 200.0);
+        let middle = nalgebra::Translation2::new(200.0, 160.0);
         let turned = Rotation2::new(f64::from(2 * n).to_radians());
         let grown = Similarity2::from_parts(
             nalgebra::Translation2::identity(),
@@ -265,7 +265,7 @@ mod tests {
     #[test]
     fn occupied_places_are_kept_clear() {
         let mut tracker = FeatureTracker::new(8);
-        let circle = (Vector2::new(240.0, 200.0), 120.0);
+        let circle = (Vector2::new(200.0, 160.0), 100.0);
         for n in 0..4 {
             let mut out = Vec::new();
             tracker.process(frame(&view(n), 1.0).view(), &[circle], &mut out);
