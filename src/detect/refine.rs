@@ -104,12 +104,13 @@ impl Refiner {
         let (pitches, blurs) = (model.pitches(family.width), windows.blurs_squared());
         let seen = self.count() as f64 / self.edges.count() as f64;
         let mistaken = if seen < ENOUGH_SEEN && cell < WIDEST_CELL { MISTAKEN } else { 0.0 };
-        let neighbours = [0, 1].map(|k| {
+        let common = [0, 1].map(|k| {
             let pitch = pitches[k];
-            let left = (NEIGHBOURS * blurs[k] / pitch.powi(3)).hypot(SHIFT_ERROR * model.shift(k));
-            left.min(0.2 * pitch).hypot(mistaken * pitch)
+            let left =
+                (NEIGHBOURS * blurs[k] / pitch.powi(3)).powi(2) + (SHIFT_ERROR * model.shift(k)).powi(2);
+            left.min((0.2 * pitch).powi(2)) + (mistaken * pitch).powi(2)
         });
-        let refined = model.result(&covariance, neighbours)?;
+        let refined = model.result(&covariance, common)?;
         let moved = (0..4).map(|i| {
             (refined.corners[i] - Vector2::new(f64::from(corners[i][0]), f64::from(corners[i][1]))).norm()
         });

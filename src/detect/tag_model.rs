@@ -102,11 +102,12 @@ impl Model {
         self.theta[PARAMETERS - 2 + axis]
     }
 
-    /// Corners and centre with their covariances; `neighbours` are errors common to all edges along ξ and η.
-    pub fn result(&self, covariance: &Information, neighbours: [f64; 2]) -> Option<Refined> {
+    /// Corners and centre with their covariances; `common` are variances that all edges crossed along ξ and all those
+    /// along η share, px².
+    pub fn result(&self, covariance: &Information, common: [f64; 2]) -> Option<Refined> {
         let axes = self.sides.map(|s| s / s.norm().max(1e-9));
-        let common = (0..2).map(|i| axes[i] * axes[i].transpose() * neighbours[i].powi(2));
-        let floor = common.fold(Matrix2::identity() * FLOOR_PX.powi(2), |sum, c| sum + c);
+        let shared = (0..2).map(|i| axes[i] * axes[i].transpose() * common[i]);
+        let floor = shared.fold(Matrix2::identity() * FLOOR_PX.powi(2), |sum, c| sum + c);
         let at = |xi: f64, eta: f64| {
             let (p, jacobian) = self.at(xi, eta);
             (p + self.origin, jacobian * covariance * jacobian.transpose() + floor)
