@@ -57,7 +57,8 @@ impl<F: Fn([f32; 2]) -> bool> Kernel for Search<'_, F> {
         let (u, v, w, h) = self.part;
         let margin = REACH + 1;
         let (u0, v0) = (u.max(margin), v.max(margin));
-        let (u1, v1) = ((u + w).min(image.width - margin), (v + h).min(image.height - margin));
+        let (right, bottom) = (image.width.saturating_sub(margin), image.height.saturating_sub(margin));
+        let (u1, v1) = ((u + w).min(right), (v + h).min(bottom));
         if u0 >= u1 || v0 >= v1 {
             return;
         }
