@@ -21,7 +21,9 @@ within() {
 [ "$(id -u)" = 0 ] || skip "nothing was flown: making the image takes root"
 command -v apt-get >/dev/null || skip "nothing was flown: the image is made of Debian's packages"
 within make hil-tools && within sh hil/base.sh target/hil || skip "nothing was flown: Debian's packages are not to be had"
-set -- hil SCENARIOS="cold_boot unplug landing"
+# What feeds the machine is there from the tests.
+within cargo build --locked --example hil_feed --example hil_frames --example hil_stream
+set -- hil SCENARIOS="cold_boot unplug landing" PARTS="--bin windhover" TOOLS=target/debug/examples
 within make "$@" && exit 0
 echo "hil-short: FAILED once; flown once more on a new machine"
 within make "$@"
