@@ -1,5 +1,5 @@
 //! Where in the image the edges between a decoded tag's cells are, along their normals, and what the tag's
-//! parameters do there; in single precision and eight side by side, for there are many.
+//! parameters do there; in single precision and side by side, for there are many.
 
 use super::quad::Point;
 use super::simd::Kernel;

@@ -154,8 +154,8 @@ impl FeatureTracker {
                 break;
             }
             let Some((template, warp)) = Template::new(image, at, self.simd) else { continue };
-            if template.sigma_a_level() < MOST_SIGMA_A_LEVEL && free(warp.at, occupied) {
-                let sigma = template.sigma_a_level();
+            let sigma = template.sigma_a_level();
+            if sigma < MOST_SIGMA_A_LEVEL && free(warp.at, occupied) {
                 self.tracks.push(Track {
                     id: self.next_id,
                     warp,

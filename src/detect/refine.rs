@@ -7,9 +7,10 @@
 //! `κ |P|² P`; to third order about a tag's middle what is no homography is `κ |q|² (P + q)`, and as lengths shrink
 //! more along P than across, |q|² of the image has a part besides that of the tag: the twist d, which with H and c
 //! makes up every quadratic. a and b are half the tag's sides in the image over their mean length, so that the bow c
-//! and the barrel k change nothing at a square's corners; all are held near nought by what a wide lens does. Beside a cell that is one wide, blur lets an edge appear nearer the other cell; by how much is one more
-//! unknown for edges along ξ and one for those along η. Gauss–Newton on distances along edge normals, each weighed
-//! by how well its edge is placed, Cauchy's weights on top.
+//! and the barrel k change nothing at a square's corners; all are held near nought by what a wide lens does. Beside a
+//! cell that is one wide, blur lets an edge appear nearer the other cell; by how much is one more unknown for edges
+//! along ξ and one for those along η. Gauss–Newton on distances along edge normals, each weighed by how well its edge
+//! is placed, Cauchy's weights on top.
 
 use nalgebra::{Cholesky, Const, Vector2};
 
@@ -229,9 +230,9 @@ impl Refiner {
     }
 
     fn solve(&mut self, model: &Model, held: [f64; HELD], spread: f64) -> Option<Solved> {
+        let count = self.count() as f64;
         let sums = &mut self.equations;
         self.simd.run(Accumulate { located: &self.located, spread: spread as f32, to: sums });
-        let count = self.located.iter().map(|l| l.count).sum::<usize>() as f64;
         let variance = sums.squares() / (count - 8.0);
         let mut information = sums.matrix();
         let mut right = sums.right();
@@ -248,8 +249,8 @@ impl Refiner {
 
     /// Covariance of the parameters: of M-estimates, with errors that are alike within a block. How much more
     /// they err together than each by itself is one number, from the blocks' pulls `g` on the parameters:
-    /// `λ = Σ gᵀ A⁻¹ g / p`, p being how many parameters the image tells, which counts noise and whatever else the model leaves over; the covariance is
-    /// `λ A⁻¹ / ρ²`, ρ being how much Cauchy's weights flatten the residuals.
+    /// `λ = Σ gᵀ A⁻¹ g / p`, p being how many parameters the image tells, which counts noise and whatever else the
+    /// model leaves over; the covariance is `λ A⁻¹ / ρ²`, ρ being how much Cauchy's weights flatten the residuals.
     fn covariance(&self, solved: &Solved, spread: f64) -> Option<Information> {
         let mut pulls = [[0.0f32; PARAMETERS]; MOST_BLOCKS];
         for l in &self.located {
