@@ -3,9 +3,13 @@
 //! `make load`, or `cargo run --release --example daemon_load -- [--seconds S] [--dir DIR]`
 //!
 //! Simulates a flight once (raw grey, 1280×1024, 30 frames/s), plays it over and over into
-//! `windhover run` - frames from memory of the file system, serial lines over pseudo-terminals - with
-//! recording on, and prints exposure to estimate, processor time by task, memory and losses. The flight
-//! hovers over a parked vehicle, so that its end fits its beginning; only the receiver's time jumps back.
+//! `windhover run` - frames from memory, serial lines over pseudo-terminals - with recording on, and prints
+//! exposure to estimate, processor time by task, memory and losses. The flight hovers over a parked vehicle, so
+//! that its end fits its beginning; only the receiver's time jumps back.
+//!
+//! It runs as the unit runs it: that environment, and that niceness where root asks for it. A bystander that
+//! only sleeps and looks at the clock tells how long the machine itself stood still: a frame that is late while
+//! it slept on is not the daemon's.
 
 use std::fs::{self, File};
 use std::io::Write;
@@ -36,6 +40,9 @@ struct Args {
     /// Where flight, frames, card and log go
     #[arg(long, default_value = "target/load")]
     dir: PathBuf,
+    /// Where the frames are played from: a file system in memory, so that no disk makes them late
+    #[arg(long, default_value = "/dev/shm")]
+    frames_in: PathBuf,
     /// The daemon
     #[arg(long, default_value = "target/release/windhover")]
     windhover: PathBuf,
@@ -53,35 +60,47 @@ fn main() -> Result<()> {
     if !flight.exists() {
         simulate(&args, &flight)?;
     }
-    let bytes = unpack(&flight, &dir.join("camera"))?;
+    let camera = tempfile::tempdir_in(&args.frames_in)?;
+    let bytes = unpack(&flight, camera.path())?;
     let card = dir.join("card");
     let _ = fs::remove_dir_all(&card);
     fs::create_dir(&card)?;
     let (gps, compass) = (line()?, line()?);
     let config = dir.join("windhover.toml");
-    fs::write(&config, configuration(&flight, &dir, &gps.1, &compass.1)?)?;
+    fs::write(&config, configuration(&flight, &dir, camera.path(), [&gps.1, &compass.1])?)?;
 
     let log = dir.join("log");
-    let mut daemon = Command::new(&args.windhover)
+    // `nice` becomes the daemon; without the right to lower it, it says so and runs as it is.
+    let mut daemon = Command::new("nice")
+        .args(["-n", of_unit("Nice=").next().unwrap_or("0")])
+        .arg(&args.windhover)
         .args(["run", "--config"])
         .arg(&config)
-        .envs(environment())
+        .envs(of_unit("Environment=").filter_map(|line| line.split_once('=')))
         .stdin(Stdio::null())
         .stderr(File::create(&log)?)
         .spawn()?;
     let feeder = Feeder::start(bytes, args.flight_s, gps.0, compass.0);
+    let bystander = Bystander::start();
     let memory = watch(&mut daemon, args.seconds)?;
     let tasks = tasks(daemon.id())?;
     kill_process(Pid::from_raw(daemon.id().cast_signed()).ok_or("no process")?, Signal::TERM)?;
     daemon.wait()?;
     feeder.stop();
-    report(&fs::read_to_string(&log)?, args.seconds, &memory, &tasks)
+    report(&fs::read_to_string(&log)?, args.seconds, &memory, &tasks)?;
+    let late = bystander.stop();
+    println!(
+        "a bystander that sleeps 5 ms at a time woke late by {:.1} ms at most; by 20 ms or more {} times",
+        late.iter().fold(0.0, |most: f64, ms| most.max(*ms)),
+        late.len()
+    );
+    Ok(())
 }
 
-/// What the unit puts into the daemon's environment.
-fn environment() -> impl Iterator<Item = (&'static str, &'static str)> {
+/// What the unit sets under this name, a line each.
+fn of_unit(name: &str) -> impl Iterator<Item = &'static str> {
     let unit = include_str!("../systemd/windhover.service");
-    unit.lines().filter_map(|line| line.strip_prefix("Environment=")?.split_once('='))
+    unit.lines().filter_map(move |line| line.strip_prefix(name))
 }
 
 fn simulate(args: &Args, flight: &Path) -> Result<()> {
@@ -106,7 +125,6 @@ type Bytes = Vec<(Span, bool, Vec<u8>)>;
 
 /// Puts the frames into a folder that the recorded camera plays; the bytes of both lines.
 fn unpack(flight: &Path, camera: &Path) -> Result<Bytes> {
-    fs::create_dir_all(camera)?;
     let (mut list, mut bytes, mut first) = ("time_s,file\n".to_owned(), Vec::new(), None);
     for event in CaptureReader::open(flight)?.filter_map(|item| item.event) {
         let since = event.t_recv - *first.get_or_insert(event.t_recv);
@@ -135,11 +153,11 @@ fn line() -> Result<(File, String)> {
     Ok((File::from(far), near))
 }
 
-fn configuration(flight: &Path, dir: &Path, gps: &str, compass: &str) -> Result<String> {
+fn configuration(flight: &Path, dir: &Path, camera: &Path, lines: [&str; 2]) -> Result<String> {
     let mut config = config_of(flight)?;
-    config.gps.device = gps.into();
-    config.compass.device = compass.into();
-    config.camera.device = format!("capture-loop:{}", dir.join("camera").display());
+    config.gps.device = lines[0].into();
+    config.compass.device = lines[1].into();
+    config.camera.device = format!("capture-loop:{}", camera.display());
     config.store.enabled = true;
     config.store.path = dir.join("card").display().to_string();
     config.store.require_mount = false;
@@ -177,6 +195,35 @@ impl Feeder {
     fn stop(self) {
         self.stop.store(true, Ordering::Release);
         let _ = self.thread.join();
+    }
+}
+
+/// Sleeps and looks at the clock: how long the machine itself kept a thread waiting.
+struct Bystander {
+    stop: Arc<AtomicBool>,
+    thread: JoinHandle<Vec<f64>>,
+}
+
+impl Bystander {
+    fn start() -> Self {
+        let stop = Arc::new(AtomicBool::new(false));
+        let asked = Arc::clone(&stop);
+        let thread = std::thread::spawn(move || {
+            let (nap, mut late) = (Duration::from_millis(5), Vec::new());
+            while !asked.load(Ordering::Acquire) {
+                let began = Instant::now();
+                std::thread::sleep(nap);
+                late.extend(Some((began.elapsed() - nap).as_secs_f64() * 1e3).filter(|ms| *ms >= 20.0));
+            }
+            late
+        });
+        Self { stop, thread }
+    }
+
+    /// By how much it woke late, milliseconds, where that was 20 or more.
+    fn stop(self) -> Vec<f64> {
+        self.stop.store(true, Ordering::Release);
+        self.thread.join().unwrap_or_default()
     }
 }
 

@@ -78,7 +78,10 @@ pub fn pulses(config: &Config, around: &Surroundings, heart: &Heart) {
     let tell = |report| {
         heart.beat();
         match report {
-            Report::Up(text) => around.log.tell(Event::DeviceUp, "pps", text),
+            Report::Up(text) => {
+                around.log.is_over(Event::DeviceDown, "pps");
+                around.log.tell(Event::DeviceUp, "pps", text);
+            }
             Report::Down(fault) => around.log.tell(Event::DeviceDown, "pps", fault.to_string()),
             _ => {}
         }
@@ -108,6 +111,7 @@ impl<'a> Told<'a> {
             Report::Up(text) => {
                 self.around.presence.set(self.part, PartState::Open);
                 self.put(EventBody::SourceUp(self.source));
+                self.around.log.is_over(Event::DeviceDown, name);
                 self.around.log.tell(Event::DeviceUp, name, text);
             }
             Report::Bytes(t, bytes) => {
@@ -148,7 +152,8 @@ impl<'a> Told<'a> {
             self.put(EventBody::SourceDown(self.source));
         }
         let name = self.part.name();
-        // The same fault again and again is one line in half a minute; another fault shows at once.
+        // The same fault again and again is one line in half a minute, until the device comes up; another fault
+        // shows at once.
         let key = format!("{name} {}", fault.kind.name());
         self.around.log.tell_keyed(self.around.clock.now(), Event::DeviceDown, key, |line| {
             line.says(fault.to_string()).with("about", name).with("fault", fault.kind.name())

@@ -12,6 +12,12 @@ use crate::time::{MonoTime, Span};
 /// behind than this does not answer, and the watchdog has it started again.
 const READS: usize = 8192;
 
+/// Frames that wait at most while a pipeline catches up, and for how long it may. A computer that stood still
+/// for some hundred milliseconds (a disk, another program) delivers everything at once afterwards, and the pipeline
+/// has handled it moments later. A queue that is not emptied within this time is not a burst.
+const BURST: usize = 16;
+const CATCH_UP: Span = Span::from_ns(500_000_000);
+
 /// What devices delivered and the pipeline has not yet taken.
 ///
 /// Events leave it in the order they were heard, numbered, and with times that never go back: what
@@ -20,6 +26,9 @@ const READS: usize = 8192;
 /// A pipeline that is busy with a frame finds the newest ones when it comes back. From then on the oldest of
 /// these stays: were it replaced while the reads before it are handled, a pipeline that is behind on reads
 /// would never see a frame.
+///
+/// Frames that come in a burst are all kept. Only a pipeline that does not catch up loses the oldest: then no more
+/// wait than the queue is set to hold, so that estimates are of what is seen now.
 #[derive(Debug)]
 pub struct Inbox {
     lanes: Mutex<Lanes>,
@@ -35,6 +44,8 @@ struct Lanes {
     pinned: bool,
     /// Whether lost frames were told since the last frame.
     told: bool,
+    /// Since when more frames wait than the queue is set to hold; until all are taken.
+    crowded: Option<MonoTime>,
     dropped: [u32; 3],
     last: Option<MonoTime>,
     next_seq: u64,
@@ -52,7 +63,7 @@ fn slot(source: Source) -> usize {
 }
 
 impl Inbox {
-    /// An inbox that holds so many frames.
+    /// An inbox where so many frames wait for a pipeline that is behind.
     pub fn new(frames: usize) -> Self {
         Self { lanes: Mutex::default(), filled: Condvar::new(), frames: frames.max(1) }
     }
@@ -76,9 +87,13 @@ impl Inbox {
         let mut lanes = self.lock();
         lanes.frames.push_back((t_recv, frame));
         if lanes.frames.len() > self.frames {
-            let goes = usize::from(lanes.pinned);
-            lanes.frames.remove(goes);
-            lanes.dropped[slot(Source::Camera)] += 1;
+            let since = *lanes.crowded.get_or_insert(t_recv);
+            let most = if t_recv - since < CATCH_UP { self.frames.max(BURST) } else { self.frames };
+            while lanes.frames.len() > most {
+                let goes = usize::from(lanes.pinned);
+                lanes.frames.remove(goes);
+                lanes.dropped[slot(Source::Camera)] += 1;
+            }
         }
         drop(lanes);
         self.filled.notify_one();
@@ -135,6 +150,9 @@ impl Lanes {
         if frame_is_next {
             let (t, frame) = self.frames.pop_front()?;
             (self.pinned, self.told) = (false, false);
+            if self.frames.is_empty() {
+                self.crowded = None;
+            }
             let payload = self.payload(frame);
             return Some(self.number(t, EventBody::Frame(payload)));
         }
@@ -209,9 +227,43 @@ mod tests {
     }
 
     #[test]
-    fn the_newest_frames_win_and_the_loss_is_told() {
+    fn a_burst_is_kept() {
         let inbox = Inbox::new(2);
-        for ms in [10, 20, 30, 40, 50] {
+        for round in [0, 400, 1000, 5000] {
+            // Given a computer that stood still, which delivers everything at once.
+            for n in 0..BURST as i64 {
+                inbox.put_frame(at(round + n), frame(round + n));
+            }
+            // Then all of it is there, in order.
+            let events = drain(&inbox);
+            assert_eq!(events.len(), BURST);
+            assert!(events.iter().all(|e| matches!(e.body, EventBody::Frame(_))), "{events:?}");
+        }
+    }
+
+    #[test]
+    fn a_pipeline_that_is_too_slow_handles_new_frames() {
+        // Given a pipeline that takes two frames of three, for ten seconds.
+        let inbox = Inbox::new(3);
+        let mut ages = Vec::new();
+        for n in 0..300 {
+            inbox.put_frame(at(n * 33), frame(n * 33));
+            if n % 3 != 0 {
+                let taken = std::iter::from_fn(|| inbox.take(Duration::ZERO));
+                let newest = taken.take(2).find(|e| matches!(e.body, EventBody::Frame(_)));
+                ages.extend(newest.map(|e| n * 33 - e.t_recv.ns() / 1_000_000));
+            }
+        }
+        // Then no frame is older than a queue of three, once it is clear that this is no burst.
+        let late = ages[60..].iter().max().copied();
+        assert!(late <= Some(100), "{ages:?}");
+    }
+
+    #[test]
+    fn the_newest_frames_win_and_the_loss_is_told() {
+        // Given frames that nobody takes for longer than a burst lasts.
+        let inbox = Inbox::new(2);
+        for ms in [10, 20, 30, 40, 600] {
             inbox.put_frame(at(ms), frame(ms));
         }
         let events = drain(&inbox);
@@ -227,7 +279,7 @@ mod tests {
                 _ => None,
             })
             .collect();
-        assert_eq!(kept, [(0, 40), (1, 50)]);
+        assert_eq!(kept, [(0, 40), (1, 600)]);
     }
 
     #[test]

@@ -9,7 +9,7 @@
 //!
 //! | channel | holds | when full |
 //! |---|---|---|
-//! | inbox, frames | `daemon.frame_queue` frames | the oldest but the next one is dropped and recorded as dropped |
+//! | inbox, frames | `daemon.frame_queue` frames, 16 in a burst of half a second | the oldest but the next one is dropped and recorded as dropped |
 //! | inbox, reads | 8192 reads of the lines | the oldest is dropped and recorded as dropped |
 //! | store | see `io::store` | what does not fit is dropped and counted; the pipeline never waits |
 //! | link | see `io::link` | the oldest estimate goes first; what was missed is sent later |

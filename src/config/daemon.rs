@@ -10,8 +10,9 @@ pub struct DaemonConfig {
     pub optional: Vec<Part>,
     /// Longest a task may go without answering before the watchdog is no longer stroked, seconds.
     pub answer_within_s: f64,
-    /// Frames that wait for the pipeline; when one more comes, the oldest is dropped and recorded as
-    /// dropped. More frames mean more latency under load, never more throughput.
+    /// Frames that wait for a pipeline that does not catch up; when one more comes, the oldest is dropped and
+    /// recorded as dropped. More frames mean more latency under load, never more throughput. (A burst of up
+    /// to 16 frames that is handled within half a second loses none.)
     pub frame_queue: usize,
 }
 

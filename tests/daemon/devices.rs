@@ -32,10 +32,11 @@ fn a_receiver_is_configured_and_its_answers_are_checked() {
     let (line, seen) = daemon.wait_from(seen, &["event=receiver_not_configured", "about=gps"]);
     assert!(line.contains("PGRMC1") && line.contains("other values"), "{line}");
 
-    // When one is plugged in that does not answer, then that is told too, and what it sends is used.
+    // When one is plugged in that does not answer, then that is told too, moments after the last time, and what it
+    // sends is used.
     drop(receiver);
     gps.unplug();
-    let (_, seen) = daemon.wait_from(seen, &["event=device_down", "about=gps"]);
+    let (_, seen) = daemon.wait_from(seen, &["event=device_down", "about=gps", "fault=unplugged"]);
     gps.plug();
     let feeder = Feeder::start(gps, compass);
     let (line, seen) = daemon.wait_from(seen, &["event=receiver_not_configured", "about=gps"]);

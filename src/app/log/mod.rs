@@ -128,6 +128,12 @@ impl Log {
         });
     }
 
+    /// Ends the holding back of an event about something: what it told of is over, so the next one is news.
+    pub fn is_over(&self, event: Event, about: &str) {
+        let mut throttles = self.throttles.lock().unwrap_or_else(PoisonError::into_inner);
+        throttles.retain(|(held, key), _| *held != event || !key.starts_with(about));
+    }
+
     /// Tells of an operator event at a time of its own; lines of the same event and `key` are
     /// throttled together.
     pub fn tell_keyed(&self, t: MonoTime, event: Event, key: String, fields: impl FnOnce(Line) -> Line) {

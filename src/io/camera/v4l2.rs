@@ -20,8 +20,9 @@ use crate::msg::FrameEncoding;
 use crate::time::{MonoTime, Span};
 
 /// Mapped buffers. One is being copied while the others fill: at 30 frames a second the driver can
-/// run on for a fifth of a second while this thread waits for a processor.
-const BUFFERS: u32 = 7;
+/// run on for a third of a second while this thread waits for a processor. A driver that has less memory gives
+/// fewer.
+const BUFFERS: u32 = 12;
 
 /// A camera that gives no frame for this long, or for [`FROZEN_FRAMES`] frame times, is frozen.
 const FROZEN: Duration = Duration::from_secs(2);
