@@ -70,7 +70,7 @@ impl Default for EstimatorConfig {
             smoother_lag_ms: 500.0,
             lost_after_s: 30.0,
             learn: true,
-            learn_s: 1.0,
+            learn_s: 1.5,
             gate_probability: 0.999,
             rejections_to_restart: 5,
             features: 8,
