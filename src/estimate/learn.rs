@@ -234,8 +234,9 @@ fn more_than_found(memory_s: f64, age_s: f64, frame_s: f64) -> f64 {
     smooth / (1.0 + memory_s / RESPONSE_S)
 }
 
-/// Time within which a vehicle's drive and steering gear follow their commands, s.
-const RESPONSE_S: f64 = 0.2;
+/// Time within which a vehicle follows its driver, s: a steering gear takes about a quarter of a second, a drive
+/// that has a mass to move two thirds.
+const RESPONSE_S: f64 = 0.4;
 
 /// Variance of `x_now − decay · x_then`.
 fn increment(echo: &Echo, row: usize, var_now: f64, column: usize, decay: f64) -> f64 {
