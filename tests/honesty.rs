@@ -5,16 +5,22 @@ use std::sync::Arc;
 
 use windhover::estimate::{Estimator, EstimatorOutput, Site};
 use windhover::geo::Ground;
-use windhover::msg::{Stamped, TargetEstimate, TrackStatus};
+use windhover::msg::{FrameObservations, Stamped, TargetEstimate, TrackStatus};
 use windhover::simulate::{Sample, Scenario, SensorSuite, World};
 use windhover::time::Span;
 
 /// Flies a scenario whose pixels are this good (px); gives the world and the estimates of its first target.
-fn fly(
+fn fly(name: &str, seconds: f64, seed: u64, px: (f64, f64)) -> (Arc<World>, Vec<TargetEstimate>) {
+    fly_with(name, seconds, seed, px, |_, _| ())
+}
+
+/// The same with what the camera saw changed before the filter has it: seconds into the flight, observations.
+fn fly_with(
     name: &str,
     seconds: f64,
     seed: u64,
     (marker_px, feature_px): (f64, f64),
+    mut change: impl FnMut(f64, &mut FrameObservations),
 ) -> (Arc<World>, Vec<TargetEstimate>) {
     let mut scenario = Scenario::named(name).expect("a named scenario");
     scenario.duration_s = seconds;
@@ -33,7 +39,8 @@ fn fly(
             Sample::Attitude { stamped, .. } => filter.attitude(stamped, &mut out),
             Sample::Frame { truth, seq } => {
                 let (t_valid, t_recv) = (truth.t_stamp + offset, truth.t_recv);
-                let value = suite.observations().clone();
+                let mut value = suite.observations().clone();
+                change(world.seconds(t_valid), &mut value);
                 filter.frame(&Stamped { t_valid, t_recv, seq: *seq, value }, &mut out);
             }
         }
@@ -71,6 +78,29 @@ fn speed_and_yaw_rate_are_off_by_what_is_told() {
             assert!(ratios.iter().all(|r| (0.7..1.4).contains(r)), "{name}, {px:?} px: {ratios:.2?}");
         }
     }
+}
+
+#[test]
+fn a_tag_badly_seen_for_a_while_is_no_vehicle_that_jumps() {
+    // Given half a second in which both tags' corners are several sigmas off, as a shadow's edge or motion blur makes
+    // them, so that their shape is wrong and their place is not.
+    let blurred = 12.0..12.5;
+    let spoil = |t: f64, seen: &mut FrameObservations| {
+        for marker in seen.markers.iter_mut().filter(|_| blurred.contains(&t)) {
+            for (i, corner) in marker.corners_px.iter_mut().flatten().enumerate() {
+                corner.x += if i % 2 == 0 { 0.25 } else { -0.25 };
+            }
+        }
+    };
+    let (world, estimates) = fly_with("follow", 16.0, 1, (0.03, 0.1), spoil);
+    let sigma = |from: f64, to: f64| {
+        let seen = estimates.iter().filter(|e| (from..to).contains(&world.seconds(e.t_valid)));
+        let sigmas = seen.map(|e| e.state.and_then(|s| s.covariance).expect("tracked")[(3, 3)].sqrt());
+        sigmas.fold(0.0, f64::max)
+    };
+    // Then speed is told a little less surely meanwhile and as surely afterwards.
+    let (before, during, after) = (sigma(10.0, 12.0), sigma(12.0, 12.6), sigma(13.0, 15.0));
+    assert!(during < 4.0 * before && after < 2.0 * before, "{before:.4} {during:.4} {after:.4} m/s");
 }
 
 #[test]

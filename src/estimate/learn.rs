@@ -194,20 +194,29 @@ impl State {
         }
     }
 
-    /// A target whose markers have all left the gate has begun to move: its intensities are what is
-    /// configured again, and its motion is as uncertain as they make it in half a second.
+    /// A target whose markers have all left the gate moves otherwise than it did. One that stood has begun to move:
+    /// its intensities are what is configured again, and its motion is as uncertain as they make it in half a second.
+    /// Of one that moves both are raised a little; where the next frame finds it out of the gate too, it is as with
+    /// one that stood.
     pub(super) fn wake(&mut self, learning: &Learning, i: usize) {
         let s = self.target_at(i);
-        self.targets[i].motion = MOVING;
+        let anew = self.targets[i].motion < RESTING || self.targets[i].rejected > 1;
+        if anew {
+            self.targets[i].motion = MOVING;
+        }
         for (k, start) in learning.start.target_q[i].iter().enumerate() {
-            let q = &mut self.learnt.target_q[i][k];
+            let (q, var) = (&mut self.learnt.target_q[i][k], self.cov.at(s + 3 + k, s + 3 + k));
+            let (woken, more) = if anew { (*start, 0.5 * *start) } else { (RAISE * *q, (RAISE - 1.0) * var) };
             if *q < *start {
-                *q = *start;
-                self.cov.add(s + 3 + k, s + 3 + k, 0.5 * *start);
+                *q = woken.min(*start);
+                self.cov.add(s + 3 + k, s + 3 + k, more);
             }
         }
     }
 }
+
+/// By what factor variances of a vehicle's motion are raised when it moves otherwise than was expected.
+const RAISE: f64 = 4.0;
 
 /// Time over which a vehicle must have stood still to be taken to stand, s.
 const REST_S: f64 = 0.5;

@@ -16,6 +16,7 @@ mod motion;
 mod output;
 mod ownship;
 mod paper;
+mod shape;
 mod state;
 mod track;
 mod update;

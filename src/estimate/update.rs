@@ -11,7 +11,7 @@ use super::state::{Echo, State};
 const MAX_COLUMNS: usize = 24;
 
 /// Beyond this many times the gate a measurement is refused: no model error explains it.
-const REFUSE_RATIO: f64 = 50.0;
+pub(super) const REFUSE_RATIO: f64 = 50.0;
 
 /// A linearised measurement `r = H δx + noise` of `m` components that touches few columns.
 #[derive(Clone, Debug)]
@@ -58,6 +58,16 @@ impl Measurement {
     /// ∂component/∂column.
     pub(super) fn set(&mut self, component: usize, column: usize, value: f64) {
         self.h[component][column] = value;
+    }
+
+    /// ∂component/∂column.
+    pub(super) fn derivative(&self, component: usize, column: usize) -> f64 {
+        self.h[component][column]
+    }
+
+    /// Raises the noise by a factor on its variance.
+    pub(super) fn scale_noise(&mut self, factor: f64) {
+        self.noise.iter_mut().flatten().for_each(|x| *x *= factor);
     }
 
     fn row(&self, component: usize) -> &[f64] {

@@ -10,9 +10,10 @@ use super::begin::ground_point;
 use super::core::Core;
 use super::learn::{LEARN_RATIO, PIXEL_FACTORS, blend_factor};
 use super::models::Models;
+use super::shape;
 use super::state::{Own, State, Target, at};
 use super::track::{BLINK_S, FRAMES_TO_START};
-use super::update::Measurement;
+use super::update::{Measurement, REFUSE_RATIO};
 
 /// A point of the world in the image, with its derivatives.
 pub(super) struct PointView {
@@ -162,11 +163,17 @@ impl Core {
         }
         if gated {
             let settled = curvature < LITTLE_CURVATURE * self.z.noise[0][0];
+            let worse = if points.len() == 4 {
+                self.worse_than_told([pose, pose + 1, pose + 2, position + 2])
+            } else {
+                1.0
+            };
+            self.z.scale_noise(worse);
             let outcome = self.fuse_gated(FusionSource::Marker);
             if self.learning.on && settled && outcome.ratio < LEARN_RATIO {
                 blend_factor(
                     &mut self.state.learnt.marker_factor[index],
-                    outcome.misfit,
+                    outcome.misfit * worse,
                     MARKER_SAMPLES,
                     PIXEL_FACTORS,
                 );
@@ -175,6 +182,18 @@ impl Core {
         }
         let outcome = self.fuse(None);
         outcome.disposition == Disposition::Fused
+    }
+
+    /// By what factor the variance of the tag's pixels in `self.z` is larger than told, by what its shape shows: 1
+    /// unless that is beyond the gate, or so far beyond that it is no tag of ours.
+    fn worse_than_told(&self, rigid: [usize; 4]) -> f64 {
+        if self.at_truth {
+            return 1.0;
+        }
+        let gate = self.models.gates[shape::LEFT];
+        let left =
+            shape::left_over(&self.z, rigid).filter(|left| (1.0..REFUSE_RATIO).contains(&(left / gate)));
+        left.map_or(1.0, |left| left / shape::LEFT as f64)
     }
 
     /// What the linear model leaves out of a pixel while tilt is hardly known, px²: a tilt error δ bends
