@@ -1,5 +1,5 @@
-//! Whether a vehicle's speed and yaw rate are off by as much as is told, whatever the pixels are worth; and
-//! whether a track outlives its vehicle's absence.
+//! Whether a vehicle's speed, yaw rate and position are off by as much as is told, whatever the pixels are worth;
+//! and whether a track outlives its vehicle's absence.
 
 use std::sync::Arc;
 
@@ -101,6 +101,22 @@ fn a_tag_badly_seen_for_a_while_is_no_vehicle_that_jumps() {
     // Then speed is told a little less surely meanwhile and as surely afterwards.
     let (before, during, after) = (sigma(10.0, 12.0), sigma(12.0, 12.6), sigma(13.0, 15.0));
     assert!(during < 4.0 * before && after < 2.0 * before, "{before:.4} {during:.4} {after:.4} m/s");
+}
+
+#[test]
+fn ground_features_tell_nothing_of_where_they_are() {
+    // Given a flight of three minutes over some five hundred ground features, one after the other.
+    let seconds = 180.0;
+    let (world, estimates) = fly("follow", seconds, 1, (0.5, 0.5));
+    let last = estimates.last().and_then(|e| e.state).and_then(|s| s.covariance).expect("tracked");
+    // Then position is known as well as a receiver with a Gauss-Markov bias of known sigma and correlation time tells
+    // it in that time to one who knows every movement, and no better: `2 σ² τ / (T + 2 τ)`.
+    let gps = &world.scenario().config.gps;
+    let least = 2.0 * gps.bias_sigma_m.powi(2) * gps.bias_tau_s / (seconds + 2.0 * gps.bias_tau_s);
+    for axis in 0..2 {
+        let ratio = last[(axis, axis)] / least;
+        assert!((0.97..1.15).contains(&ratio), "axis {axis}: {ratio:.3} of the least variance");
+    }
 }
 
 #[test]
