@@ -9,7 +9,7 @@ use crate::msg::{Disposition, FusionSource, MarkerDetection, TrackStatus};
 use super::core::Core;
 use super::learn::MOVING;
 use super::models::{Marker, Models};
-use super::state::{ANYWHERE, Own, Target, at};
+use super::state::{GUESSED_VAR, Own, Target, at};
 use super::track::{BLINK_S, started, started_again};
 
 impl Core {
@@ -32,7 +32,7 @@ impl Core {
         self.state.learnt.target_q[index] = self.learning.start.target_q[index];
         let heading_var = if heading_known { 1.0 } else { UNKNOWN_HEADING.powi(2) };
         let (speed_var, rate_var) = if moving { (9.0, 1.0) } else { (0.0, 0.0) };
-        self.state.renew(start, &[ANYWHERE, ANYWHERE, heading_var, speed_var, rate_var]);
+        self.state.renew(start, &[GUESSED_VAR, GUESSED_VAR, heading_var, speed_var, rate_var]);
         self.fuse_first(index, markers);
         self.state.settle(index);
     }
@@ -68,7 +68,7 @@ impl Core {
             ..before
         };
         self.state.learnt.target_q[index] = self.learning.start.target_q[index];
-        self.state.renew(s, &[ANYWHERE, ANYWHERE, 1.0, motion[0], motion[1]]);
+        self.state.renew(s, &[GUESSED_VAR, GUESSED_VAR, 1.0, motion[0], motion[1]]);
         self.fuse_first(index, markers);
         self.state.settle(index);
         true

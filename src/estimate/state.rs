@@ -44,7 +44,7 @@ pub(super) mod at {
 /// Variance of the place of something just found, m². Its guess is made from where the helicopter is thought to be, so
 /// as a prior it must tell nothing of where that is: with 30 m each new ground feature told a little, and a
 /// thousand of them twice what the receiver does.
-pub(super) const ANYWHERE: f64 = 1e5;
+pub(super) const GUESSED_VAR: f64 = 1e5;
 
 /// Standard gravity, m/s².
 pub(super) const GRAVITY: f64 = 9.806_65;

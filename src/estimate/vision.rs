@@ -11,7 +11,7 @@ use super::core::Core;
 use super::learn::{LEARN_RATIO, PIXEL_FACTORS, blend_factor};
 use super::models::Models;
 use super::shape;
-use super::state::{ANYWHERE, Own, State, Target, at};
+use super::state::{GUESSED_VAR, Own, State, Target, at};
 use super::track::{BLINK_S, FRAMES_TO_START};
 use super::update::{Measurement, REFUSE_RATIO};
 
@@ -230,7 +230,7 @@ impl Core {
         feature.mean = [found.x, found.y];
         feature.rejected = 0;
         let start = self.state.feature_at(slot);
-        self.state.renew(start, &[ANYWHERE; 2]);
+        self.state.renew(start, &[GUESSED_VAR; 2]);
         self.fuse_feature(slot, track, false);
     }
 
