@@ -80,15 +80,16 @@ fn main() -> Result<()> {
         .stdin(Stdio::null())
         .stderr(File::create(&log)?)
         .spawn()?;
-    let feeder = Feeder::start(bytes, args.flight_s, gps.0, compass.0);
-    let bystander = Bystander::start();
+    let flight_s = args.flight_s;
+    let feeder = Background::start(move |asked| feed(&bytes, flight_s, gps.0, compass.0, asked));
+    let bystander = Background::start(stand_by);
     let memory = watch(&mut daemon, args.seconds)?;
     let tasks = tasks(daemon.id())?;
     kill_process(Pid::from_raw(daemon.id().cast_signed()).ok_or("no process")?, Signal::TERM)?;
     daemon.wait()?;
-    feeder.stop();
+    feeder.stop()?;
     report(&fs::read_to_string(&log)?, args.seconds, &memory, &tasks)?;
-    let late = bystander.stop();
+    let late = bystander.stop()?;
     println!(
         "a bystander that sleeps 5 ms at a time woke late by {:.1} ms at most; by 20 ms or more {} times",
         late.iter().fold(0.0, |most: f64, ms| most.max(*ms)),
@@ -164,67 +165,52 @@ fn configuration(flight: &Path, dir: &Path, camera: &Path, lines: [&str; 2]) -> 
     Ok(config.to_toml()?)
 }
 
+/// A thread that works until it is stopped.
+struct Background<T> {
+    stop: Arc<AtomicBool>,
+    thread: JoinHandle<T>,
+}
+
+impl<T: Send + 'static> Background<T> {
+    /// Starts `work`, which looks whether it has been asked to stop.
+    fn start(work: impl FnOnce(&AtomicBool) -> T + Send + 'static) -> Self {
+        let stop = Arc::new(AtomicBool::new(false));
+        let asked = Arc::clone(&stop);
+        Self { stop, thread: std::thread::spawn(move || work(&asked)) }
+    }
+
+    fn stop(self) -> Result<T> {
+        self.stop.store(true, Ordering::Release);
+        self.thread.join().map_err(|_| "a thread of the load test panicked".into())
+    }
+}
+
 /// Feeds both lines at the real pace, again and again.
-struct Feeder {
-    stop: Arc<AtomicBool>,
-    thread: JoinHandle<()>,
-}
-
-impl Feeder {
-    fn start(bytes: Bytes, flight_s: u64, mut gps: File, mut compass: File) -> Self {
-        let stop = Arc::new(AtomicBool::new(false));
-        let asked = Arc::clone(&stop);
-        let thread = std::thread::spawn(move || {
-            let began = Instant::now();
-            for round in 0.. {
-                for (since, is_gps, data) in &bytes {
-                    let due =
-                        Duration::from_secs(round * flight_s) + Duration::from_secs_f64(since.s().max(0.0));
-                    std::thread::sleep(due.saturating_sub(began.elapsed()));
-                    if asked.load(Ordering::Acquire) {
-                        return;
-                    }
-                    // Bytes for a line that nobody reads are lost, as on a real one.
-                    let _ = if *is_gps { &mut gps } else { &mut compass }.write_all(data);
-                }
+fn feed(bytes: &Bytes, flight_s: u64, mut gps: File, mut compass: File, asked: &AtomicBool) {
+    let began = Instant::now();
+    for round in 0.. {
+        for (since, is_gps, data) in bytes {
+            let due = Duration::from_secs(round * flight_s) + Duration::from_secs_f64(since.s().max(0.0));
+            std::thread::sleep(due.saturating_sub(began.elapsed()));
+            if asked.load(Ordering::Acquire) {
+                return;
             }
-        });
-        Self { stop, thread }
-    }
-
-    fn stop(self) {
-        self.stop.store(true, Ordering::Release);
-        let _ = self.thread.join();
+            // Bytes for a line that nobody reads are lost, as on a real one.
+            let _ = if *is_gps { &mut gps } else { &mut compass }.write_all(data);
+        }
     }
 }
 
-/// Sleeps and looks at the clock: how long the machine itself kept a thread waiting.
-struct Bystander {
-    stop: Arc<AtomicBool>,
-    thread: JoinHandle<Vec<f64>>,
-}
-
-impl Bystander {
-    fn start() -> Self {
-        let stop = Arc::new(AtomicBool::new(false));
-        let asked = Arc::clone(&stop);
-        let thread = std::thread::spawn(move || {
-            let (nap, mut late) = (Duration::from_millis(5), Vec::new());
-            while !asked.load(Ordering::Acquire) {
-                let began = Instant::now();
-                std::thread::sleep(nap);
-                late.extend(Some((began.elapsed() - nap).as_secs_f64() * 1e3).filter(|ms| *ms >= 20.0));
-            }
-            late
-        });
-        Self { stop, thread }
+/// Sleeps and looks at the clock: by how much it woke late, milliseconds, where that was 20 or more. So long the
+/// machine itself kept a thread waiting.
+fn stand_by(asked: &AtomicBool) -> Vec<f64> {
+    let (nap, mut late) = (Duration::from_millis(5), Vec::new());
+    while !asked.load(Ordering::Acquire) {
+        let began = Instant::now();
+        std::thread::sleep(nap);
+        late.extend(Some((began.elapsed() - nap).as_secs_f64() * 1e3).filter(|ms| *ms >= 20.0));
     }
-
-    /// By how much it woke late, milliseconds, where that was 20 or more.
-    fn stop(self) -> Vec<f64> {
-        self.stop.store(true, Ordering::Release);
-        self.thread.join().unwrap_or_default()
-    }
+    late
 }
 
 /// Resident memory, megabytes.

@@ -78,10 +78,7 @@ pub fn pulses(config: &Config, around: &Surroundings, heart: &Heart) {
     let tell = |report| {
         heart.beat();
         match report {
-            Report::Up(text) => {
-                around.log.is_over(Event::DeviceDown, "pps");
-                around.log.tell(Event::DeviceUp, "pps", text);
-            }
+            Report::Up(text) => around.log.tell(Event::DeviceUp, "pps", text),
             Report::Down(fault) => around.log.tell(Event::DeviceDown, "pps", fault.to_string()),
             _ => {}
         }
@@ -111,7 +108,6 @@ impl<'a> Told<'a> {
             Report::Up(text) => {
                 self.around.presence.set(self.part, PartState::Open);
                 self.put(EventBody::SourceUp(self.source));
-                self.around.log.is_over(Event::DeviceDown, name);
                 self.around.log.tell(Event::DeviceUp, name, text);
             }
             Report::Bytes(t, bytes) => {

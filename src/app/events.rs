@@ -130,6 +130,14 @@ impl Event {
     pub const fn throttle(self) -> Span {
         self.row().every
     }
+
+    /// What is over with it, so that it is news when it happens to the same thing again.
+    pub const fn ends(self) -> Option<Self> {
+        match self {
+            Self::DeviceUp => Some(Self::DeviceDown),
+            _ => None,
+        }
+    }
 }
 
 const fn device_row(note: NoteKind) -> Row {

@@ -163,11 +163,7 @@ impl Core {
         }
         if gated {
             let settled = curvature < LITTLE_CURVATURE * self.z.noise[0][0];
-            let worse = if points.len() == 4 {
-                self.worse_than_told([pose, pose + 1, pose + 2, position + 2])
-            } else {
-                1.0
-            };
+            let worse = self.worse_than_told([pose, pose + 1, pose + 2, position + 2]);
             self.z.scale_noise(worse);
             let outcome = self.fuse_gated(FusionSource::Marker);
             if self.learning.on && settled && outcome.ratio < LEARN_RATIO {
@@ -184,10 +180,10 @@ impl Core {
         outcome.disposition == Disposition::Fused
     }
 
-    /// By what factor the variance of the tag's pixels in `self.z` is larger than told, by what its shape shows: 1
-    /// unless that is beyond the gate, or so far beyond that it is no tag of ours.
+    /// By what factor the variance of the marker's pixels in `self.z` is larger than told, by what a tag's shape shows:
+    /// 1 unless that is beyond the gate, or so far beyond that it is no tag of ours. A disc's centre has no shape.
     fn worse_than_told(&self, rigid: [usize; 4]) -> f64 {
-        if self.at_truth {
+        if self.at_truth || self.z.m < 8 {
             return 1.0;
         }
         let gate = self.models.gates[shape::LEFT];

@@ -128,17 +128,14 @@ impl Log {
         });
     }
 
-    /// Ends the holding back of an event about something: what it told of is over, so the next one is news.
-    pub fn is_over(&self, event: Event, about: &str) {
-        let mut throttles = self.throttles.lock().unwrap_or_else(PoisonError::into_inner);
-        throttles.retain(|(held, key), _| *held != event || !key.starts_with(about));
-    }
-
-    /// Tells of an operator event at a time of its own; lines of the same event and `key` are
-    /// throttled together.
+    /// Tells of an operator event at a time of its own; lines of the same event and `key`, which begins with what
+    /// they are about, are throttled together.
     pub fn tell_keyed(&self, t: MonoTime, event: Event, key: String, fields: impl FnOnce(Line) -> Line) {
         let held = {
             let mut throttles = self.throttles.lock().unwrap_or_else(PoisonError::into_inner);
+            if let Some(over) = event.ends() {
+                throttles.retain(|(held, about), _| *held != over || !about.starts_with(&key));
+            }
             let throttle = throttles.entry((event, key)).or_default();
             throttle.pass(t, event.throttle())
         };
