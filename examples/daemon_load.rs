@@ -90,9 +90,10 @@ fn main() -> Result<()> {
     feeder.stop()?;
     report(&fs::read_to_string(&log)?, args.seconds, &memory, &tasks)?;
     let late = bystander.stop()?;
+    let longest =
+        late.iter().copied().reduce(f64::max).map_or(String::new(), |ms| format!(", by {ms:.1} ms at most"));
     println!(
-        "a bystander that sleeps 5 ms at a time woke late by {:.1} ms at most; by 20 ms or more {} times",
-        late.iter().fold(0.0, |most: f64, ms| most.max(*ms)),
+        "a bystander that sleeps 5 ms at a time woke late by 20 ms or more {} times{longest}",
         late.len()
     );
     Ok(())
