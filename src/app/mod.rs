@@ -1,30 +1,35 @@
 //! Wiring: configuration files, the task graph, supervision, the operator log, reports.
 
-pub mod brain;
 pub mod card;
 pub mod config_file;
+pub mod context;
 pub mod declination;
 pub mod devices;
 pub mod downlink;
+pub mod event_queue;
 pub mod events;
 pub mod export;
 pub mod flight;
+pub mod flight_store;
 pub mod geopositions;
 pub mod ground;
 pub mod health;
 pub mod import;
-pub mod inbox;
 pub mod latencies;
 pub mod log;
 pub mod outlets;
+pub mod pipeline_task;
+pub mod power_task;
 pub mod presence;
 pub mod reload;
 pub mod recording;
 pub mod replay;
 pub mod report;
 pub mod run;
+pub mod signals;
+pub mod status;
 pub mod supervise;
 pub mod topology;
 pub mod truth;
-pub mod warm;
+pub mod warm_start;
 mod watch;

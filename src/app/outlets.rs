@@ -8,12 +8,12 @@ use crate::msg::{Event, GnssEpoch, MarkerDetection, Stamped};
 use crate::pipeline::Output;
 use crate::time::{MonoTime, UtcTime};
 
-use super::card::Slot;
 use super::downlink::Downlink;
+use super::flight_store::FlightStore;
 
 /// The data card and the link, from the pipeline's side. Nothing here waits.
 pub struct Outlets {
-    slot: Slot,
+    flight_store: FlightStore,
     downlink: Downlink,
     recorder: Recorder,
     records: Vec<Record>,
@@ -24,9 +24,9 @@ pub struct Outlets {
 
 impl Outlets {
     /// For a pipeline of this configuration.
-    pub fn new(config: &Config, slot: Slot, downlink: Downlink) -> Self {
+    pub fn new(config: &Config, flight_store: FlightStore, downlink: Downlink) -> Self {
         Self {
-            slot,
+            flight_store,
             downlink,
             recorder: Recorder::new(config),
             records: Vec::new(),
@@ -37,15 +37,15 @@ impl Outlets {
     }
 
     /// The data card's place.
-    pub fn slot(&self) -> &Slot {
-        &self.slot
+    pub fn flight_store(&self) -> &FlightStore {
+        &self.flight_store
     }
 
     /// Keeps an event as it was heard.
     pub fn event(&mut self, event: &Event) {
         self.began.get_or_insert(event.t_recv);
         self.downlink.event(event);
-        let Some(store) = self.slot.get() else {
+        let Some(store) = self.flight_store.get() else {
             if std::mem::replace(&mut self.opened, false) {
                 self.downlink.store_closed();
             }
@@ -70,7 +70,7 @@ impl Outlets {
     pub fn output(&mut self, output: &Output, t: MonoTime) {
         self.downlink.output(output);
         self.recorder.output(output, t, &mut self.records);
-        let store = self.slot.get();
+        let store = self.flight_store.get();
         if let Some(store) = &store {
             match output {
                 Output::Fix(epoch) => self.date(epoch, store),
