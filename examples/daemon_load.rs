@@ -30,7 +30,7 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use windhover::app::replay::config_of;
 use windhover::io::capture::CaptureReader;
 use windhover::io::clock::HostClock;
-use windhover::msg::EventBody;
+use windhover::msg::{EventBody, Source};
 use windhover::time::{MonoTime, Span};
 
 #[derive(Parser)]
@@ -143,8 +143,8 @@ fn unpack(flight: &Path, camera: &Path) -> Result<Bytes> {
     for event in CaptureReader::open(flight)?.filter_map(|item| item.event) {
         let since = event.t_recv - *first.get_or_insert(event.t_recv);
         match event.body {
-            EventBody::GnssBytes(data) => bytes.push((since, true, data)),
-            EventBody::CompassBytes(data) => bytes.push((since, false, data)),
+            EventBody::Bytes { source: Source::Gps, data } => bytes.push((since, true, data)),
+            EventBody::Bytes { source: Source::Compass, data } => bytes.push((since, false, data)),
             EventBody::Frame(frame) => {
                 let name = format!("{:05}.pgm", frame.index);
                 let head = format!("P5\n{} {}\n255\n", frame.width, frame.height);
@@ -239,8 +239,9 @@ fn report_stamps(card: &Path, written: &[Written]) -> Result<()> {
     for flight in fs::read_dir(card.join("FLIGHTS"))? {
         for event in CaptureReader::open(&flight?.path())?.filter_map(|item| item.event) {
             match event.body {
-                EventBody::GnssBytes(data) => reads[1].push((event.t_recv, data)),
-                EventBody::CompassBytes(data) => reads[0].push((event.t_recv, data)),
+                EventBody::Bytes { source, data } => {
+                    reads[usize::from(source == Source::Gps)].push((event.t_recv, data));
+                }
                 EventBody::Frame(frame) => frames.push((event.t_recv - frame.t_exposure).ms()),
                 _ => {}
             }
@@ -251,7 +252,9 @@ fn report_stamps(card: &Path, written: &[Written]) -> Result<()> {
         let reads = &reads[usize::from(of.is_gps)];
         let next = reads.partition_point(|(t, _)| *t < of.t);
         // A read that begins with other bytes is of a write before it that waited.
-        bytes.extend(reads.get(next).filter(|(_, data)| data.starts_with(&of.data)).map(|(t, _)| (*t - of.t).ms()));
+        bytes.extend(
+            reads.get(next).filter(|(_, data)| data.starts_with(&of.data)).map(|(t, _)| (*t - of.t).ms()),
+        );
     }
     let unmatched = written.len() - bytes.len();
     for (what, mut waits) in [("bytes", bytes), ("frames", frames)] {

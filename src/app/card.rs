@@ -85,7 +85,8 @@ pub async fn run(task: StoreTask, mut opened: Option<OpenStore>) {
         if task.heart.while_waiting(back).await.is_none() {
             return;
         }
-        let (config, clock, store) = (Arc::clone(&task.config), task.context.clock, task.flight_store.clone());
+        let (config, clock, store) =
+            (Arc::clone(&task.config), task.context.clock, task.flight_store.clone());
         opened = blocking(move || open(&config, clock, &store)).await;
     }
 }

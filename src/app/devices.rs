@@ -97,11 +97,7 @@ impl DeviceReports {
             }
             Report::Bytes(t, bytes) => {
                 self.delivers();
-                let body = match self.source {
-                    Source::Gps => EventBody::GnssBytes(bytes),
-                    Source::Compass | Source::Camera => EventBody::CompassBytes(bytes),
-                };
-                self.context.events.put(t, body);
+                self.context.events.put(t, EventBody::Bytes { source: self.source, data: bytes });
             }
             Report::Frame(t, frame) => {
                 self.delivers();

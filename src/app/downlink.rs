@@ -14,13 +14,12 @@ use crate::config::Config;
 use crate::io::clock::HostClock;
 use crate::io::device::blocking;
 use crate::io::link::{
-    Backlog, EarlyRecords, LinkError, LinkEvent, LinkHandle, LinkStatus, PayloadLink, PayloadSettings, Picture,
-    StoreBacklog,
+    Backlog, EarlyRecords, LinkError, LinkEvent, LinkHandle, LinkStatus, PayloadLink, PayloadSettings,
+    Picture, StoreBacklog,
 };
-use crate::io::mavlink::MavlinkSender;
+use crate::io::mavlink::{self, MavlinkSender};
 use crate::io::records::Record;
-use crate::msg::{Event, EventBody, FramePayload};
-use crate::pipeline::Output;
+use crate::msg::{Event, EventBody, FramePayload, Output};
 use crate::time::UtcTime;
 
 use super::context::TaskContext;
@@ -163,7 +162,13 @@ async fn send_mavlink(downlink: Downlink, clock: HostClock, every: Duration) {
     tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     loop {
         tick.tick().await;
+        let names = downlink.lines().mavlink.as_mut().and_then(|mavlink| mavlink.unresolved(clock.now()));
+        let addresses = match names {
+            Some(names) => Some(blocking(move || mavlink::look_up(&names)).await),
+            None => None,
+        };
         if let Some(mavlink) = &mut downlink.lines().mavlink {
+            addresses.into_iter().for_each(|addresses| mavlink.send_to(addresses));
             mavlink.send(clock.now());
         }
     }

@@ -1,11 +1,10 @@
 //! The queue of events before the pipeline: bounded, in order of time, the oldest frame dropped first.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use crate::io::device::RawFrame;
-use crate::msg::{Event, EventBody, FramePayload, Source};
+use crate::msg::{Event, EventBody, FramePayload, PerSource, Source};
 use crate::time::{MonoTime, Span};
 
 /// Reads of the serial lines that wait: more than ten seconds' worth. A pipeline that is further
@@ -42,14 +41,14 @@ pub struct EventQueue {
 #[derive(Debug, Default)]
 struct Lanes {
     reads: VecDeque<(MonoTime, EventBody)>,
-    frames: VecDeque<(MonoTime, RawFrame)>,
+    frames: VecDeque<(MonoTime, FramePayload)>,
     /// Whether the oldest frame is the next one, once the reads before it are handled.
     pinned: bool,
     /// Whether lost frames were told since the last frame.
     told: bool,
     /// Since when more frames wait than the queue is set to hold; until all are taken.
     crowded: Option<MonoTime>,
-    dropped: BTreeMap<Source, u32>,
+    dropped: PerSource<u32>,
     /// Whether somebody wants the taker to look up.
     woken: bool,
     last: Option<MonoTime>,
@@ -68,9 +67,9 @@ impl EventQueue {
         let mut lanes = self.lock();
         if lanes.reads.len() >= READS
             && let Some((_, oldest)) = lanes.reads.pop_front()
-            && let Some(source) = source_of(&oldest)
+            && let Some(source) = oldest.delivered_by()
         {
-            *lanes.dropped.entry(source).or_default() += 1;
+            lanes.dropped[source] += 1;
         }
         lanes.reads.push_back((t_recv, body));
         drop(lanes);
@@ -78,7 +77,7 @@ impl EventQueue {
     }
 
     /// Puts in a frame; where too many wait, the oldest goes that is not the next one.
-    pub fn put_frame(&self, t_recv: MonoTime, frame: RawFrame) {
+    pub fn put_frame(&self, t_recv: MonoTime, frame: FramePayload) {
         let mut lanes = self.lock();
         lanes.frames.push_back((t_recv, frame));
         if lanes.frames.len() > self.frames {
@@ -87,7 +86,7 @@ impl EventQueue {
             while lanes.frames.len() > most {
                 let goes = usize::from(lanes.pinned);
                 lanes.frames.remove(goes);
-                *lanes.dropped.entry(Source::Camera).or_default() += 1;
+                lanes.dropped[Source::Camera] += 1;
             }
         }
         drop(lanes);
@@ -122,15 +121,6 @@ impl EventQueue {
     }
 }
 
-fn source_of(body: &EventBody) -> Option<Source> {
-    match body {
-        EventBody::GnssBytes(_) => Some(Source::Gps),
-        EventBody::CompassBytes(_) => Some(Source::Compass),
-        EventBody::Frame(_) => Some(Source::Camera),
-        _ => None,
-    }
-}
-
 impl Lanes {
     fn is_empty(&self) -> bool {
         self.reads.is_empty() && self.frames.is_empty()
@@ -145,8 +135,9 @@ impl Lanes {
         // What was lost is told before what is still here; frames with the next one, not one by one.
         let frames_due = frame.is_none() || (frame_is_next && !self.told);
         let due = |source: Source| source != Source::Camera || frames_due;
-        if let Some(source) = self.dropped.keys().copied().find(|&source| due(source)) {
-            let count = self.dropped.remove(&source).unwrap_or_default();
+        let lost = Source::ALL.iter().copied().find(|&source| self.dropped[source] > 0 && due(source));
+        if let Some(source) = lost {
+            let count = std::mem::take(&mut self.dropped[source]);
             self.told |= source == Source::Camera;
             return Some(self.number(earliest, EventBody::Dropped { source, count }));
         }
@@ -156,8 +147,9 @@ impl Lanes {
             if self.frames.is_empty() {
                 self.crowded = None;
             }
-            let payload = self.payload(frame);
-            return Some(self.number(t, EventBody::Frame(payload)));
+            let index = self.next_frame;
+            self.next_frame = index.wrapping_add(1);
+            return Some(self.number(t, EventBody::Frame(FramePayload { index, ..frame })));
         }
         let (t, body) = self.reads.pop_front()?;
         Some(self.number(t, body))
@@ -172,20 +164,6 @@ impl Lanes {
         self.next_seq += 1;
         Event { t_recv, seq, body }
     }
-
-    fn payload(&mut self, frame: RawFrame) -> FramePayload {
-        let index = self.next_frame;
-        self.next_frame = index.wrapping_add(1);
-        FramePayload {
-            index,
-            t_exposure: frame.t_exposure,
-            encoding: frame.encoding,
-            width: frame.width,
-            height: frame.height,
-            stride: frame.stride,
-            data: frame.data,
-        }
-    }
 }
 
 #[cfg(test)]
@@ -199,8 +177,9 @@ mod tests {
         MonoTime::from_ns(ms * 1_000_000)
     }
 
-    fn frame(ms: i64) -> RawFrame {
-        RawFrame {
+    fn frame(ms: i64) -> FramePayload {
+        FramePayload {
+            index: 0,
             t_exposure: at(ms),
             encoding: FrameEncoding::Grey,
             width: 1,
@@ -218,10 +197,10 @@ mod tests {
     fn events_leave_in_order_of_time_and_never_go_back() {
         let queue = EventQueue::new(3);
         queue.put_frame(at(20), frame(15));
-        queue.put(at(10), EventBody::GnssBytes(vec![1]));
-        queue.put(at(30), EventBody::CompassBytes(vec![2]));
+        queue.put(at(10), EventBody::Bytes { source: Source::Gps, data: vec![1] });
+        queue.put(at(30), EventBody::Bytes { source: Source::Compass, data: vec![2] });
         let first = drain(&queue);
-        queue.put(at(25), EventBody::GnssBytes(vec![3]));
+        queue.put(at(25), EventBody::Bytes { source: Source::Gps, data: vec![3] });
         let late = drain(&queue);
         let times: Vec<i64> = first.iter().chain(&late).map(|e| e.t_recv.ns() / 1_000_000).collect();
         assert_eq!(times, [10, 20, 30, 30]);
@@ -290,12 +269,12 @@ mod tests {
         // Given a pipeline that takes one read in the time of a frame, three reads behind.
         let queue = EventQueue::new(2);
         for ms in [0, 10, 20] {
-            queue.put(at(ms), EventBody::CompassBytes(vec![0]));
+            queue.put(at(ms), EventBody::Bytes { source: Source::Compass, data: vec![0] });
         }
         let mut taken = Vec::new();
         for ms in (30..300).step_by(10) {
             queue.put_frame(at(ms), frame(ms));
-            queue.put(at(ms + 1), EventBody::CompassBytes(vec![0]));
+            queue.put(at(ms + 1), EventBody::Bytes { source: Source::Compass, data: vec![0] });
             taken.extend(queue.take(Duration::ZERO));
         }
         // Then it comes to a frame all the same, after the reads before it, and what was lost is told with it, once.
@@ -315,7 +294,7 @@ mod tests {
     fn reads_are_bounded() {
         let queue = EventQueue::new(1);
         for n in 0..READS + 5 {
-            queue.put(at(n as i64), EventBody::CompassBytes(vec![0]));
+            queue.put(at(n as i64), EventBody::Bytes { source: Source::Compass, data: vec![0] });
         }
         let events = drain(&queue);
         assert_eq!(events.len(), READS + 1);

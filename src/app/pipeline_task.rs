@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use crate::config::Config;
 use crate::geo::Tile;
-use crate::msg::{Event, EventBody, TargetEstimate};
-use crate::pipeline::{Health, Output, Pipeline, TICK, Ticks};
+use crate::msg::{Event, EventBody, Health, Output, TargetEstimate};
+use crate::pipeline::{Pipeline, TICK, Ticks};
 use crate::time::{MonoTime, Span};
 
 use super::context::TaskContext;
@@ -72,9 +72,12 @@ pub fn run(parts: Parts) {
     orders.pipeline_done.cancel();
 }
 
-/// Time from `now` to the next tick: so long the task may wait for an event.
+/// An event that was stamped before a tick may be queued this much after it and still comes first.
+const QUEUED_LATE: Span = Span::from_ns(5_000_000);
+
+/// Time from `now` until the next tick is due: so long the task may wait for an event.
 fn until_tick(now: MonoTime) -> Duration {
-    let left = TICK.ns() - now.ns().rem_euclid(TICK.ns());
+    let left = TICK.ns() - (now - QUEUED_LATE).ns().rem_euclid(TICK.ns());
     Duration::from_nanos(left.unsigned_abs())
 }
 

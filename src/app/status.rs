@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use crate::pipeline::Health;
+use crate::msg::Health;
 
 use super::health::Figures;
 

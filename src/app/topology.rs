@@ -1,30 +1,53 @@
 //! The whole task graph on one page.
 //!
 //! ```text
-//!   gps, pps ─┐                         ┌─► store   (card: flights, index)
-//!   compass ──┼─► events ─► pipeline ────┼─► link    (ground stations, MAVLink)
-//!   camera ───┘                         └─► status ◄── health (health line, watchdog, signals, power)
+//!   gps, pps ─┐                                  ┌─► store   (card: flights, index)
+//!   compass ──┼─► event queue ─► pipeline ───────┼─► link    (ground stations, MAVLink)
+//!   camera ───┘                                  └─► status ◄── health (health line, watchdog, signals)
+//!   power ─────────────────────────────────────────────────────► health
 //!                         every task ─────► log     (journal, file)
 //! ```
 //!
+//! Tasks of the one runtime, which has two workers. They wait by readiness and never block:
+//!
+//! | task | waits for | restart rule |
+//! |---|---|---|
+//! | gps, compass | their line's descriptor | open the device again, waiting ¼ s to 5 s |
+//! | pps | the pulse device's descriptor | the same |
+//! | camera | the V4L2 queue's descriptor, or the thread that plays a recording | the same |
+//! | power | the GPIO line's descriptor, a second's timer | the same |
+//! | store | notices of the store, the pipeline's end, power going | opens the card again; the daemon flies on without |
+//! | link | its socket | calls again; the daemon flies on without |
+//! | health | signals, the end of any task, a quarter-second timer | is the main thread; nothing restarts it |
+//!
+//! Threads of their own, and why:
+//!
+//! | thread | why |
+//! |---|---|
+//! | pipeline | computes for milliseconds a frame. Ends the process where it fails: a filter in an unknown state is not repaired |
+//! | store-encode | computes JPEG |
+//! | store-write, store-keep, index | `fdatasync` and directory calls block as long as the card does |
+//! | log | a terminal, a pipe or a disk can stall |
+//! | recording | reads image files where the camera is a recording; it stands in for the driver |
+//! | runtime's threads for blocking work, 32 at most | open and close devices (a UART drains, a camera ends its stream); read configuration, terrain, keys and sysfs; thumbnails; back-fill from the card; start and stop the store |
+//!
+//! The main thread strokes the watchdog and answers signals, and runs nothing else: a configuration and its terrain
+//! are read on a thread for blocking work, at the start and on SIGHUP.
+//!
 //! | channel | holds | when full |
 //! |---|---|---|
-//! | events, frames | `daemon.frame_queue` frames, 16 in a burst of half a second | the oldest but the next one is dropped and recorded as dropped |
-//! | events, reads | 8192 reads of the lines | the oldest is dropped and recorded as dropped |
+//! | event queue, frames | `daemon.frame_queue` frames, 16 in a burst of half a second | the oldest but the next one is dropped and recorded as dropped |
+//! | event queue, reads | 8192 reads of the lines | the oldest is dropped and recorded as dropped |
+//! | recording to camera | 12 frames, as a driver's buffers | the recording waits |
 //! | store | see `io::store` | what does not fit is dropped and counted; the pipeline never waits |
 //! | link | see `io::link` | the oldest estimate goes first; what was missed is sent later |
-//! | log | 512 lines | the line is dropped and counted |
-//!
-//! | task | restart rule |
-//! |---|---|
-//! | gps, pps, compass, camera | open the device again, waiting ¼ s to 5 s |
-//! | pipeline | ends the process: a filter in an unknown state is not repaired |
-//! | store | opens the card again; the daemon flies on without |
-//! | link | calls again; the daemon flies on without |
-//! | health | is the main thread: signals, health, watchdog |
+//! | power to health, power to store, store to link | the newest value | a newer value replaces it |
+//! | log | see `app::log` | the line is dropped and counted |
 //!
 //! Every task beats its heart at least once a second while it works; the watchdog is stroked only while
-//! all do. A panic in any task ends the process, and the service manager starts it again.
+//! all do. A panic in any task ends the process, and the service manager starts it again. The end is a
+//! cancellation token: the device tasks are dropped where they wait, the pipeline handles what is queued, the
+//! store closes the flight.
 
 use std::sync::Arc;
 

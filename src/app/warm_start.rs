@@ -122,7 +122,12 @@ pub fn save(store: &StoreHandle, origin: &Origin, t: MonoTime, state: &WarmState
 }
 
 /// Waits for the card to tell what an earlier run knew.
-pub fn wait_for(flight_store: &FlightStore, origin: &Origin, context: &TaskContext, heart: &Heart) -> Earlier {
+pub fn wait_for(
+    flight_store: &FlightStore,
+    origin: &Origin,
+    context: &TaskContext,
+    heart: &Heart,
+) -> Earlier {
     let end = context.clock.now() + PATIENCE;
     while !context.stop.is_cancelled() && context.clock.now() < end {
         heart.beat();

@@ -7,14 +7,13 @@ use std::io;
 use std::ops::{Deref, DerefMut};
 use std::os::fd::AsRawFd;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
-use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use tokio::task::spawn_blocking;
 
-use crate::msg::FrameEncoding;
+use crate::msg::FramePayload;
 use crate::time::MonoTime;
 
 /// Why a device does not deliver.
@@ -122,7 +121,7 @@ pub enum Report {
     /// The bytes one read returned, and when it returned.
     Bytes(MonoTime, Vec<u8>),
     /// A frame, and when it was dequeued.
-    Frame(MonoTime, RawFrame),
+    Frame(MonoTime, FramePayload),
     /// The device does not deliver; it will be tried again.
     Down(Fault),
     /// Something to know about a device that delivers; `count` things of the kind.
@@ -133,23 +132,6 @@ pub enum Report {
 
 /// Where a device task's reports go. The call returns at once.
 pub type Reports<'a> = &'a (dyn Fn(Report) + Sync);
-
-/// A frame as a device gave it, not yet numbered.
-#[derive(Clone, Debug)]
-pub struct RawFrame {
-    /// The driver's exposure stamp, host time.
-    pub t_exposure: MonoTime,
-    /// How to read `data`.
-    pub encoding: FrameEncoding,
-    /// Width in pixels; 0 where the encoding tells.
-    pub width: u32,
-    /// Height in pixels; 0 where the encoding tells.
-    pub height: u32,
-    /// Bytes from one row to the next; 0 where the encoding tells.
-    pub stride: u32,
-    /// The bytes.
-    pub data: Arc<[u8]>,
-}
 
 /// How often a task that waits reports that it answers.
 const BEAT: Duration = Duration::from_millis(250);
@@ -228,8 +210,12 @@ impl<T: Send + 'static> Opened<T> {
     /// Closes the device and waits until it is closed.
     pub(super) async fn close(mut self) {
         let device = self.0.take();
-        blocking(move || drop(catch_panics(|| drop(device)))).await;
+        blocking(move || close(device)).await;
     }
+}
+
+fn close<T>(device: T) {
+    let _ = catch_panics(|| drop(device));
 }
 
 impl<T: Send + 'static> Deref for Opened<T> {
@@ -250,7 +236,7 @@ impl<T: Send + 'static> Drop for Opened<T> {
     /// Where the task is cancelled: closes the device without waiting for it.
     fn drop(&mut self) {
         if let Some(device) = self.0.take() {
-            spawn_blocking(move || drop(catch_panics(|| drop(device))));
+            spawn_blocking(move || close(device));
         }
     }
 }

@@ -7,7 +7,9 @@ use gpiocdev::Request;
 use gpiocdev::line::{EdgeDetection, Value};
 use tokio::io::Interest;
 
-use super::device::{Backoff, Fault, FaultKind, OwnsDescriptor, Report, Reports, blocking, register, wait_for};
+use super::device::{
+    Backoff, Fault, FaultKind, OwnsDescriptor, Report, Reports, blocking, register, wait_for,
+};
 use crate::config::GoingLine;
 
 /// How often a line is read whose controller raises no interrupts.

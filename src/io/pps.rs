@@ -99,8 +99,7 @@ async fn watch(
         wait_for(line.readable(), reports).await?.clear_ready();
         let edge = fetch(line.get_ref())?;
         let new = std::mem::replace(&mut last, edge.assert_sequence) != edge.assert_sequence;
-        if new
-            && let (Ok(sec), Ok(nsec)) = (u64::try_from(edge.assert.sec), u32::try_from(edge.assert.nsec))
+        if new && let (Ok(sec), Ok(nsec)) = (u64::try_from(edge.assert.sec), u32::try_from(edge.assert.nsec))
         {
             pulse(clock.from_realtime(Duration::new(sec, nsec)));
         }

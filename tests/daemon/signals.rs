@@ -48,9 +48,7 @@ fn signals_are_answered_before_the_configuration_is_read() {
     let bench = Bench::new();
     slow_file(&bench.config());
     let daemon = bench.start();
-    daemon.wait_until("signals are taken over", || {
-        daemon.catches(&[Signal::TERM, Signal::INT, Signal::HUP])
-    });
+    daemon.wait_until("signals are taken over", || daemon.catches(&[Signal::TERM, Signal::INT, Signal::HUP]));
 
     // When it is asked to read it again and to end, then it goes on and ends.
     daemon.signal(Signal::HUP);

@@ -11,8 +11,8 @@ use tokio::sync::mpsc;
 use super::CameraSettings;
 use crate::io::capture::CaptureReader;
 use crate::io::clock::HostClock;
-use crate::io::device::{Fault, FaultKind, NoteKind, RawFrame, Report, Reports, wait_for};
-use crate::msg::{EventBody, FrameEncoding};
+use crate::io::device::{Fault, FaultKind, NoteKind, Report, Reports, wait_for};
+use crate::msg::{EventBody, FrameEncoding, FramePayload};
 use crate::time::{MonoTime, Span};
 
 /// Frames that wait for the task, as in a driver's buffers; the player waits while so many do.
@@ -21,7 +21,7 @@ const WAITING: usize = 12;
 /// A recorded frame and when it was delivered, both on the recording's own clock.
 struct Recorded {
     t_recv: MonoTime,
-    frame: RawFrame,
+    frame: FramePayload,
 }
 
 /// What the player delivers.
@@ -29,7 +29,7 @@ enum Played {
     /// The recording can be read.
     Opened,
     /// A frame that is due.
-    Frame(RawFrame),
+    Frame(FramePayload),
     /// The recording cannot be read.
     Unusable(Fault),
 }
@@ -82,8 +82,7 @@ impl Player {
         loop {
             let frames = open(Path::new(&self.path))
                 .map_err(|detail| Fault::new(FaultKind::Missing, &self.path, detail))?;
-            if !std::mem::replace(&mut opened, true)
-                && self.delivered.blocking_send(Played::Opened).is_err()
+            if !std::mem::replace(&mut opened, true) && self.delivered.blocking_send(Played::Opened).is_err()
             {
                 return Ok(());
             }
@@ -125,14 +124,6 @@ fn open(path: &Path) -> Result<Box<dyn Iterator<Item = Recorded>>, String> {
     Ok(Box::new(reader.filter_map(|item| {
         let event = item.event?;
         let EventBody::Frame(frame) = event.body else { return None };
-        let frame = RawFrame {
-            t_exposure: frame.t_exposure,
-            encoding: frame.encoding,
-            width: frame.width,
-            height: frame.height,
-            stride: frame.stride,
-            data: frame.data,
-        };
         Some(Recorded { t_recv: event.t_recv, frame })
     })))
 }
@@ -158,7 +149,7 @@ fn folder(path: &Path) -> Result<impl Iterator<Item = Recorded> + use<>, String>
 }
 
 /// An image file as a frame: PGM as raw grey, JPEG and PNG as they are.
-fn image(t_exposure: MonoTime, file: &Path) -> Option<RawFrame> {
+fn image(t_exposure: MonoTime, file: &Path) -> Option<FramePayload> {
     let data = std::fs::read(file).ok()?;
     let extension = file.extension()?.to_str()?.to_ascii_lowercase();
     let encoding = match extension.as_str() {
@@ -167,13 +158,21 @@ fn image(t_exposure: MonoTime, file: &Path) -> Option<RawFrame> {
             let pixels = data.get(start..start.checked_add(width as usize * height as usize)?)?;
             let data: Arc<[u8]> = Arc::from(pixels);
             let encoding = FrameEncoding::Grey;
-            return Some(RawFrame { t_exposure, encoding, width, height, stride: width, data });
+            return Some(FramePayload { index: 0, t_exposure, encoding, width, height, stride: width, data });
         }
         "jpg" | "jpeg" => FrameEncoding::Jpeg,
         "png" => FrameEncoding::Png,
         _ => FrameEncoding::Unknown,
     };
-    Some(RawFrame { t_exposure, encoding, width: 0, height: 0, stride: 0, data: Arc::from(data) })
+    Some(FramePayload {
+        index: 0,
+        t_exposure,
+        encoding,
+        width: 0,
+        height: 0,
+        stride: 0,
+        data: Arc::from(data),
+    })
 }
 
 /// Width, height and first pixel of a binary 8-bit PGM (`P5`).

@@ -21,10 +21,10 @@ use super::CameraSettings;
 use super::format::{self, FourCc};
 use crate::io::clock::HostClock;
 use crate::io::device::{
-    Fault, FaultKind, NoteKind, Opened, OwnsDescriptor, RawFrame, Report, Reports, blocking, catch_panics,
-    register, wait_for,
+    Fault, FaultKind, NoteKind, Opened, OwnsDescriptor, Report, Reports, blocking, catch_panics, register,
+    wait_for,
 };
-use crate::msg::FrameEncoding;
+use crate::msg::{FrameEncoding, FramePayload};
 use crate::time::{MonoTime, Span};
 
 /// Mapped buffers. One is being copied while the others fill: at 30 frames a second the driver can
@@ -199,8 +199,7 @@ impl Camera {
         stream.set_timeout(self.patience());
         // An error of the driver alone is no readiness to read, but it is to be seen.
         let interest = Interest::READABLE | Interest::ERROR;
-        let ready =
-            register(Descriptor(stream.handle()), interest).map_err(|e| fault(&e))?;
+        let ready = register(Descriptor(stream.handle()), interest).map_err(|e| fault(&e))?;
         let following = Following::default();
         let mut running = Running { camera: self, ready, stream, following, owes_buffer: false };
         let first = running.take_next(clock)?;
@@ -292,7 +291,7 @@ impl Camera {
         following: &mut Following,
         clock: HostClock,
         tell: &mut dyn FnMut(Report),
-    ) -> Option<RawFrame> {
+    ) -> Option<FramePayload> {
         let missed = following
             .sequence
             .replace(meta.sequence)
@@ -317,7 +316,8 @@ impl Camera {
         }
         let t_exposure = self.exposure(meta, t_recv, following, clock, tell);
         let data: Arc<[u8]> = Arc::from(&bytes[..needed.unwrap_or(used)]);
-        Some(RawFrame {
+        Some(FramePayload {
+            index: 0,
             t_exposure,
             encoding: self.encoding,
             width: self.width,

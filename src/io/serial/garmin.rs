@@ -70,7 +70,9 @@ impl GarminSetup {
             };
             match self.answer(body) {
                 Some(true) => self.accepted += 1,
-                Some(false) => return Step::Refused(format!("the receiver answered {body} with other values")),
+                Some(false) => {
+                    return Step::Refused(format!("the receiver answered {body} with other values"));
+                }
                 None if now < asked + GARMIN_ANSWER => return Step::Wait(asked + GARMIN_ANSWER),
                 None if must_answer => {
                     return Step::Refused(format!("the receiver did not answer {body}; is it a Garmin?"));

@@ -108,7 +108,8 @@ impl Reader<'_> {
             && let Some(percent) = share.garbled(bytes)
         {
             let (device, baud) = (&self.settings.device, self.settings.baud);
-            let text = format!("{percent} % of what {device} sends is no text; is its line speed {baud} baud?");
+            let text =
+                format!("{percent} % of what {device} sends is no text; is its line speed {baud} baud?");
             (self.reports)(Report::Note(NoteKind::Garbled, 1, text));
         }
     }
