@@ -12,9 +12,9 @@ use crate::io::clock::HostClock;
 use crate::io::mcap_read::ReadError;
 use crate::io::mcap_write::{McapWriter, WriteError};
 use crate::io::records::{Recorder, topic};
-use crate::msg::{Event, EventBody};
 use crate::pipeline::{DecodedFrame, FrameFault, Output, Pipeline, Ticks};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{Event, EventBody};
+use windhover_base::time::{MonoTime, Span};
 
 /// Events read and frames decoded ahead of the pipeline.
 const AHEAD: usize = 16;

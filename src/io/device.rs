@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use crate::msg::FrameEncoding;
-use crate::time::MonoTime;
+use windhover_base::msg::FrameEncoding;
+use windhover_base::time::MonoTime;
 
 /// Asks threads to end. Copies are the same switch.
 #[derive(Clone, Debug, Default)]

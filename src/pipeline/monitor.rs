@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use super::output::{Health, Notice, NoticeKind, Output, SourceHealth, TargetHealth};
 use crate::config::Config;
-use crate::msg::{Disposition, FixKind, Source, TargetEstimate, TrackStatus};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{Disposition, FixKind, Source, TargetEstimate, TrackStatus};
+use windhover_base::time::{MonoTime, Span};
 
 /// Health is told this often.
 const HEALTH_PERIOD: Span = Span::from_ns(1_000_000_000);

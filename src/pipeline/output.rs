@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use crate::geo::Geodetic;
-use crate::msg::{
+use windhover_base::geo::Geodetic;
+use windhover_base::msg::{
     AttitudeSample, Disposition, FeatureTrack, FixKind, FusionResult, GnssEpoch, MarkerDetection, Ownship,
     Source, Stamped, TargetEstimate,
 };
-use crate::time::{MonoTime, Span};
+use windhover_base::time::{MonoTime, Span};
 
 /// One thing the pipeline says.
 #[derive(Clone, Debug)]

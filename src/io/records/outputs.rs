@@ -8,14 +8,14 @@ use prost_types::Timestamp;
 
 use super::{Record, Schema, topic};
 use crate::config::Config;
-use crate::geo::rot_z;
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
-use crate::msg::{
+use crate::pipeline::{Health, Notice, NoticeKind, Output, SourceHealth};
+use windhover_base::geo::rot_z;
+use windhover_base::msg::{
     AttitudeSample, FeatureTrack, FixKind, FusionResult, GnssEpoch, MarkerDetection, MarkerId, Ownship,
     Stamped, TargetEstimate, TrackStatus,
 };
-use crate::pipeline::{Health, Notice, NoticeKind, Output, SourceHealth};
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// What only a daemon knows of itself (card, link, computer), by name.
 #[derive(Clone, Default, PartialEq, Debug)]
