@@ -16,7 +16,7 @@ use windhover::app::replay::config_of;
 use windhover::config::Config;
 use windhover::io::capture::CaptureReader;
 use windhover::io::clock::HostClock;
-use windhover::pipeline::frame::{self as frames, DecodedFrame};
+use windhover::pixels::{self, DecodedFrame};
 use windhover_base::msg::TagFamily;
 use windhover_base::msg::{
     EventBody, FrameObservations, FramePrediction, GrayImage, ImageView, MarkerDetection, MarkerId,
@@ -215,7 +215,7 @@ fn flight(capture: &Path) -> Result<(), Box<dyn std::error::Error>> {
     ];
     for item in CaptureReader::open(capture)? {
         let Some(EventBody::Frame(payload)) = item.event.map(|event| event.body) else { continue };
-        let image = frames::decode(&payload, true)?;
+        let image = pixels::decode(&payload, true)?;
         ways.iter_mut().for_each(|way| way.take(&image));
     }
     println!(

@@ -14,6 +14,7 @@
 // -- core: values in, values out
 pub mod config;
 pub mod jpeg;
+pub mod pixels;
 pub mod plot;
 pub mod pipeline;
 // -- edge: devices, disk, network

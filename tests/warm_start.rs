@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use windhover::config::Config;
 use windhover::io::capture::CaptureReader;
-use windhover::pipeline::{Output, Pipeline};
+use windhover::pipeline::Pipeline;
+use windhover_base::msg::Output;
 use windhover_base::msg::{Event, EventBody, TrackStatus, WarmState};
 use windhover_base::time::{MonoTime, Span};
 

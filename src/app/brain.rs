@@ -4,8 +4,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::config::Config;
-use crate::pipeline::{Health, Output, Pipeline, Ticks};
-use windhover_base::msg::{Event, EventBody, TargetEstimate};
+use crate::pipeline::{Pipeline, Ticks};
+use windhover_base::msg::{Event, EventBody, Health, Output, TargetEstimate};
 use windhover_base::time::{MonoTime, Span};
 
 use super::card::CardOrders;

@@ -17,8 +17,7 @@ use crate::io::link::{
 };
 use crate::io::mavlink::MavlinkSender;
 use crate::io::records::Record;
-use crate::pipeline::Output;
-use windhover_base::msg::{Event, EventBody, FramePayload};
+use windhover_base::msg::{Event, EventBody, FramePayload, Output};
 use windhover_base::time::{Span, UtcTime};
 
 use super::brain::Board;

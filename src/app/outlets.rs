@@ -4,8 +4,7 @@ use std::sync::Arc;
 
 use crate::config::Config;
 use crate::io::records::{DaemonFigures, Record, Recorder};
-use crate::pipeline::Output;
-use windhover_base::msg::{Event, GnssEpoch, MarkerDetection, Stamped};
+use windhover_base::msg::{Event, GnssEpoch, MarkerDetection, Output, Stamped};
 use windhover_base::time::{MonoTime, UtcTime};
 
 use super::card::Slot;

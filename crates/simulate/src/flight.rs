@@ -11,7 +11,7 @@ use super::line::Line;
 use super::random::{Purpose, Stream};
 use super::render::Renderer;
 use super::world::World;
-use windhover_base::msg::{Event, EventBody, FrameEncoding, FramePayload, GrayImage};
+use windhover_base::msg::{Event, EventBody, FrameEncoding, FramePayload, GrayImage, Source};
 use windhover_base::time::{MonoTime, Span};
 
 /// Makes a JPEG picture of an image. The error says why it cannot.
@@ -177,11 +177,11 @@ impl Iterator for Flight {
         let first = [gnss, compass, frame.map(|f| f.t_recv)].into_iter().flatten().min()?;
         if gnss == Some(first) {
             let (t, bytes) = self.gnss_line.pop()?;
-            return Some(Ok(self.event(t, EventBody::GnssBytes(bytes))));
+            return Some(Ok(self.event(t, EventBody::Bytes { source: Source::Gps, data: bytes })));
         }
         if compass == Some(first) {
             let (t, bytes) = self.compass_line.pop()?;
-            return Some(Ok(self.event(t, EventBody::CompassBytes(bytes))));
+            return Some(Ok(self.event(t, EventBody::Bytes { source: Source::Compass, data: bytes })));
         }
         Some(self.frame_event(frame?))
     }

@@ -8,7 +8,7 @@ use crate::app::flight::{self, Flight};
 use crate::io::mcap_read::ReadError;
 use crate::io::proto::windhover as wh;
 use crate::jpeg::{self, Layout};
-use crate::pipeline::frame::decode;
+use crate::pixels::decode;
 use windhover_base::msg::GrayImage;
 use windhover_base::time::MonoTime;
 

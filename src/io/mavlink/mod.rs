@@ -12,9 +12,8 @@ use std::path::{Path, PathBuf};
 
 use crate::config::Config;
 use crate::io::link::keys::{KeyError, read_private};
-use crate::pipeline::Output;
 use windhover_base::geo::Geodetic;
-use windhover_base::msg::{TargetEstimate, TrackStatus};
+use windhover_base::msg::{Output, TargetEstimate, TrackStatus};
 use windhover_base::time::{MonoTime, Span, UtcTime};
 
 use frame::{Refused, Sender, SigningKey};
