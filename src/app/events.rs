@@ -5,7 +5,7 @@
 
 use crate::config::LogLevel;
 use crate::io::device::NoteKind;
-use crate::pipeline::{Notice, NoticeKind};
+use crate::msg::{Notice, NoticeKind};
 use crate::time::{MonoTime, Span};
 
 use super::log::Line;
@@ -161,8 +161,11 @@ const fn pipeline_row(notice: NoticeKind) -> Row {
         | NoticeKind::Declination
         | NoticeKind::TargetTracking => (Info, 0),
         NoticeKind::TargetCoasting => (Info, 5),
-        NoticeKind::FixLost | NoticeKind::SourceSilent | NoticeKind::FilterReset => (Warn, 0),
-        NoticeKind::TargetLost => (Warn, 0),
+        NoticeKind::FixLost
+        | NoticeKind::SourceSilent
+        | NoticeKind::TerrainMissing
+        | NoticeKind::FilterReset
+        | NoticeKind::TargetLost => (Warn, 0),
         NoticeKind::BytesRefused
         | NoticeKind::FrameUnusable
         | NoticeKind::Dropped
