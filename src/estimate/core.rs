@@ -86,7 +86,8 @@ impl Core {
             t_target: MonoTime::default(),
         };
         let lag_frames = (e.smoother_lag_ms * 1e-3 * config.camera.fps).ceil() as usize;
-        let features = e.features.min(config.detector.ground_features.max(e.features));
+        // No more are in use at once than the detector follows: without any there are no states of them.
+        let features = e.features.min(config.detector.ground_features);
         let state = State::new(
             config.target.len(),
             features,
