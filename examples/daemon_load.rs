@@ -30,8 +30,8 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use windhover::app::replay::config_of;
 use windhover::io::capture::CaptureReader;
 use windhover::io::clock::HostClock;
-use windhover::msg::{EventBody, Source};
-use windhover::time::{MonoTime, Span};
+use windhover_base::msg::{EventBody, Source};
+use windhover_base::time::{MonoTime, Span};
 
 #[derive(Parser)]
 struct Args {

@@ -8,7 +8,7 @@ use crate::config::{Config, Part};
 use crate::io::clock::HostClock;
 use crate::io::device::blocking;
 use crate::io::store::{Recording, Store, StoreNotice, StoreStatus};
-use crate::time::Span;
+use windhover_base::time::Span;
 
 use super::context::TaskContext;
 use super::events::Event;

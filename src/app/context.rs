@@ -5,7 +5,7 @@ use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
 
 use crate::io::clock::HostClock;
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 use super::event_queue::EventQueue;
 use super::log::Log;

@@ -2,12 +2,13 @@
 
 use std::sync::Arc;
 
-use crate::config::{CompassFormat, Config, Part};
+use crate::config::{Config, Part};
 use crate::io::camera::{self, CameraSettings};
 use crate::io::device::{Fault, NoteKind, Report};
 use crate::io::pps;
 use crate::io::serial::{self, SerialSettings};
-use crate::msg::{EventBody, Source};
+use windhover_base::msg::{EventBody, Source};
+use windhover_base::settings::CompassFormat;
 
 use super::context::TaskContext;
 use super::events::Event;

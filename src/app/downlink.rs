@@ -19,8 +19,8 @@ use crate::io::link::{
 };
 use crate::io::mavlink::{self, MavlinkSender};
 use crate::io::records::Record;
-use crate::msg::{Event, EventBody, FramePayload, Output};
-use crate::time::UtcTime;
+use windhover_base::msg::{Event, EventBody, FramePayload, Output};
+use windhover_base::time::UtcTime;
 
 use super::context::TaskContext;
 use super::events::Event as OperatorEvent;

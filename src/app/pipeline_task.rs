@@ -4,10 +4,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::config::Config;
-use crate::geo::Tile;
-use crate::msg::{Event, EventBody, Health, Output, TargetEstimate};
 use crate::pipeline::{Pipeline, TICK, Ticks};
-use crate::time::{MonoTime, Span};
+use windhover_base::geo::Tile;
+use windhover_base::msg::{Event, EventBody, Health, Output, TargetEstimate};
+use windhover_base::time::{MonoTime, Span};
 
 use super::context::TaskContext;
 use super::events::{self, Event as OperatorEvent};
@@ -157,7 +157,7 @@ impl PipelineTask<'_> {
         for output in &outputs {
             match output {
                 Output::Notice(notice) => {
-                    let about = notice.source.map_or("", crate::msg::Source::name);
+                    let about = notice.source.map_or("", windhover_base::msg::Source::name);
                     let line = events::line_of_notice(notice);
                     let event = OperatorEvent::Pipeline(notice.kind);
                     // A target's notices tell its name in their words only.

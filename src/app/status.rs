@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use crate::msg::Health;
+use windhover_base::msg::Health;
 
 use super::health::Figures;
 

@@ -8,7 +8,7 @@ use tokio::sync::oneshot;
 use tokio::task::JoinSet;
 
 use crate::io::clock::HostClock;
-use crate::time::{MonoTime, Span};
+use windhover_base::time::{MonoTime, Span};
 
 /// What happens when a task cannot go on.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]

@@ -15,8 +15,8 @@ use crate::config::{Config, PowerConfig};
 use crate::io::clock::HostClock;
 use crate::io::notify::ServiceManager;
 use crate::io::power::{PowerState, PowerWatch};
-use crate::msg::Source;
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::Source;
+use windhover_base::time::{MonoTime, Span};
 
 /// Everything the health task keeps.
 pub(super) struct Watch {

@@ -13,8 +13,8 @@ use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use tokio::task::spawn_blocking;
 
-use crate::msg::FramePayload;
-use crate::time::MonoTime;
+use windhover_base::msg::FramePayload;
+use windhover_base::time::MonoTime;
 
 /// Why a device does not deliver.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]

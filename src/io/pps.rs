@@ -11,7 +11,7 @@ use tokio::io::Interest;
 
 use super::clock::HostClock;
 use super::device::{Backoff, Fault, FaultKind, Report, Reports, blocking, register, wait_for};
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// `struct pps_ktime` of linux/pps.h.
 #[repr(C)]

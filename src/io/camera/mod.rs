@@ -6,7 +6,7 @@ mod v4l2;
 
 use std::convert::Infallible;
 
-use crate::config::PixelFormat;
+use windhover_base::settings::PixelFormat;
 
 use super::clock::HostClock;
 use super::device::{Backoff, Report, Reports};

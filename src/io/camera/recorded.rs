@@ -12,8 +12,8 @@ use super::CameraSettings;
 use crate::io::capture::CaptureReader;
 use crate::io::clock::HostClock;
 use crate::io::device::{Fault, FaultKind, NoteKind, Report, Reports, wait_for};
-use crate::msg::{EventBody, FrameEncoding, FramePayload};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{EventBody, FrameEncoding, FramePayload};
+use windhover_base::time::{MonoTime, Span};
 
 /// Frames that wait for the task, as in a driver's buffers; the player waits while so many do.
 const WAITING: usize = 12;
@@ -197,7 +197,7 @@ fn pgm_header(data: &[u8]) -> Option<(u32, u32, usize)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::PixelFormat;
+    use windhover_base::settings::PixelFormat;
 
     #[tokio::test]
     async fn a_folder_plays_at_its_own_pace() {

@@ -24,8 +24,8 @@ use crate::io::device::{
     Fault, FaultKind, NoteKind, Opened, OwnsDescriptor, Report, Reports, blocking, catch_panics, register,
     wait_for,
 };
-use crate::msg::{FrameEncoding, FramePayload};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{FrameEncoding, FramePayload};
+use windhover_base::time::{MonoTime, Span};
 
 /// Mapped buffers. One is being copied while the others fill: at 30 frames a second the driver can
 /// run on for a third of a second while this task waits for a processor. A driver that has less memory gives

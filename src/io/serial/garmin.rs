@@ -4,8 +4,8 @@
 //! sentence means accepted; an echo with other values means refused.
 
 use super::GARMIN_ANSWER;
-use crate::decode::{Sentence, framed};
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
+use windhover_decode::{Sentence, framed};
 
 /// What to do now.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -119,7 +119,7 @@ pub(super) fn bodies(text: &str) -> impl Iterator<Item = &str> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::time::Span;
+    use windhover_base::time::Span;
 
     fn at(ms: f64) -> MonoTime {
         MonoTime::from_ns(0) + Span::from_ms(ms)

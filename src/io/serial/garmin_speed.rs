@@ -8,7 +8,7 @@ use super::garmin::{bodies, sentence};
 use super::{Line, READ_BYTES, SerialSettings, left};
 use crate::io::clock::HostClock;
 use crate::io::device::{Fault, NoteKind, Report, Reports, wait_for};
-use crate::time::Span;
+use windhover_base::time::Span;
 
 /// Speeds a receiver may speak and their codes in PGRMC, factory settings first.
 const SPEEDS: [(u32, u8); 4] = [(19_200, 5), (4_800, 3), (38_400, 8), (9_600, 4)];

@@ -10,11 +10,11 @@ use std::time::Duration;
 
 use super::clock::HostClock;
 use super::device::{Backoff, Fault, FaultKind, NoteKind, Report, Reports, wait_for};
-use crate::time::{MonoTime, Span};
 use garbled::TextShare;
 use garmin::{GarminSetup, Step};
 use garmin_speed::Settling;
 use line::Line;
+use windhover_base::time::{MonoTime, Span};
 
 /// What a line is and how it is set.
 #[derive(Clone, PartialEq, Eq, Debug)]
