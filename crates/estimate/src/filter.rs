@@ -14,8 +14,10 @@ use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::{MonoTime, Span};
 
 use super::Site;
-use super::core::{AnyMeasurement, Core, Kind};
-use super::ownship::start;
+use super::blocks::own;
+use super::core::Core;
+use super::sources::{AnyMeasurement, Kind};
+use super::start::start;
 use super::state::State;
 
 /// What the estimator tells.
@@ -44,7 +46,7 @@ pub enum EstimatorOutput {
 /// The joint filter with its history of measurements.
 #[derive(Clone, Debug)]
 pub struct Estimator {
-    pub(super) core: Core,
+    pub(crate) core: Core,
     history: History<AnyMeasurement, State>,
     /// Compass readings heard before there was a state.
     compass: VecDeque<Stamped<AttitudeSample>>,
@@ -202,21 +204,21 @@ impl Estimator {
     /// One line on what the filter believes of the sensors and of the intensities of motion.
     pub fn inside(&self) -> String {
         let (own, l) = (&self.core.state.own, &self.core.state.learnt);
-        let sigma = |i: usize| self.core.state.cov.at(i, i).max(0.0).sqrt();
+        let cov = &self.core.state.cov;
         let targets: Vec<String> =
             l.target_q.iter().map(|q| format!("{:.3}/{:.3}", q[0].sqrt(), q[1].sqrt())).collect();
         format!(
             "heading bias {:.2}±{:.2} deg, tilt gain {:.2}±{:.2}, tilt bias {:.2},{:.2}±{:.2} deg, delay {:.0}±{:.0} ms, \
              sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} force {:.2}/{:.2} targets {} pixels {:.2?} {:.2}",
             own.heading_bias.to_degrees(),
-            sigma(super::state::at::HEADING_BIAS).to_degrees(),
+            cov.sigma(own::HEADING_BIAS, 0).to_degrees(),
             own.tilt_gain,
-            sigma(super::state::at::TILT_GAIN),
+            cov.sigma(own::TILT_GAIN, 0),
             own.tilt_bias.x.to_degrees(),
             own.tilt_bias.y.to_degrees(),
-            sigma(super::state::at::TILT_BIAS).to_degrees(),
+            cov.sigma(own::TILT_BIAS, 0).to_degrees(),
             own.gps_delay_s * 1e3,
-            sigma(super::state::at::GPS_DELAY) * 1e3,
+            cov.sigma(own::GPS_DELAY, 0) * 1e3,
             l.heading_var.sqrt().to_degrees(),
             l.tilt_var.sqrt().to_degrees(),
             l.tilt_rate_q.sqrt(),
@@ -302,11 +304,7 @@ impl Estimator {
         let core = &mut self.core;
         core.state.alive = false;
         core.state.own = Default::default();
-        core.state.targets.fill(Default::default());
-        core.state.features.fill(Default::default());
-        core.state.echoes.iter_mut().for_each(|echo| echo.live = false);
-        core.state.probe.live = false;
-        core.state.cov.fill(0.0);
+        core.state.clear();
         self.compass.clear();
         let t = core.state.t;
         self.history.restart(t, |_| {});
@@ -321,14 +319,14 @@ impl Estimator {
     /// that have not been told yet, in their order.
     fn tell_smoothed_until(&mut self, until: Option<MonoTime>, out: &mut Vec<EstimatorOutput>) {
         loop {
-            let told = self.smoothed_to;
-            let due = |t: MonoTime| until.is_none_or(|u| t <= u) && told.is_none_or(|s| t > s);
-            let echoes = self.core.state.echoes.iter().filter(|e| e.live && due(e.t));
-            let Some(echo) = echoes.min_by_key(|e| e.t) else { return };
+            let last = self.smoothed_to;
+            let due = |t: MonoTime| until.is_none_or(|u| t <= u) && last.is_none_or(|s| t > s);
+            let copies = self.core.state.copies.iter().filter(|copy| copy.in_use && due(copy.t));
+            let Some(copy) = copies.min_by_key(|copy| copy.t) else { return };
             for target in 0..self.core.state.targets.len() {
-                out.push(EstimatorOutput::Smoothed(echo.estimate(&self.core.models, target)));
+                out.push(EstimatorOutput::Smoothed(copy.estimate(&self.core.models, target)));
             }
-            self.smoothed_to = Some(echo.t);
+            self.smoothed_to = Some(copy.t);
         }
     }
 

@@ -17,8 +17,8 @@ use windhover_base::settings::{EstimatorConfig, Rig, TargetModel};
 use windhover_base::time::MonoTime;
 
 use super::Site;
+use super::aid::compass::true_heading;
 use super::models::Models;
-use super::ownship::true_heading;
 
 /// Shortest lever with which (34) gives a yaw rate, m; below it the heading's difference does.
 const SHORTEST_LEVER_M: f64 = 0.1;
@@ -114,7 +114,7 @@ impl PaperEstimator {
     /// The first two markers of the target that are seen, on the ground.
     fn pair(&self, target: usize, frame: &Stamped<FrameObservations>) -> Option<Pair> {
         let model = &self.models.targets[target];
-        if model.model != TargetModel::Ackermann {
+        if model.kind != TargetModel::Ackermann {
             return None;
         }
         let mut seen = model.markers.iter().enumerate().filter_map(|(index, marker)| {

@@ -3,9 +3,11 @@
 
 use nalgebra::{Matrix2, Vector3};
 
+use super::aid::pixel::{target_point, view};
+use super::blocks::{TARGET, own};
 use super::models::Models;
-use super::state::{Own, State, at};
-use super::vision::{target_point, view};
+use super::own::Own;
+use super::state::State;
 use super::*;
 use windhover_base::geo::{Geodetic, Tilt};
 use windhover_base::msg::{
@@ -96,7 +98,7 @@ impl Scene {
         Self { filter, models: Models::new(&rig, &estimator, &site), step: 0, rover: [-2.0, -3.0, 0.0] }
     }
 
-    fn truth(&self, target: usize) -> [f64; at::TARGET] {
+    fn truth(&self, target: usize) -> [f64; TARGET] {
         let t_s = f64::from(self.step) / 15.0;
         let [north, east, turned] = self.rover;
         match target {
@@ -211,13 +213,13 @@ fn numbers_gone_wrong_reset_the_filter_which_says_so_and_goes_on() {
         ("a velocity that is no number", |s| s.own.velocity.x = f64::NAN),
         ("an infinite bias", |s| s.own.gps_bias.y = f64::INFINITY),
         ("a position beyond reason", |s| s.own.position.x = 1e7),
-        ("a variance below zero", |s| s.cov.set(at::ATTITUDE, at::ATTITUDE, -1.0)),
-        ("a variance that is no number", |s| s.cov.set(at::DRAG, at::DRAG, f64::NAN)),
+        ("a variance below zero", |s| s.cov.set_diagonal(own::ATTITUDE, &[-1.0; 3])),
+        ("a variance that is no number", |s| s.cov.set_diagonal(own::DRAG, &[f64::NAN])),
         ("the first target's heading", |s| s.targets[0].mean[2] = f64::NAN),
         ("the second target's speed", |s| s.targets[1].mean[3] = f64::NEG_INFINITY),
         ("the third target's variance", |s| {
-            let place = s.target_at(2);
-            s.cov.set(place, place, f64::NAN);
+            let place = s.layout().target(2).place();
+            s.cov.set_diagonal(place, &[f64::NAN; 2]);
         }),
     ];
     let mut scene = Scene::new();
