@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use windhover::config::CompassFormat;
 use windhover::geo::wrap_angle;
-use windhover::msg::{AttitudeSample, GnssEpoch, NoticeKind, Output, Stamped};
+use windhover::msg::{AttitudeSample, GnssEpoch, NoticeKind, Output, Stamped, TimedOutput};
 use windhover::pipeline::Pipeline;
 use windhover::simulate::{Flight, FrameStorage, Sample, Scenario, SensorSuite, World};
 use windhover::time::{MonoTime, Span};
@@ -17,9 +17,9 @@ type Decoded = (Vec<Stamped<GnssEpoch>>, Vec<Stamped<AttitudeSample>>);
 fn decoded(flight: Flight) -> Decoded {
     let mut pipeline = Pipeline::new(&flight.world().scenario().config);
     let (mut outputs, mut fixes, mut attitudes) = (Vec::new(), Vec::new(), Vec::new());
-    let mut sort = |outputs: &mut Vec<Output>| {
-        for output in outputs.drain(..) {
-            match output {
+    let mut sort = |outputs: &mut Vec<TimedOutput>| {
+        for timed in outputs.drain(..) {
+            match timed.output {
                 Output::Fix(fix) => fixes.push(fix),
                 Output::Attitude(attitude) => attitudes.push(attitude),
                 _ => {}
@@ -198,7 +198,7 @@ fn a_terrain_tile_that_is_missing_is_an_event_of_its_own() {
     }
     // Then it is said once, as what it is, and the datum is settled.
     let count = |kind: NoticeKind| {
-        outputs.iter().filter(|o| matches!(o, Output::Notice(notice) if notice.kind == kind)).count()
+        outputs.iter().filter(|o| matches!(&o.output, Output::Notice(notice) if notice.kind == kind)).count()
     };
     assert_eq!((count(NoticeKind::TerrainMissing), count(NoticeKind::DatumSet)), (1, 1));
 }

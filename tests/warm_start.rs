@@ -4,8 +4,7 @@ use std::path::{Path, PathBuf};
 
 use windhover::config::Config;
 use windhover::io::capture::CaptureReader;
-use windhover::msg::Output;
-use windhover::msg::{Event, EventBody, TrackStatus, WarmState};
+use windhover::msg::{Event, EventBody, Output, TrackStatus, WarmState};
 use windhover::pipeline::Pipeline;
 use windhover::time::{MonoTime, Span};
 
@@ -25,7 +24,7 @@ fn events() -> Vec<Event> {
 fn outputs(pipeline: &mut Pipeline, events: &[Event]) -> Vec<Output> {
     let mut out = Vec::new();
     events.iter().for_each(|event| pipeline.handle(event, &mut out));
-    out
+    out.into_iter().map(|timed| timed.output).collect()
 }
 
 /// When the first estimate with `tracking` was true, and its heading sigma in rad.

@@ -4,9 +4,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::config::Config;
-use crate::msg::{Event, EventBody, Health, Output, TargetEstimate};
-use crate::pipeline::{Pipeline, Ticks};
-use crate::time::{MonoTime, Span};
+use crate::msg::{Event, EventBody, Health, Output, TargetEstimate, TimedOutput};
+use crate::pipeline::Pipeline;
+use crate::time::Span;
 
 use super::card::CardOrders;
 use super::config_file;
@@ -60,7 +60,6 @@ pub fn run(
         origin: Origin::here(config, around.clock),
         outlets,
         pipeline: Pipeline::with_terrain(config, config_file::terrain_of(config)),
-        ticks: Ticks::default(),
         latencies: Latencies::default(),
         outputs: Vec::new(),
     };
@@ -91,9 +90,8 @@ struct Brain<'a> {
     origin: Origin,
     outlets: Outlets,
     pipeline: Pipeline,
-    ticks: Ticks,
     latencies: Latencies,
-    outputs: Vec<Output>,
+    outputs: Vec<TimedOutput>,
 }
 
 impl Brain<'_> {
@@ -121,29 +119,23 @@ impl Brain<'_> {
     }
 
     fn pass_time(&mut self) {
-        let now = self.around.clock.now();
-        for t in self.ticks.until(now) {
+        if let Some(t) = self.pipeline.tick_due(self.around.clock.now()) {
             let tick = self.around.inbox.number(t, EventBody::Tick);
             self.pipeline.handle(&tick, &mut self.outputs);
-            self.pass_on(t);
+            self.pass_on();
         }
     }
 
     fn handle(&mut self, event: &Event) {
-        for t in self.ticks.until(event.t_recv) {
-            let tick = Event { t_recv: t, seq: event.seq, body: EventBody::Tick };
-            self.pipeline.handle(&tick, &mut self.outputs);
-            self.pass_on(t);
-        }
         // Recorded first: what the pipeline stumbles over is on the card.
         self.outlets.event(event);
         self.pipeline.handle(event, &mut self.outputs);
-        self.pass_on(event.t_recv);
+        self.pass_on();
     }
 
     fn finish(&mut self) {
         self.pipeline.finish(&mut self.outputs);
-        self.pass_on(self.around.clock.now());
+        self.pass_on();
         if let Some(all) = self.latencies.of_flight() {
             self.around.log.tell_with(OperatorEvent::Latencies, "", "", |line| {
                 line.count("frames", all.frames)
@@ -154,10 +146,10 @@ impl Brain<'_> {
         }
     }
 
-    /// Passes on what followed from what was heard at `t`.
-    fn pass_on(&mut self, t: MonoTime) {
+    /// Passes on what followed.
+    fn pass_on(&mut self) {
         let outputs = std::mem::take(&mut self.outputs);
-        for output in &outputs {
+        for TimedOutput { t_cause, output } in &outputs {
             match output {
                 Output::Notice(notice) => {
                     let about = notice.source.map_or("", crate::msg::Source::name);
@@ -171,7 +163,7 @@ impl Brain<'_> {
                 Output::Estimate(estimate) => self.estimate(estimate),
                 _ => {}
             }
-            self.outlets.output(output, t);
+            self.outlets.output(output, *t_cause);
         }
         self.outputs = outputs;
         self.outputs.clear();

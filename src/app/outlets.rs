@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::config::Config;
-use crate::io::records::{DaemonFigures, Record, Recorder};
+use crate::io::records::{DaemonFigures, OutputEncoder, Record};
 use crate::msg::{Event, GnssEpoch, MarkerDetection, Output, Stamped};
 use crate::time::{MonoTime, UtcTime};
 
@@ -14,7 +14,7 @@ use super::downlink::Downlink;
 pub struct Outlets {
     slot: Slot,
     downlink: Downlink,
-    recorder: Recorder,
+    recorder: OutputEncoder,
     records: Vec<Record>,
     began: Option<MonoTime>,
     dated: bool,
@@ -27,7 +27,7 @@ impl Outlets {
         Self {
             slot,
             downlink,
-            recorder: Recorder::new(config),
+            recorder: OutputEncoder::new(&config.camera, &config.target),
             records: Vec::new(),
             began: None,
             dated: false,

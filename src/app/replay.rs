@@ -11,9 +11,9 @@ use crate::io::capture::{CaptureItem, CaptureReader, attached_config};
 use crate::io::clock::HostClock;
 use crate::io::mcap_read::ReadError;
 use crate::io::mcap_write::{McapWriter, WriteError};
-use crate::io::records::{Recorder, topic};
-use crate::msg::{Event, EventBody, Output};
-use crate::pipeline::{Pipeline, Ticks};
+use crate::io::records::{OutputEncoder, topic};
+use crate::msg::{EventBody, Output, TimedOutput};
+use crate::pipeline::Pipeline;
 use crate::pixels::{self, DecodedFrame, FrameFault};
 use crate::time::{MonoTime, Span};
 
@@ -138,15 +138,13 @@ fn read_ahead(mut reader: CaptureReader, want_rgb: bool, sender: &SyncSender<Ahe
 struct Run<'a> {
     config: &'a Config,
     pipeline: Pipeline,
-    recorder: Recorder,
-    outputs: Vec<Output>,
+    recorder: OutputEncoder,
+    outputs: Vec<TimedOutput>,
     summary: Summary,
     clock: HostClock,
     started: MonoTime,
     pace: Option<Pace>,
     first: Option<MonoTime>,
-    last: MonoTime,
-    ticks: Ticks,
 }
 
 impl<'a> Run<'a> {
@@ -155,15 +153,13 @@ impl<'a> Run<'a> {
         Self {
             config,
             pipeline: Pipeline::with_terrain(config, config_file::terrain_of(config)),
-            recorder: Recorder::new(config),
+            recorder: OutputEncoder::new(&config.camera, &config.target),
             outputs: Vec::new(),
             summary: Summary::default(),
             clock,
             started: clock.now(),
             pace: realtime.then(Pace::default),
             first: None,
-            last: MonoTime::default(),
-            ticks: Ticks::default(),
         }
     }
 
@@ -196,17 +192,12 @@ impl<'a> Run<'a> {
             if let Some(pace) = &mut self.pace {
                 pace.wait_until(t, &self.clock);
             }
-            for tick in self.ticks.until(t) {
-                let event = Event { t_recv: tick, seq: event.seq, body: EventBody::Tick };
-                self.pipeline.handle(&event, &mut self.outputs);
-                self.deliver(tick, writer.as_mut(), watch)?;
-            }
             self.count(t, &event.body);
             self.pipeline.handle_prepared(&event, prepared, &mut self.outputs);
-            self.deliver(t, writer.as_mut(), watch)?;
+            self.deliver(writer.as_mut(), watch)?;
         }
         self.pipeline.finish(&mut self.outputs);
-        self.deliver(self.last, writer.as_mut(), watch)?;
+        self.deliver(writer.as_mut(), watch)?;
         if let Some(writer) = writer {
             writer.finish()?;
         }
@@ -224,7 +215,6 @@ impl<'a> Run<'a> {
 
     fn count(&mut self, t: MonoTime, body: &EventBody) {
         let first = *self.first.get_or_insert(t);
-        self.last = t;
         self.summary.recorded = t - first;
         self.summary.events += 1;
         self.summary.frames += u64::from(matches!(body, EventBody::Frame(_)));
@@ -232,15 +222,14 @@ impl<'a> Run<'a> {
 
     fn deliver(
         &mut self,
-        t: MonoTime,
         mut writer: Option<&mut FlightWriter>,
         watch: &mut dyn FnMut(Step<'_>),
     ) -> Result<(), ReplayError> {
         let mut records = Vec::new();
-        for output in self.outputs.drain(..) {
+        for TimedOutput { t_cause, output } in self.outputs.drain(..) {
             watch(Step::Output(&output));
             if let Some(writer) = writer.as_deref_mut() {
-                self.recorder.output(&output, t, &mut records);
+                self.recorder.output(&output, t_cause, &mut records);
                 for record in records.drain(..) {
                     writer.write(&record)?;
                 }

@@ -21,7 +21,7 @@ pub use measure::{
     AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, MarkerDetection, MarkerId, Stamped,
 };
 pub use notice::{Notice, NoticeKind};
-pub use output::Output;
+pub use output::{Output, TimedOutput};
 pub use predict::{FramePrediction, MarkerPrediction};
 pub use source::{Delivery, PerSource, Source};
 pub use warm::{WARM_STATES, WarmArrival, WarmFilter, WarmSite, WarmState};

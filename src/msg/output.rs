@@ -42,3 +42,12 @@ pub enum Output {
     /// How everything does, once a second.
     Health(Box<Health>),
 }
+
+/// An output, and when what caused it happened.
+#[derive(Clone, Debug)]
+pub struct TimedOutput {
+    /// Host time of the event, or of the tick before it, from which the output followed.
+    pub t_cause: MonoTime,
+    /// The output.
+    pub output: Output,
+}

@@ -1,15 +1,13 @@
 //! The one path from events to outputs, live and in replay.
 //!
 //! [`Pipeline::handle`] takes what was heard, in the order it was heard, and appends what follows
-//! from it. It reads no clock: time is what the events say, so a replay of the same events gives the
-//! same outputs to the last bit.
+//! from it. It reads no clock: time is what the events say, and so are the ticks at which time-outs are
+//! looked at, so a replay of the same events gives the same outputs to the last bit.
 
 mod lines;
 mod monitor;
 mod site;
 mod ticks;
-
-pub use ticks::{TICK, Ticks};
 
 use std::sync::Arc;
 
@@ -19,14 +17,15 @@ use crate::estimate::{Estimator, EstimatorOutput, PaperEstimator};
 use crate::geo::{Geodetic, Tile};
 use crate::msg::{
     AttitudeSample, Event, EventBody, FrameObservations, FramePayload, FramePrediction, GnssEpoch,
-    MarkerDetection, MarkerId, NoticeKind, Output, Source, Stamped, TargetEstimate, TrackStatus, WarmFilter,
-    WarmSite, WarmState,
+    MarkerDetection, MarkerId, NoticeKind, Output, Source, Stamped, TargetEstimate, TimedOutput, TrackStatus,
+    WarmFilter, WarmSite, WarmState,
 };
 use crate::pixels::{self, DecodedFrame, FrameFault};
 use crate::time::{MonoTime, Span};
 use lines::{CompassLine, GpsLine};
 use monitor::{Monitor, notice};
 use site::SiteFinder;
+use ticks::Ticks;
 
 /// Events in, outputs out.
 pub struct Pipeline {
@@ -42,7 +41,11 @@ pub struct Pipeline {
     /// An earlier run's filter, until there is one to continue it.
     warm: Option<WarmFilter>,
     monitor: Monitor,
+    ticks: Ticks,
+    /// Time of the last event or tick.
+    now: MonoTime,
     last_exposure: Option<MonoTime>,
+    outputs: Vec<Output>,
     epochs: Vec<Stamped<GnssEpoch>>,
     samples: Vec<Stamped<AttitudeSample>>,
     estimated: Vec<EstimatorOutput>,
@@ -76,7 +79,10 @@ impl Pipeline {
             estimators: None,
             warm: None,
             monitor: Monitor::new(config),
+            ticks: Ticks::default(),
+            now: MonoTime::default(),
             last_exposure: None,
+            outputs: Vec::new(),
             epochs: Vec::new(),
             samples: Vec::new(),
             estimated: Vec::new(),
@@ -94,13 +100,53 @@ impl Pipeline {
         })
     }
 
-    /// Takes an event; appends what follows from it.
-    pub fn handle(&mut self, event: &Event, out: &mut Vec<Output>) {
+    /// Takes an event; appends what follows from it and from the time that passed before it.
+    pub fn handle(&mut self, event: &Event, out: &mut Vec<TimedOutput>) {
         self.handle_prepared(event, None, out);
+    }
+
+    /// The latest tick that is due at `now`; `None` where it was made already. Where nothing arrives, an
+    /// [`EventBody::Tick`] of this time lets time pass.
+    pub fn tick_due(&mut self, now: MonoTime) -> Option<MonoTime> {
+        self.ticks.due(now)
     }
 
     /// As [`Self::handle`], with the event's frame already decoded elsewhere.
     pub fn handle_prepared(
+        &mut self,
+        event: &Event,
+        prepared: Option<Result<DecodedFrame, FrameFault>>,
+        out: &mut Vec<TimedOutput>,
+    ) {
+        let mut outputs = std::mem::take(&mut self.outputs);
+        for t in self.ticks.until(event.t_recv) {
+            self.tick(t, event.seq, &mut outputs);
+            self.pass_on(t, &mut outputs, out);
+        }
+        if !matches!(event.body, EventBody::Tick) {
+            self.event(event, prepared, &mut outputs);
+            self.pass_on(event.t_recv, &mut outputs, out);
+        }
+        self.outputs = outputs;
+    }
+
+    /// What followed from what happened at `t`.
+    fn pass_on(&mut self, t: MonoTime, outputs: &mut Vec<Output>, out: &mut Vec<TimedOutput>) {
+        self.now = t;
+        out.extend(outputs.drain(..).map(|output| TimedOutput { t_cause: t, output }));
+    }
+
+    fn tick(&mut self, t: MonoTime, seq: u64, out: &mut Vec<Output>) {
+        self.monitor.advance(t, out);
+        self.gps.tick(t, seq, &mut self.epochs);
+        self.take_epochs(t, out);
+        if let Some(estimators) = &mut self.estimators {
+            estimators.joint.tick(t, &mut self.estimated);
+        }
+        self.take_estimated(t, out);
+    }
+
+    fn event(
         &mut self,
         event: &Event,
         prepared: Option<Result<DecodedFrame, FrameFault>>,
@@ -115,17 +161,9 @@ impl Pipeline {
                 self.frame(frame, decoded, event, out);
             }
             EventBody::Dropped { source, count } => self.monitor.dropped(*source, t, *count, out),
-            EventBody::Tick => {
-                self.gps.tick(t, event.seq, &mut self.epochs);
-                self.take_epochs(t, out);
-                if let Some(estimators) = &mut self.estimators {
-                    estimators.joint.tick(t, &mut self.estimated);
-                }
-                self.take_estimated(t, out);
-            }
             EventBody::Pulse => self.gps.pulse(t),
             EventBody::Warm(state) => self.resume(state),
-            EventBody::SourceUp(_) | EventBody::SourceDown(_) => {}
+            EventBody::Tick | EventBody::SourceUp(_) | EventBody::SourceDown(_) => {}
         }
     }
 
@@ -135,14 +173,16 @@ impl Pipeline {
     }
 
     /// The recording ends here: what was still held back follows.
-    pub fn finish(&mut self, out: &mut Vec<Output>) {
+    pub fn finish(&mut self, out: &mut Vec<TimedOutput>) {
+        let mut outputs = std::mem::take(&mut self.outputs);
         self.gps.finish(&mut self.epochs);
         let t = self.epochs.last().map_or(self.last_exposure.unwrap_or_default(), |e| e.t_recv);
-        self.take_epochs(t, out);
+        self.take_epochs(t, &mut outputs);
         if let Some(estimators) = &mut self.estimators {
             estimators.joint.finish(&mut self.estimated);
         }
-        self.take_estimated(t, out);
+        self.take_estimated(t, &mut outputs);
+        self.pass_on(self.now, &mut outputs, out);
     }
 
     /// Continues from what an earlier run of the same flight had learnt: site, clock fit, sensors' slow
