@@ -8,13 +8,13 @@ use crate::msg::{Event, EventBody, Health, Output, TargetEstimate, TimedOutput};
 use crate::pipeline::Pipeline;
 use crate::time::Span;
 
-use super::card::CardOrders;
+use super::card::{CardOrders, Slot};
 use super::config_file;
 use super::devices::Surroundings;
 use super::events::{self, Event as OperatorEvent};
 use super::health::{self, Figures};
 use super::latencies::Latencies;
-use super::outlets::Outlets;
+use super::sink::{Outlets, Sink};
 use super::supervise::Heart;
 use super::warm::{self, Earlier, Origin};
 
@@ -49,7 +49,7 @@ pub fn run(
     config: &Config,
     around: &Surroundings,
     board: &Board,
-    outlets: Outlets,
+    (slot, outlets): (Slot, Outlets<Box<dyn Sink>>),
     orders: &CardOrders,
     heart: &Heart,
 ) {
@@ -58,6 +58,7 @@ pub fn run(
         around,
         board,
         origin: Origin::here(config, around.clock),
+        slot,
         outlets,
         pipeline: Pipeline::with_terrain(config, config_file::terrain_of(config)),
         latencies: Latencies::default(),
@@ -88,7 +89,8 @@ struct Brain<'a> {
     around: &'a Surroundings,
     board: &'a Board,
     origin: Origin,
-    outlets: Outlets,
+    slot: Slot,
+    outlets: Outlets<Box<dyn Sink>>,
     pipeline: Pipeline,
     latencies: Latencies,
     outputs: Vec<TimedOutput>,
@@ -102,7 +104,7 @@ impl Brain<'_> {
             return;
         }
         let tell = |words: String| self.around.log.tell(OperatorEvent::WarmStart, "", words);
-        match warm::wait_for(self.outlets.slot(), &self.origin, self.around, heart) {
+        match warm::wait_for(&self.slot, &self.origin, self.around, heart) {
             Earlier::Known(state, age) => {
                 tell(format!("continues from what was known {:.1} s ago", age.s()));
                 let body = EventBody::Warm(state);
@@ -149,8 +151,8 @@ impl Brain<'_> {
     /// Passes on what followed.
     fn pass_on(&mut self) {
         let outputs = std::mem::take(&mut self.outputs);
-        for TimedOutput { t_cause, output } in &outputs {
-            match output {
+        for timed in &outputs {
+            match &timed.output {
                 Output::Notice(notice) => {
                     let about = notice.source.map_or("", crate::msg::Source::name);
                     let line = events::line_of_notice(notice);
@@ -163,7 +165,7 @@ impl Brain<'_> {
                 Output::Estimate(estimate) => self.estimate(estimate),
                 _ => {}
             }
-            self.outlets.output(output, *t_cause);
+            self.outlets.output(timed);
         }
         self.outputs = outputs;
         self.outputs.clear();
@@ -185,7 +187,7 @@ impl Brain<'_> {
         });
         self.outlets.figures(figures.by_name());
         self.around.log.write(health::line(health, self.config, Some(&figures)));
-        if let (Some(state), Some(store)) = (self.pipeline.warm_state(), self.outlets.slot().get()) {
+        if let (Some(state), Some(store)) = (self.pipeline.warm_state(), self.slot.get()) {
             warm::save(&store, &self.origin, health.t, &state);
         }
     }

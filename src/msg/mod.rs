@@ -18,7 +18,8 @@ pub use event::{Event, EventBody, FrameEncoding, FramePayload};
 pub use health::{Health, SourceHealth, TargetHealth};
 pub use image::{GrayImage, ImageView, RgbImage};
 pub use measure::{
-    AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, MarkerDetection, MarkerId, Stamped,
+    AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, MarkerDetection, MarkerId,
+    Measurement, Stamped,
 };
 pub use notice::{Notice, NoticeKind};
 pub use output::{Output, TimedOutput};

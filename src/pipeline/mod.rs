@@ -17,12 +17,12 @@ use crate::estimate::{Estimator, EstimatorOutput, PaperEstimator};
 use crate::geo::{Geodetic, Tile};
 use crate::msg::{
     AttitudeSample, Event, EventBody, FrameObservations, FramePayload, FramePrediction, GnssEpoch,
-    MarkerDetection, MarkerId, NoticeKind, Output, Source, Stamped, TargetEstimate, TimedOutput, TrackStatus,
-    WarmFilter, WarmSite, WarmState,
+    MarkerDetection, MarkerId, Measurement, NoticeKind, Output, Source, Stamped, TargetEstimate, TimedOutput,
+    TrackStatus, WarmFilter, WarmSite, WarmState,
 };
 use crate::pixels::{self, DecodedFrame, FrameFault};
 use crate::time::{MonoTime, Span};
-use lines::{CompassLine, GpsLine};
+use lines::Lines;
 use monitor::{Monitor, notice};
 use site::SiteFinder;
 use ticks::Ticks;
@@ -31,8 +31,7 @@ use ticks::Ticks;
 pub struct Pipeline {
     config: Config,
     want_rgb: bool,
-    gps: GpsLine,
-    compass: CompassLine,
+    lines: Lines,
     detector: FrameDetector,
     observations: FrameObservations,
     prediction: FramePrediction,
@@ -46,8 +45,7 @@ pub struct Pipeline {
     now: MonoTime,
     last_exposure: Option<MonoTime>,
     outputs: Vec<Output>,
-    epochs: Vec<Stamped<GnssEpoch>>,
-    samples: Vec<Stamped<AttitudeSample>>,
+    measured: Vec<Measurement>,
     estimated: Vec<EstimatorOutput>,
     papered: Vec<TargetEstimate>,
 }
@@ -70,8 +68,7 @@ impl Pipeline {
         Self {
             config: config.clone(),
             want_rgb: wants_rgb(config),
-            gps: GpsLine::new(config),
-            compass: CompassLine::new(config),
+            lines: Lines::new(&config.gps, &config.compass),
             detector: FrameDetector::new(config),
             observations: FrameObservations::default(),
             prediction: FramePrediction::default(),
@@ -83,8 +80,7 @@ impl Pipeline {
             now: MonoTime::default(),
             last_exposure: None,
             outputs: Vec::new(),
-            epochs: Vec::new(),
-            samples: Vec::new(),
+            measured: Vec::new(),
             estimated: Vec::new(),
             papered: Vec::new(),
         }
@@ -95,7 +91,7 @@ impl Pipeline {
         let estimators = self.estimators.as_ref()?;
         Some(WarmState {
             site: estimators.site,
-            arrivals: self.gps.arrivals(),
+            arrivals: self.lines.gps.arrivals(),
             filter: estimators.joint.warm_state(),
         })
     }
@@ -138,8 +134,12 @@ impl Pipeline {
 
     fn tick(&mut self, t: MonoTime, seq: u64, out: &mut Vec<Output>) {
         self.monitor.advance(t, out);
-        self.gps.tick(t, seq, &mut self.epochs);
-        self.take_epochs(t, out);
+        for &source in Source::ALL {
+            if let Some(line) = self.lines.of(source) {
+                line.tick(t, seq, &mut self.measured);
+                self.take_measured(source, t, out);
+            }
+        }
         if let Some(estimators) = &mut self.estimators {
             estimators.joint.tick(t, &mut self.estimated);
         }
@@ -161,7 +161,7 @@ impl Pipeline {
                 self.frame(frame, decoded, event, out);
             }
             EventBody::Dropped { source, count } => self.monitor.dropped(*source, t, *count, out),
-            EventBody::Pulse => self.gps.pulse(t),
+            EventBody::Pulse => self.lines.gps.pulse(t),
             EventBody::Warm(state) => self.resume(state),
             EventBody::Tick | EventBody::SourceUp(_) | EventBody::SourceDown(_) => {}
         }
@@ -175,13 +175,16 @@ impl Pipeline {
     /// The recording ends here: what was still held back follows.
     pub fn finish(&mut self, out: &mut Vec<TimedOutput>) {
         let mut outputs = std::mem::take(&mut self.outputs);
-        self.gps.finish(&mut self.epochs);
-        let t = self.epochs.last().map_or(self.last_exposure.unwrap_or_default(), |e| e.t_recv);
-        self.take_epochs(t, &mut outputs);
+        for &source in Source::ALL {
+            if let Some(line) = self.lines.of(source) {
+                line.finish(&mut self.measured);
+                self.take_measured(source, self.now, &mut outputs);
+            }
+        }
         if let Some(estimators) = &mut self.estimators {
             estimators.joint.finish(&mut self.estimated);
         }
-        self.take_estimated(t, &mut outputs);
+        self.take_estimated(self.now, &mut outputs);
         self.pass_on(self.now, &mut outputs, out);
     }
 
@@ -191,40 +194,49 @@ impl Pipeline {
         if self.estimators.is_some() {
             return;
         }
-        self.gps.resume(&warm.arrivals);
+        self.lines.gps.resume(&warm.arrivals);
         self.finder.resume(warm.site);
         self.warm = warm.filter.clone().filter(WarmFilter::is_sound);
     }
 
     fn bytes(&mut self, source: Source, bytes: &[u8], event: &Event, out: &mut Vec<Output>) {
-        match source {
-            Source::Gps => self.gnss_bytes(bytes, event, out),
-            Source::Compass => self.compass_bytes(bytes, event, out),
-            Source::Camera => {}
-        }
+        let t = event.t_recv;
+        let Some(line) = self.lines.of(source) else { return };
+        line.push(bytes, t, event.seq, &mut self.measured);
+        let (refused, why) = lines::refused(line.counts());
+        self.monitor.refused(source, t, refused, &why, out);
+        self.take_measured(source, t, out);
     }
 
-    fn gnss_bytes(&mut self, bytes: &[u8], event: &Event, out: &mut Vec<Output>) {
-        self.gps.push(bytes, event.t_recv, event.seq, &mut self.epochs);
-        let (refused, why) = self.gps.refused();
-        self.monitor.refused(Source::Gps, event.t_recv, refused, &why, out);
-        self.take_epochs(event.t_recv, out);
-    }
-
-    fn take_epochs(&mut self, t: MonoTime, out: &mut Vec<Output>) {
-        for epoch in std::mem::take(&mut self.epochs) {
-            self.monitor.heard(Source::Gps, t, out);
-            self.monitor.fix(t, epoch.value.fix, epoch.value.sats, self.gps.clock_sigma(), out);
-            out.push(Output::Fix(epoch));
-            if self.estimators.is_none() {
-                self.settle(&epoch.value, t, out);
-            }
-            if let Some(estimators) = &mut self.estimators {
-                estimators.joint.gnss(&epoch, &mut self.estimated);
-                estimators.paper.gnss(&epoch, &mut self.papered);
+    fn take_measured(&mut self, source: Source, t: MonoTime, out: &mut Vec<Output>) {
+        for measurement in std::mem::take(&mut self.measured) {
+            self.monitor.heard(source, t, out);
+            match measurement {
+                Measurement::Gnss(epoch) => self.gnss(&epoch, t, out),
+                Measurement::Attitude(sample) => self.attitude(&sample, out),
             }
         }
         self.take_estimated(t, out);
+    }
+
+    fn gnss(&mut self, epoch: &Stamped<GnssEpoch>, t: MonoTime, out: &mut Vec<Output>) {
+        self.monitor.fix(t, epoch.value.fix, epoch.value.sats, self.lines.gps.clock_sigma(), out);
+        out.push(Output::Fix(*epoch));
+        if self.estimators.is_none() {
+            self.settle(&epoch.value, t, out);
+        }
+        if let Some(estimators) = &mut self.estimators {
+            estimators.joint.gnss(epoch, &mut self.estimated);
+            estimators.paper.gnss(epoch, &mut self.papered);
+        }
+    }
+
+    fn attitude(&mut self, sample: &Stamped<AttitudeSample>, out: &mut Vec<Output>) {
+        out.push(Output::Attitude(*sample));
+        if let Some(estimators) = &mut self.estimators {
+            estimators.joint.attitude(sample, &mut self.estimated);
+            estimators.paper.attitude(sample, &mut self.papered);
+        }
     }
 
     fn settle(&mut self, epoch: &GnssEpoch, t: MonoTime, out: &mut Vec<Output>) {
@@ -248,21 +260,6 @@ impl Pipeline {
         }
         let paper = PaperEstimator::new(&self.config, &settled.site);
         self.estimators = Some(Estimators { joint, paper, site: settled.warm });
-    }
-
-    fn compass_bytes(&mut self, bytes: &[u8], event: &Event, out: &mut Vec<Output>) {
-        self.compass.push(bytes, event.t_recv, event.seq, &mut self.samples);
-        let (refused, why) = self.compass.refused();
-        self.monitor.refused(Source::Compass, event.t_recv, refused, &why, out);
-        for sample in std::mem::take(&mut self.samples) {
-            self.monitor.heard(Source::Compass, event.t_recv, out);
-            out.push(Output::Attitude(sample));
-            if let Some(estimators) = &mut self.estimators {
-                estimators.joint.attitude(&sample, &mut self.estimated);
-                estimators.paper.attitude(&sample, &mut self.papered);
-            }
-        }
-        self.take_estimated(event.t_recv, out);
     }
 
     fn frame(

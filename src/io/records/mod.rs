@@ -9,7 +9,7 @@ pub mod warm_message;
 
 pub use events::{EventDecoder, KeptMessage, is_event, of_event, topic_of_event};
 pub use messages::{detections, health, ownship, target_state};
-pub use outputs::{DaemonFigures, OutputEncoder};
+pub use outputs::{DaemonFigures, OutputEncoder, opening};
 pub use schema::Schema;
 
 use std::borrow::Cow;

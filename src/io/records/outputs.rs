@@ -24,9 +24,30 @@ pub struct DaemonFigures {
     pub words: BTreeMap<String, String>,
 }
 
+/// Records that every file begins with: intrinsics and the camera's mount.
+pub fn opening(camera: &CameraConfig, t: MonoTime) -> Vec<Record> {
+    let k = &camera.intrinsics;
+    let calibration = fox::CameraCalibration {
+        timestamp: Some(timestamp(t)),
+        frame_id: "camera".into(),
+        width: camera.width,
+        height: camera.height,
+        distortion_model: "plumb_bob".into(),
+        d: k.distortion.to_vec(),
+        k: vec![k.fx, k.fx * k.skew, k.cx, 0.0, k.fy, k.cy, 0.0, 0.0, 1.0],
+        r: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        p: vec![k.fx, 0.0, k.cx, 0.0, 0.0, k.fy, k.cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    };
+    let body_from_camera = UnitQuaternion::from_rotation_matrix(&camera.mount.body_from_camera());
+    let mount = transform(t, "body", "camera", camera.mount.position(), &body_from_camera);
+    vec![
+        record(topic::CAMERA_CALIBRATION.into(), Schema::CameraCalibration, t, t, &calibration),
+        record(topic::TF.into(), Schema::FrameTransform, t, t, &mount),
+    ]
+}
+
 /// Turns outputs into records.
 pub struct OutputEncoder {
-    camera: CameraConfig,
     targets: Vec<String>,
     datum_height_m: f64,
     /// What the next health message tells of the daemon.
@@ -34,37 +55,13 @@ pub struct OutputEncoder {
 }
 
 impl OutputEncoder {
-    /// For outputs of a pipeline with this camera and these targets.
-    pub fn new(camera: &CameraConfig, targets: &[TargetConfig]) -> Self {
+    /// For outputs of a pipeline with these targets.
+    pub fn new(targets: &[TargetConfig]) -> Self {
         Self {
-            camera: camera.clone(),
             targets: targets.iter().map(|target| target.name.clone()).collect(),
             datum_height_m: 0.0,
             figures: DaemonFigures::default(),
         }
-    }
-
-    /// Records that every file begins with: intrinsics and the camera's mount.
-    pub fn opening(&self, t: MonoTime) -> Vec<Record> {
-        let camera = &self.camera;
-        let k = &camera.intrinsics;
-        let calibration = fox::CameraCalibration {
-            timestamp: Some(timestamp(t)),
-            frame_id: "camera".into(),
-            width: camera.width,
-            height: camera.height,
-            distortion_model: "plumb_bob".into(),
-            d: k.distortion.to_vec(),
-            k: vec![k.fx, k.fx * k.skew, k.cx, 0.0, k.fy, k.cy, 0.0, 0.0, 1.0],
-            r: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-            p: vec![k.fx, 0.0, k.cx, 0.0, 0.0, k.fy, k.cy, 0.0, 0.0, 0.0, 1.0, 0.0],
-        };
-        let body_from_camera = UnitQuaternion::from_rotation_matrix(&camera.mount.body_from_camera());
-        let mount = transform(t, "body", "camera", camera.mount.position(), &body_from_camera);
-        vec![
-            record(topic::CAMERA_CALIBRATION.into(), Schema::CameraCalibration, t, t, &calibration),
-            record(topic::TF.into(), Schema::FrameTransform, t, t, &mount),
-        ]
     }
 
     /// Appends the records of an output; `log` is when the event that caused it was heard.
