@@ -4,9 +4,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::config::Config;
-use crate::msg::{Event, EventBody, Health, Output, TargetEstimate, TimedOutput};
 use crate::pipeline::Pipeline;
-use crate::time::Span;
+use windhover_base::msg::{Event, EventBody, Health, Output, TargetEstimate, TimedOutput};
+use windhover_base::time::Span;
 
 use super::card::{CardOrders, Slot};
 use super::config_file;
@@ -154,7 +154,7 @@ impl Brain<'_> {
         for timed in &outputs {
             match &timed.output {
                 Output::Notice(notice) => {
-                    let about = notice.source.map_or("", crate::msg::Source::name);
+                    let about = notice.source.map_or("", windhover_base::msg::Source::name);
                     let line = events::line_of_notice(notice);
                     let event = OperatorEvent::Pipeline(notice.kind);
                     // A target's notices tell its name in their words only.

@@ -2,8 +2,8 @@
 
 use crate::config::{Config, LogLevel};
 use crate::io::records::DaemonFigures;
-use crate::msg::{FixKind, Health, Source, SourceHealth, TargetHealth, TrackStatus};
-use crate::time::Span;
+use windhover_base::msg::{FixKind, Health, Source, SourceHealth, TargetHealth, TrackStatus};
+use windhover_base::time::Span;
 
 use super::log::{Line, Value};
 
@@ -175,8 +175,11 @@ mod tests {
         let numbers: Vec<(&str, f64)> = told.figures.iter().map(|(name, value)| (&**name, *value)).collect();
         assert_eq!(numbers, [("card_free_mb", 812.0), ("latency_p99_ms", 31.0)]);
         assert_eq!(told.words.iter().map(|(a, b)| (&**a, &**b)).collect::<Vec<_>>(), [("card", "ok")]);
-        let text =
-            of_daemon(Line::new(crate::time::MonoTime::default(), LogLevel::Info, "health"), &figures).text();
+        let text = of_daemon(
+            Line::new(windhover_base::time::MonoTime::default(), LogLevel::Info, "health"),
+            &figures,
+        )
+        .text();
         assert!(text.contains("latency_p99_ms=31.0 card=ok card_free_mb=812"), "{text}");
     }
 

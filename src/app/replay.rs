@@ -14,10 +14,11 @@ use crate::io::clock::HostClock;
 use crate::io::mcap_read::ReadError;
 use crate::io::mcap_write::WriteError;
 use crate::io::records::OutputEncoder;
-use crate::msg::{EventBody, Output, TimedOutput};
 use crate::pipeline::Pipeline;
 use crate::pixels::{self, DecodedFrame, FrameFault};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{Event, EventBody, Output};
+use windhover_base::msg::{EventBody, Output, TimedOutput};
+use windhover_base::time::{MonoTime, Span};
 
 /// Events read and frames decoded ahead of the pipeline.
 const AHEAD: usize = 16;

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::io::records::{DaemonFigures, OutputEncoder, Record};
-use crate::msg::{Event, TimedOutput};
+use windhover_base::msg::{Event, TimedOutput};
 
 /// A record on its way out.
 #[derive(Clone, Debug)]
@@ -83,9 +83,9 @@ impl<S: Sink> Outlets<S> {
 mod tests {
     use super::*;
     use crate::config::Config;
-    use crate::geo::Geodetic;
-    use crate::msg::{EventBody, Output};
-    use crate::time::MonoTime;
+    use windhover_base::geo::Geodetic;
+    use windhover_base::msg::{EventBody, Output};
+    use windhover_base::time::MonoTime;
 
     /// Counts what it is given; numbers records where it is told to, and keeps the numbers it sees.
     #[derive(Default)]

@@ -8,8 +8,8 @@ use std::path::Path;
 use super::mcap_read::{self, McapReader, RawMessage, ReadError};
 use super::mcap_write::{CONFIG_ATTACHMENT, McapWriter, WriteError};
 use super::records::{self, EventDecoder, FRAME_NUMBER_KEY, IN_SEQUENCE, KeptMessage};
-use crate::msg::{Event, EventBody};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{Event, EventBody};
+use windhover_base::time::{MonoTime, Span};
 
 /// Messages are put in order of their log time over this span: writers of several threads do not
 /// keep it exactly.

@@ -1,6 +1,6 @@
 //! When time passes: the instants at which the pipeline looks at time-outs, live and in replay alike.
 
-use crate::time::{MonoTime, Span};
+use windhover_base::time::{MonoTime, Span};
 
 /// Time between two ticks.
 const TICK: Span = Span::from_ns(100_000_000);

@@ -5,11 +5,11 @@ use std::sync::Arc;
 use crate::app::card::Slot;
 use crate::app::downlink::Downlink;
 use crate::app::sink::{OutgoingRecord, Sink};
-use crate::config::CameraConfig;
 use crate::io::records;
 use crate::io::store::StoreHandle;
-use crate::msg::{Event, GnssEpoch, MarkerDetection, Output, Stamped, TimedOutput};
-use crate::time::{MonoTime, UtcTime};
+use windhover_base::msg::{Event, GnssEpoch, MarkerDetection, Output, Stamped, TimedOutput};
+use windhover_base::settings::CameraConfig;
+use windhover_base::time::{MonoTime, UtcTime};
 
 /// Keeps everything on the data card, while there is one.
 pub struct CardSink {

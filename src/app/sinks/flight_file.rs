@@ -5,11 +5,11 @@ use std::io::BufWriter;
 use std::path::PathBuf;
 
 use crate::app::sink::{OutgoingRecord, Sink};
-use crate::config::CameraConfig;
 use crate::io::mcap_read::RawMessage;
 use crate::io::mcap_write::{McapWriter, WriteError};
 use crate::io::records::{self, topic};
-use crate::time::MonoTime;
+use windhover_base::settings::CameraConfig;
+use windhover_base::time::MonoTime;
 
 /// Writes a flight; the file is made when the first message is there.
 pub struct FlightFile {

@@ -2,7 +2,7 @@
 
 use crate::app::downlink::Downlink;
 use crate::app::sink::{OutgoingRecord, Sink};
-use crate::msg::{Event, TimedOutput};
+use windhover_base::msg::{Event, TimedOutput};
 
 /// Gives the link what goes down, and records the numbers under which stations know them.
 pub struct LinkSink(Downlink);

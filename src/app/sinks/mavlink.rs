@@ -2,7 +2,7 @@
 
 use crate::app::downlink::Downlink;
 use crate::app::sink::Sink;
-use crate::msg::TimedOutput;
+use windhover_base::msg::TimedOutput;
 
 /// Gives MAVLink the outputs of which its messages are made.
 pub struct MavlinkSink(Downlink);

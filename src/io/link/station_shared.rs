@@ -14,7 +14,7 @@ use super::peer::Peer;
 use super::ranges::RangeSet;
 use super::received_numbers::{Progress, ReceivedNumbers};
 use crate::io::proto::link::Thumbnail;
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// Topic and schema of what arrives.
 #[derive(Clone, PartialEq, Eq, Debug)]

@@ -6,8 +6,8 @@ use prost::{DecodeError, Message as _};
 
 use super::{Record, Schema, topic, warm_message};
 use crate::io::proto::{foxglove, host_time, timestamp, windhover};
-use crate::msg::{Delivery, Event, EventBody, FrameEncoding, FramePayload, Source};
-use crate::time::MonoTime;
+use windhover_base::msg::{Delivery, Event, EventBody, FrameEncoding, FramePayload, Source};
+use windhover_base::time::MonoTime;
 
 /// Frame of reference of images.
 const CAMERA_FRAME: &str = "camera";
@@ -203,7 +203,7 @@ fn to_frame(message: &KeptMessage<'_>, index: u32) -> Result<FramePayload, Decod
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::msg::{WarmSite, WarmState};
+    use windhover_base::msg::{WarmSite, WarmState};
 
     fn frame(encoding: FrameEncoding) -> FramePayload {
         let t_exposure = MonoTime::from_ns(5);

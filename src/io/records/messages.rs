@@ -4,11 +4,11 @@ use nalgebra::{UnitQuaternion, Vector3};
 use prost_types::Timestamp;
 
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
-use crate::msg::{
+use windhover_base::msg::{
     FeatureTrack, FixKind, Health, MarkerDetection, MarkerId, Notice, NoticeKind, Ownship, SourceHealth,
     TargetEstimate, TrackStatus,
 };
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 pub(super) fn stamp(t: MonoTime) -> Option<Timestamp> {
     Some(timestamp(t))

@@ -9,11 +9,11 @@ use super::messages::{
     annotations, detections, fix_number, health, log_message, ownship, stamp, target_state, transform,
 };
 use super::{Record, Schema, topic};
-use crate::config::{CameraConfig, TargetConfig};
-use crate::geo::rot_z;
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
-use crate::msg::{AttitudeSample, FusionResult, GnssEpoch, Output, Stamped, TargetEstimate};
-use crate::time::MonoTime;
+use windhover_base::geo::rot_z;
+use windhover_base::msg::{AttitudeSample, FusionResult, GnssEpoch, Output, Stamped, TargetEstimate};
+use windhover_base::settings::{CameraConfig, TargetConfig};
+use windhover_base::time::MonoTime;
 
 /// What only a daemon knows of itself (card, link, computer), by name.
 #[derive(Clone, Default, PartialEq, Debug)]

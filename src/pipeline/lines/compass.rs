@@ -1,10 +1,10 @@
 //! The compass line: bytes to samples at their time of validity.
 
 use super::{Line, on_the_wire};
-use crate::config::CompassConfig;
-use crate::decode::{CompassDecoder, DecodeCounts, HeardAttitude};
-use crate::msg::{Measurement, Stamped};
-use crate::time::{MonoTime, Span, SteadyClock};
+use windhover_base::msg::{Measurement, Stamped};
+use windhover_base::settings::CompassConfig;
+use windhover_base::time::{MonoTime, Span, SteadyClock};
+use windhover_decode::{CompassDecoder, DecodeCounts, HeardAttitude};
 
 /// Compass bytes to samples at their time of validity.
 pub(in crate::pipeline) struct CompassLine {

@@ -1,10 +1,10 @@
 //! The GPS line: bytes to epochs at their time of validity.
 
 use super::{Line, on_the_wire};
-use crate::config::GpsConfig;
-use crate::decode::{DecodeCounts, GnssDecoder, HeardEpoch};
-use crate::msg::{Measurement, Stamped, WarmArrival};
-use crate::time::{GnssClock, MonoTime, Span};
+use windhover_base::msg::{Measurement, Stamped, WarmArrival};
+use windhover_base::settings::GpsConfig;
+use windhover_base::time::{GnssClock, MonoTime, Span};
+use windhover_decode::{DecodeCounts, GnssDecoder, HeardEpoch};
 
 /// Arrivals kept for a warm start: the jitter of a 5 Hz receiver over 10 s.
 const WARM_ARRIVALS: usize = 50;

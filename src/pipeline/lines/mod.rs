@@ -6,10 +6,10 @@ mod gps;
 pub(super) use compass::CompassLine;
 pub(super) use gps::GpsLine;
 
-use crate::config::{CompassConfig, GpsConfig};
-use crate::decode::DecodeCounts;
-use crate::msg::{Measurement, Source};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{Measurement, Source};
+use windhover_base::settings::{CompassConfig, GpsConfig};
+use windhover_base::time::{MonoTime, Span};
+use windhover_decode::DecodeCounts;
 
 /// A decoder, and the clock that puts what it decodes in time.
 pub(super) trait Line {
