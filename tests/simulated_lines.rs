@@ -7,7 +7,7 @@ use std::sync::Arc;
 use windhover::config::Config;
 use windhover::pipeline::Pipeline;
 use windhover_base::geo::wrap_angle;
-use windhover_base::msg::{AttitudeSample, GnssEpoch, NoticeKind, Output, Stamped, TimedOutput};
+use windhover_base::msg::{AttitudeSample, GnssEpoch, Measurement, NoticeKind, Output, Stamped, TimedOutput};
 use windhover_base::settings::CompassFormat;
 use windhover_base::time::{MonoTime, Span};
 use windhover_simulate::{Flight, FrameStorage, Sample, Scenario, SensorSuite, World};
@@ -25,8 +25,8 @@ fn decoded(flight: Flight) -> Decoded {
     let mut sort = |outputs: &mut Vec<TimedOutput>| {
         for timed in outputs.drain(..) {
             match timed.output {
-                Output::Fix(fix) => fixes.push(fix),
-                Output::Attitude(attitude) => attitudes.push(attitude),
+                Output::Measured(Measurement::Gnss(fix)) => fixes.push(fix),
+                Output::Measured(Measurement::Attitude(attitude)) => attitudes.push(attitude),
                 _ => {}
             }
         }

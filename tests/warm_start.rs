@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use windhover::config::Config;
 use windhover::io::capture::CaptureReader;
 use windhover::pipeline::Pipeline;
-use windhover_base::msg::{Event, EventBody, Output, TrackStatus, WarmState};
+use windhover_base::msg::{EstimatorOutput, Event, EventBody, Output, TrackStatus, WarmState};
 use windhover_base::time::{MonoTime, Span};
 
 fn capture() -> PathBuf {
@@ -30,7 +30,7 @@ fn outputs(pipeline: &mut Pipeline, events: &[Event]) -> Vec<Output> {
 /// When the first estimate with `tracking` was true, and its heading sigma in rad.
 fn first_tracking(out: &[Output]) -> Option<(MonoTime, f64)> {
     out.iter().find_map(|o| match o {
-        Output::Estimate(e) if e.status == TrackStatus::Tracking => {
+        Output::Estimator(EstimatorOutput::Estimate(e)) if e.status == TrackStatus::Tracking => {
             let covariance = e.state?.covariance?;
             Some((e.t_valid, covariance[(2, 2)].sqrt()))
         }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use crate::config::Config;
 use crate::pipeline::Pipeline;
-use windhover_base::msg::{Event, EventBody, Health, Output, TargetEstimate, TimedOutput};
+use windhover_base::msg::{EstimatorOutput, Event, EventBody, Health, Output, TargetEstimate, TimedOutput};
 use windhover_base::time::Span;
 
 use super::card::{CardOrders, Slot};
@@ -162,7 +162,7 @@ impl Brain<'_> {
                     self.around.log.tell_keyed(notice.t, event, key, |_| line);
                 }
                 Output::Health(health) => self.health(health),
-                Output::Estimate(estimate) => self.estimate(estimate),
+                Output::Estimator(EstimatorOutput::Estimate(estimate)) => self.estimate(estimate),
                 _ => {}
             }
             self.outlets.output(timed);

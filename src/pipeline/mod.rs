@@ -19,14 +19,14 @@ use site::SiteFinder;
 use ticks::Ticks;
 use windhover_base::geo::{Geodetic, Tile};
 use windhover_base::msg::{
-    AttitudeSample, Event, EventBody, FrameObservations, FramePayload, FramePrediction, GnssEpoch,
-    MarkerDetection, MarkerId, Measurement, NoticeKind, Output, Source, Stamped, TargetEstimate, TimedOutput,
-    TrackStatus, WarmFilter, WarmSite, WarmState,
+    AttitudeSample, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload, FramePrediction,
+    GnssEpoch, MarkerDetection, MarkerId, Measurement, NoticeKind, Output, Source, Stamped, TargetEstimate,
+    TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
 };
 use windhover_base::settings::MarkerKind;
 use windhover_base::time::{MonoTime, Span};
 use windhover_detect::FrameDetector;
-use windhover_estimate::{Estimator, EstimatorOutput, PaperEstimator};
+use windhover_estimate::{Estimator, PaperEstimator};
 
 /// Events in, outputs out.
 pub struct Pipeline {
@@ -222,7 +222,7 @@ impl Pipeline {
 
     fn gnss(&mut self, epoch: &Stamped<GnssEpoch>, t: MonoTime, out: &mut Vec<Output>) {
         self.monitor.fix(t, epoch.value.fix, epoch.value.sats, self.lines.gps.clock_sigma(), out);
-        out.push(Output::Fix(*epoch));
+        out.push(Output::Measured(Measurement::Gnss(*epoch)));
         if self.estimators.is_none() {
             self.settle(&epoch.value, t, out);
         }
@@ -233,7 +233,7 @@ impl Pipeline {
     }
 
     fn attitude(&mut self, sample: &Stamped<AttitudeSample>, out: &mut Vec<Output>) {
-        out.push(Output::Attitude(*sample));
+        out.push(Output::Measured(Measurement::Attitude(*sample)));
         if let Some(estimators) = &mut self.estimators {
             estimators.joint.attitude(sample, &mut self.estimated);
             estimators.paper.attitude(sample, &mut self.papered);
@@ -327,7 +327,8 @@ impl Pipeline {
             for target in 0..self.config.target.len() {
                 let frame = self.observations.frame;
                 let status = TrackStatus::Lost;
-                out.push(Output::Estimate(TargetEstimate { t_valid, frame, target, status, state: None }));
+                let lost = TargetEstimate { t_valid, frame, target, status, state: None };
+                out.push(Output::Estimator(EstimatorOutput::Estimate(lost)));
             }
             return;
         };
@@ -342,17 +343,9 @@ impl Pipeline {
 
     fn take_estimated(&mut self, t: MonoTime, out: &mut Vec<Output>) {
         for estimated in self.estimated.drain(..) {
-            match estimated {
-                EstimatorOutput::Estimate(estimate) => {
-                    self.monitor.estimate(&estimate, t, out);
-                    out.push(Output::Estimate(estimate));
-                }
-                EstimatorOutput::Smoothed(estimate) => out.push(Output::Smoothed(estimate)),
-                EstimatorOutput::Ownship(own) => out.push(Output::Ownship(own)),
-                EstimatorOutput::Fusion(result) => {
-                    self.monitor.disposition(result.disposition);
-                    out.push(Output::Fusion(result));
-                }
+            match &estimated {
+                EstimatorOutput::Estimate(estimate) => self.monitor.estimate(estimate, t, out),
+                EstimatorOutput::Fusion(result) => self.monitor.disposition(result.disposition),
                 EstimatorOutput::Anchored { moved_m: d } => {
                     let detail = format!(
                         "the receiver jumped for good: everything moved by {:.1} m north, {:.1} m east, {:.1} m down",
@@ -361,9 +354,11 @@ impl Pipeline {
                     out.push(notice(t, NoticeKind::FilterReset, None, detail));
                 }
                 EstimatorOutput::Reset { reason } => {
-                    out.push(notice(t, NoticeKind::FilterReset, None, reason.to_string()));
+                    out.push(notice(t, NoticeKind::FilterReset, None, (*reason).to_owned()));
                 }
+                EstimatorOutput::Smoothed(_) | EstimatorOutput::Ownship(_) => {}
             }
+            out.push(Output::Estimator(estimated));
         }
     }
 }

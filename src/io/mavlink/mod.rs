@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use crate::config::Config;
 use crate::io::link::keys::{KeyError, read_private};
 use windhover_base::geo::Geodetic;
-use windhover_base::msg::{Output, TargetEstimate, TrackStatus};
+use windhover_base::msg::{EstimatorOutput, Measurement, Output, TargetEstimate, TrackStatus};
 use windhover_base::time::{MonoTime, Span, UtcTime};
 
 use messages::Vehicle;
@@ -117,13 +117,13 @@ impl MavlinkSender {
     /// Takes what it needs of the pipeline's outputs.
     pub fn output(&mut self, output: &Output) {
         match output {
-            Output::Estimate(estimate) => {
+            Output::Estimator(EstimatorOutput::Estimate(estimate)) => {
                 if let Some(latest) = self.latest.get_mut(estimate.target) {
                     *latest = Some(*estimate);
                 }
             }
             Output::Datum(_, datum) => self.datum = Some(*datum),
-            Output::Fix(fix) => {
+            Output::Measured(Measurement::Gnss(fix)) => {
                 self.geoid_m = fix.value.geoid_m.or(self.geoid_m);
                 if let Some(utc) = fix.value.utc {
                     self.utc_from_host_ns = Some(utc.unix_ns() - fix.t_valid.ns());

@@ -11,7 +11,9 @@ use super::messages::{
 use super::{Record, Schema, topic};
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
 use windhover_base::geo::rot_z;
-use windhover_base::msg::{AttitudeSample, FusionResult, GnssEpoch, Output, Stamped, TargetEstimate};
+use windhover_base::msg::{
+    AttitudeSample, EstimatorOutput, FusionResult, GnssEpoch, Measurement, Output, Stamped, TargetEstimate,
+};
 use windhover_base::settings::{CameraConfig, TargetConfig};
 use windhover_base::time::MonoTime;
 
@@ -77,8 +79,8 @@ impl OutputEncoder {
                 };
                 out.push(record(topic::DATUM.into(), Schema::Datum, log, *t, &message));
             }
-            Output::Fix(epoch) => fix(epoch, log, out),
-            Output::Attitude(sample) => out.push(attitude(sample, log)),
+            Output::Measured(Measurement::Gnss(epoch)) => fix(epoch, log, out),
+            Output::Measured(Measurement::Attitude(sample)) => out.push(attitude(sample, log)),
             Output::Detections { frame, t_valid, markers, features } => {
                 let whole = detections(*frame, *t_valid, markers, features);
                 out.push(record(topic::CAMERA_DETECTIONS.into(), Schema::Detections, log, *t_valid, &whole));
@@ -86,15 +88,8 @@ impl OutputEncoder {
                 let name = topic::CAMERA_ANNOTATIONS.into();
                 out.push(record(name, Schema::ImageAnnotations, log, *t_valid, &overlay));
             }
-            Output::Ownship(own) => {
-                out.push(record(topic::OWNSHIP.into(), Schema::Ownship, log, own.t_valid, &ownship(own)));
-                let tf = transform(own.t_valid, "ned", "body", own.position_ned_m, &own.ned_from_body);
-                out.push(record(topic::TF.into(), Schema::FrameTransform, log, own.t_valid, &tf));
-            }
-            Output::Estimate(estimate) => self.estimate(estimate, log, out),
-            Output::Smoothed(e) => self.state(topic::target_smoothed(self.name(e)), e, log, out),
+            Output::Estimator(said) => self.estimator(said, log, out),
             Output::Paper(e) => self.state(topic::target_paper(self.name(e)), e, log, out),
-            Output::Fusion(result) => out.push(fusion(result, log)),
             Output::Notice(notice) => {
                 out.push(record(topic::LOG.into(), Schema::Log, log, notice.t, &log_message(notice)));
             }
@@ -104,6 +99,21 @@ impl OutputEncoder {
                 message.words.extend(self.figures.words.clone());
                 out.push(record(topic::HEALTH.into(), Schema::Health, log, now.t, &message));
             }
+        }
+    }
+
+    fn estimator(&self, said: &EstimatorOutput, log: MonoTime, out: &mut Vec<Record>) {
+        match said {
+            EstimatorOutput::Ownship(own) => {
+                out.push(record(topic::OWNSHIP.into(), Schema::Ownship, log, own.t_valid, &ownship(own)));
+                let tf = transform(own.t_valid, "ned", "body", own.position_ned_m, &own.ned_from_body);
+                out.push(record(topic::TF.into(), Schema::FrameTransform, log, own.t_valid, &tf));
+            }
+            EstimatorOutput::Estimate(estimate) => self.estimate(estimate, log, out),
+            EstimatorOutput::Smoothed(e) => self.state(topic::target_smoothed(self.name(e)), e, log, out),
+            EstimatorOutput::Fusion(result) => out.push(fusion(result, log)),
+            // The pipeline's notice tells of these.
+            EstimatorOutput::Anchored { .. } | EstimatorOutput::Reset { .. } => {}
         }
     }
 

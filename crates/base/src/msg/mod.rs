@@ -13,7 +13,8 @@ mod source;
 mod warm;
 
 pub use estimate::{
-    Disposition, FusionResult, FusionSource, Ownship, TargetEstimate, TargetState, TrackStatus,
+    Disposition, EstimatorOutput, FusionResult, FusionSource, Ownship, TargetEstimate, TargetState,
+    TrackStatus,
 };
 pub use event::{Event, EventBody, FrameEncoding, FramePayload};
 pub use family::TagFamily;
