@@ -90,6 +90,13 @@ impl Config {
         }
     }
 
+    /// The filter's section. No more features are in use at once than the detector follows: without any
+    /// the filter has no states of them.
+    pub fn filter(&self) -> EstimatorConfig {
+        let features = self.estimator.features.min(self.detector.ground_features);
+        EstimatorConfig { features, ..self.estimator.clone() }
+    }
+
     /// The instruments and the targets.
     pub fn rig(&self) -> Rig {
         Rig {

@@ -255,12 +255,12 @@ impl Pipeline {
         );
         out.push(notice(t, NoticeKind::DatumSet, Some(Source::Gps), words));
         out.push(Output::Datum(t, datum));
-        let rig = self.config.rig();
-        let mut joint = Estimator::new(&rig, &self.config.estimator, &settled.site);
+        let (rig, filter) = (self.config.rig(), self.config.filter());
+        let mut joint = Estimator::new(&rig, &filter, &settled.site);
         if let Some(warm) = self.warm.take().filter(|_| settled.continued) {
             joint.resume(warm);
         }
-        let paper = PaperEstimator::new(&rig, &self.config.estimator, &settled.site);
+        let paper = PaperEstimator::new(&rig, &filter, &settled.site);
         self.estimators = Some(Estimators { joint, paper, site: settled.warm });
     }
 

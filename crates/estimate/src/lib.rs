@@ -26,6 +26,8 @@ mod update;
 mod vision;
 mod warm;
 #[cfg(test)]
+mod jacobians;
+#[cfg(test)]
 mod tests;
 
 pub use bound::{Bound, BoundTruth};

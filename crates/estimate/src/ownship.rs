@@ -116,6 +116,7 @@ impl Core {
         let d_rate = -own.rotation() * skew(&models.antenna_at);
         let d_attitude = -skew(&swing) + skew(&(own.ned_from_body * own.force)) * tau;
         let d_force = -own.rotation() * tau;
+        let d_drag = own.velocity * tau;
         let z = &mut self.z;
         z.begin(m);
         let v = z.columns(at::VELOCITY, 3);
@@ -123,6 +124,7 @@ impl Core {
         let rate = z.columns(at::RATE, 3);
         let force = z.columns(at::FORCE, 3);
         let delay = z.columns(at::GPS_DELAY, 1);
+        let drag = z.columns(at::DRAG, 1);
         for i in 0..m {
             z.residual[i] = velocity[i] - expected[i];
             z.set(i, v + i, 1.0);
@@ -130,6 +132,7 @@ impl Core {
             set_row(z, i, rate, &d_rate);
             set_row(z, i, force, &d_force);
             z.set(i, delay, -acceleration[i]);
+            z.set(i, drag, d_drag[i]);
             z.noise[i][i] = models.gps_velocity_var * self.state.learnt.gps_velocity_factor;
         }
         let outcome = self.fuse_gated(FusionSource::GpsVelocity);

@@ -65,6 +65,13 @@ impl Measurement {
         self.h[component][column]
     }
 
+    /// ∂component/∂(column of the error state).
+    #[cfg(test)]
+    pub(super) fn derivative_by(&self, component: usize, column: usize) -> f64 {
+        let entries = self.row(component).iter().zip(&self.column);
+        entries.filter(|(_, c)| **c == column).map(|(h, _)| h).sum()
+    }
+
     /// Raises the noise by a factor on its variance.
     pub(super) fn scale_noise(&mut self, factor: f64) {
         self.noise.iter_mut().flatten().for_each(|x| *x *= factor);

@@ -238,7 +238,7 @@ impl Core {
         self.state.renew(start, &[0.0; 2]);
     }
 
-    fn fuse_feature(&mut self, slot: usize, track: &FeatureTrack, gated: bool) {
+    pub(super) fn fuse_feature(&mut self, slot: usize, track: &FeatureTrack, gated: bool) {
         let start = self.state.feature_at(slot);
         let [north, east] = self.state.features[slot].mean;
         let world = Vector3::new(north, east, self.models.ground.down_m(north, east));
