@@ -16,7 +16,6 @@ use crate::io::mcap_write::WriteError;
 use crate::io::records::OutputEncoder;
 use crate::pipeline::Pipeline;
 use crate::pixels::{self, DecodedFrame, FrameFault};
-use windhover_base::msg::{Event, EventBody, Output};
 use windhover_base::msg::{EventBody, Output, TimedOutput};
 use windhover_base::time::{MonoTime, Span};
 

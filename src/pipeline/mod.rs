@@ -9,6 +9,8 @@ mod monitor;
 mod site;
 mod ticks;
 
+pub use ticks::next_tick;
+
 use std::sync::Arc;
 
 use crate::config::Config;

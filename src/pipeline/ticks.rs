@@ -30,6 +30,11 @@ impl Ticks {
     }
 }
 
+/// The first tick after `now`: so long whoever feeds the pipeline may wait for an event.
+pub fn next_tick(now: MonoTime) -> MonoTime {
+    MonoTime::from_ns((grid(now) + 1) * TICK.ns())
+}
+
 /// Ticks from zero to `t`.
 fn grid(t: MonoTime) -> i64 {
     t.ns().div_euclid(TICK.ns())
@@ -63,6 +68,7 @@ mod tests {
         let due = ticks.due(at(1_530)).expect("two are");
         assert_eq!(due, at(1_500));
         assert_eq!(ticks.until(due).collect::<Vec<_>>(), [at(1_300), at(1_400), at(1_500)]);
-        assert_eq!(ticks.due(at(1_590)), None);
+        assert_eq!((ticks.due(at(1_590)), next_tick(at(1_590))), (None, at(1_600)));
+        assert_eq!(ticks.due(at(1_600)), Some(at(1_600)));
     }
 }
