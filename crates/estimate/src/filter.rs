@@ -23,20 +23,20 @@ use super::state::State;
 pub struct Estimator {
     pub(crate) core: Core,
     history: History<AnyMeasurement, State>,
-    /// Compass readings heard before there was a state.
+    /// Compass readings that came before there was a state.
     compass: VecDeque<Stamped<AttitudeSample>>,
     /// Room to look ahead in.
     ahead: State,
     lag: Span,
     /// What the next start continues from.
     warm: Option<WarmFilter>,
-    /// Exposure time of the last frame whose smoothed estimate has been told.
+    /// Exposure time of the last frame whose smoothed estimate is out.
     smoothed_to: Option<MonoTime>,
-    /// Time of the last anchoring that has been told.
+    /// Time of the last anchoring that was reported.
     anchored: Option<MonoTime>,
 }
 
-/// Without any measurement for so long the state is worth nothing.
+/// Without any measurement for so long the state is given up.
 const SILENCE: Span = Span::from_ns(60_000_000_000);
 /// Farther ahead than this a frame is not foreseen, s.
 const FORESIGHT_S: f64 = 2.0;
@@ -93,7 +93,7 @@ impl Estimator {
             m.kind = Kind::Gnss;
             m.gnss = value;
         });
-        self.tell_smoothed(out);
+        self.emit_smoothed(out);
     }
 
     /// Takes a compass reading; `t_valid` has the configured latency taken off.
@@ -113,10 +113,10 @@ impl Estimator {
             m.kind = Kind::Attitude;
             m.attitude = value;
         });
-        self.tell_smoothed(out);
+        self.emit_smoothed(out);
     }
 
-    /// Takes what a frame showed, and tells one estimate a target and the helicopter's own state at
+    /// Takes what a frame showed, and gives one estimate a target and the helicopter's own state at
     /// the frame's exposure.
     pub fn frame(&mut self, frame: &Stamped<FrameObservations>, out: &mut Vec<EstimatorOutput>) {
         let (t, number) = (frame.t_valid, frame.value.frame);
@@ -142,22 +142,22 @@ impl Estimator {
         if taken.is_some() {
             out.push(EstimatorOutput::Ownship(state.ownship(&self.core.models, number, t)));
         }
-        self.tell_smoothed(out);
+        self.emit_smoothed(out);
     }
 
-    /// Lets time pass: tells smoothed estimates that are due, and starts again after a long silence.
+    /// Lets time pass: gives smoothed estimates that are due, and starts again after a long silence.
     pub fn tick(&mut self, now: MonoTime, out: &mut Vec<EstimatorOutput>) {
         if self.core.state.alive && now - self.core.state.t > SILENCE {
-            self.tell_smoothed_until(None, out);
+            self.emit_smoothed_until(None, out);
             self.reset("nothing was heard for a minute", out);
         } else {
-            self.tell_smoothed_until(Some(now - self.lag), out);
+            self.emit_smoothed_until(Some(now - self.lag), out);
         }
     }
 
-    /// Tells every smoothed estimate still owed: the flight is over.
+    /// Gives every smoothed estimate still owed: the flight is over.
     pub fn finish(&mut self, out: &mut Vec<EstimatorOutput>) {
-        self.tell_smoothed_until(None, out);
+        self.emit_smoothed_until(None, out);
     }
 
     /// What a frame exposed at `t` should show, into a recycled value.
@@ -254,7 +254,7 @@ impl Estimator {
         }
         out.extend(self.core.results.drain(..).map(EstimatorOutput::Fusion));
         if let Some((t, moved_m)) = self.core.state.anchored
-            && self.anchored.is_none_or(|told| t > told)
+            && self.anchored.is_none_or(|reported| t > reported)
         {
             self.anchored = Some(t);
             out.push(EstimatorOutput::Anchored { moved_m });
@@ -286,13 +286,13 @@ impl Estimator {
         out.push(EstimatorOutput::Reset { reason });
     }
 
-    fn tell_smoothed(&mut self, out: &mut Vec<EstimatorOutput>) {
-        self.tell_smoothed_until(Some(self.core.state.t - self.lag), out);
+    fn emit_smoothed(&mut self, out: &mut Vec<EstimatorOutput>) {
+        self.emit_smoothed_until(Some(self.core.state.t - self.lag), out);
     }
 
-    /// Tells the smoothed estimates of frames exposed no later than `until` (all of them for `None`)
-    /// that have not been told yet, in their order.
-    fn tell_smoothed_until(&mut self, until: Option<MonoTime>, out: &mut Vec<EstimatorOutput>) {
+    /// Gives the smoothed estimates of frames exposed no later than `until` (all of them for `None`)
+    /// that are not out yet, in their order.
+    fn emit_smoothed_until(&mut self, until: Option<MonoTime>, out: &mut Vec<EstimatorOutput>) {
         loop {
             let last = self.smoothed_to;
             let due = |t: MonoTime| until.is_none_or(|u| t <= u) && last.is_none_or(|s| t > s);

@@ -118,7 +118,7 @@ const RAISE: f64 = 4.0;
 
 /// How much later than the filter's memory P/q an estimate is compared with what became of it.
 const LAG: f64 = 2.0;
-/// Memories over which it is fitted at the least: what lies closer together tells the same.
+/// Memories over which it is fitted at the least: what lies closer together says the same.
 const MEMORIES: f64 = 4.0;
 /// Least share of a variance that must have been found out since.
 const LEAST_TOLD: f64 = 0.2;

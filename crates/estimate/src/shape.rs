@@ -77,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn a_singular_tag_tells_nothing() {
+    fn a_singular_tag_shows_nothing() {
         let (mut z, rigid) = tag([1.0; 8]);
         z.scale_noise(0.0);
         assert_eq!(left_over(&z, &rigid), None);
