@@ -27,6 +27,8 @@ pub mod replay;
 pub mod report;
 pub mod run;
 pub mod signals;
+pub mod sink;
+pub mod sinks;
 pub mod status;
 pub mod supervise;
 pub mod topology;

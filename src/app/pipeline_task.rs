@@ -4,17 +4,17 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::config::Config;
-use crate::pipeline::{Pipeline, TICK, Ticks};
+use crate::pipeline::{Pipeline, next_tick};
 use windhover_base::geo::Tile;
-use windhover_base::msg::{Event, EventBody, Health, Output, TargetEstimate};
+use windhover_base::msg::{EstimatorOutput, Event, EventBody, Health, Output, TargetEstimate, TimedOutput};
 use windhover_base::time::{MonoTime, Span};
 
 use super::context::TaskContext;
 use super::events::{self, Event as OperatorEvent};
-use super::flight_store::StoreOrders;
+use super::flight_store::{FlightStore, StoreOrders};
 use super::health;
 use super::latencies::Latencies;
-use super::outlets::Outlets;
+use super::sink::{Outlets, Sink};
 use super::status::SharedStatus;
 use super::supervise::Heart;
 use super::warm_start::{self, Earlier, Origin};
@@ -32,8 +32,10 @@ pub struct Parts {
     pub context: TaskContext,
     /// Where health is shown.
     pub status: SharedStatus,
+    /// Where what an earlier run knew is kept.
+    pub flight_store: FlightStore,
     /// Where events and outputs go.
-    pub outlets: Outlets,
+    pub outlets: Outlets<Box<dyn Sink>>,
     /// What the store is asked to do.
     pub orders: StoreOrders,
     /// Its heart.
@@ -42,15 +44,15 @@ pub struct Parts {
 
 /// Runs the pipeline on the calling thread until the end is asked for and everything that waits is handled.
 pub fn run(parts: Parts) {
-    let Parts { config, terrain, context, status, outlets, orders, heart } = parts;
+    let Parts { config, terrain, context, status, flight_store, outlets, orders, heart } = parts;
     let mut task = PipelineTask {
         config: &config,
         context: &context,
         status: &status,
         origin: Origin::here(&config, context.clock),
+        flight_store,
         outlets,
         pipeline: Pipeline::with_terrain(&config, terrain),
-        ticks: Ticks::default(),
         latencies: Latencies::default(),
         outputs: Vec::new(),
     };
@@ -77,8 +79,8 @@ const QUEUED_LATE: Span = Span::from_ns(5_000_000);
 
 /// Time from `now` until the next tick is due: so long the task may wait for an event.
 fn until_tick(now: MonoTime) -> Duration {
-    let left = TICK.ns() - (now - QUEUED_LATE).ns().rem_euclid(TICK.ns());
-    Duration::from_nanos(left.unsigned_abs())
+    let due = next_tick(now - QUEUED_LATE) + QUEUED_LATE;
+    Duration::from_nanos((due - now).ns().unsigned_abs())
 }
 
 struct PipelineTask<'a> {
@@ -86,11 +88,11 @@ struct PipelineTask<'a> {
     context: &'a TaskContext,
     status: &'a SharedStatus,
     origin: Origin,
-    outlets: Outlets,
+    flight_store: FlightStore,
+    outlets: Outlets<Box<dyn Sink>>,
     pipeline: Pipeline,
-    ticks: Ticks,
     latencies: Latencies,
-    outputs: Vec<Output>,
+    outputs: Vec<TimedOutput>,
 }
 
 impl PipelineTask<'_> {
@@ -101,7 +103,7 @@ impl PipelineTask<'_> {
             return;
         }
         let tell = |words: String| self.context.log.tell(OperatorEvent::WarmStart, "", words);
-        match warm_start::wait_for(self.outlets.flight_store(), &self.origin, self.context, heart) {
+        match warm_start::wait_for(&self.flight_store, &self.origin, self.context, heart) {
             Earlier::Known(state, age) => {
                 tell(format!("continues from what was known {:.1} s ago", age.s()));
                 let body = EventBody::Warm(state);
@@ -118,29 +120,23 @@ impl PipelineTask<'_> {
     }
 
     fn pass_time(&mut self) {
-        let now = self.context.clock.now();
-        for t in self.ticks.until(now) {
+        if let Some(t) = self.pipeline.tick_due(self.context.clock.now()) {
             let tick = self.context.events.number(t, EventBody::Tick);
             self.pipeline.handle(&tick, &mut self.outputs);
-            self.pass_on(t);
+            self.pass_on();
         }
     }
 
     fn handle(&mut self, event: &Event) {
-        for t in self.ticks.until(event.t_recv) {
-            let tick = Event { t_recv: t, seq: event.seq, body: EventBody::Tick };
-            self.pipeline.handle(&tick, &mut self.outputs);
-            self.pass_on(t);
-        }
         // Recorded first: what the pipeline stumbles over is on the card.
         self.outlets.event(event);
         self.pipeline.handle(event, &mut self.outputs);
-        self.pass_on(event.t_recv);
+        self.pass_on();
     }
 
     fn finish(&mut self) {
         self.pipeline.finish(&mut self.outputs);
-        self.pass_on(self.context.clock.now());
+        self.pass_on();
         if let Some(all) = self.latencies.of_flight() {
             self.context.log.tell_with(OperatorEvent::Latencies, "", "", |line| {
                 line.count("frames", all.frames)
@@ -151,11 +147,11 @@ impl PipelineTask<'_> {
         }
     }
 
-    /// Passes on what followed from what was heard at `t`.
-    fn pass_on(&mut self, t: MonoTime) {
+    /// Passes on what followed.
+    fn pass_on(&mut self) {
         let outputs = std::mem::take(&mut self.outputs);
-        for output in &outputs {
-            match output {
+        for timed in &outputs {
+            match &timed.output {
                 Output::Notice(notice) => {
                     let about = notice.source.map_or("", windhover_base::msg::Source::name);
                     let line = events::line_of_notice(notice);
@@ -165,10 +161,10 @@ impl PipelineTask<'_> {
                     self.context.log.tell_keyed(notice.t, event, key, |_| line);
                 }
                 Output::Health(health) => self.health(health),
-                Output::Estimate(estimate) => self.estimate(estimate),
+                Output::Estimator(EstimatorOutput::Estimate(estimate)) => self.estimate(estimate),
                 _ => {}
             }
-            self.outlets.output(output, t);
+            self.outlets.output(timed);
         }
         self.outputs = outputs;
         self.outputs.clear();
@@ -190,7 +186,7 @@ impl PipelineTask<'_> {
         });
         self.outlets.figures(figures.by_name());
         self.context.log.write(health::line(health, self.config, Some(&figures)));
-        if let (Some(state), Some(store)) = (self.pipeline.warm_state(), self.outlets.flight_store().get()) {
+        if let (Some(state), Some(store)) = (self.pipeline.warm_state(), self.flight_store.get()) {
             warm_start::save(&store, &self.origin, health.t, &state);
         }
     }

@@ -63,7 +63,7 @@ use super::downlink::{self, Downlink, LinkTask};
 use super::event_queue::EventQueue;
 use super::flight_store::{FlightStore, StoreOrders};
 use super::log::Log;
-use super::outlets::Outlets;
+use super::outlets;
 use super::pipeline_task::{self, Parts};
 use super::power_task::{self, PowerView};
 use super::presence::Presence;
@@ -131,9 +131,11 @@ pub fn start(loaded: Loaded, clock: HostClock, log: &Log) -> std::io::Result<Gra
     });
     tasks.spawn_thread(PIPELINE, {
         let (config, context, status) = (Arc::clone(&config), context.clone(), status.clone());
-        let (outlets, orders) = (Outlets::new(&config, flight_store, downlink), orders.clone());
+        let outlets = outlets::of_daemon(&config, &flight_store, &downlink);
+        let orders = orders.clone();
         move |heart| {
-            pipeline_task::run(Parts { config, terrain, context, status, outlets, orders, heart });
+            let parts = Parts { config, terrain, context, status, flight_store, outlets, orders, heart };
+            pipeline_task::run(parts);
         }
     })?;
     let (readings, power) = power_task::parts(&config.power);
