@@ -294,4 +294,4 @@ struct Solved {
 }
 
 #[cfg(test)]
-mod proofs;
+mod tests;
