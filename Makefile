@@ -5,7 +5,7 @@ CARGO ?= cargo
 VENV  ?= target/venv
 DEMO  ?= demo
 
-.PHONY: help setup setup-python build demo test test-python test-web test-real test-zenoh proofs check lint docs configs \
+.PHONY: help setup setup-python build debug demo test test-python test-web test-real test-zenoh proofs check lint docs configs \
         licences oldest aarch64 bench load clean deb hil hil-long hil-short hil-tools
 
 help:
@@ -38,6 +38,11 @@ setup-python: setup
 build: setup
 	$(CARGO) build --release --locked $(PARTS)
 
+# The program as tests use it. Without the examples Cargo would take fewer features of other crates than the tests do,
+# and build half of them once more.
+debug: setup
+	$(CARGO) build --locked --bins --examples
+
 demo: build
 	@sh tests/demo.sh target/release/windhover $(DEMO)
 
@@ -46,20 +51,17 @@ test: setup-python
 	$(MAKE) test-python
 
 # The flight file opened by readers that know nothing of us.
-test-python: setup-python
-	$(CARGO) build --locked
+test-python: setup-python debug
 	$(VENV)/bin/python -m unittest discover -s tests/python -p 'test_*.py' -v
 
 # The station's page in headless Chromium, fed by a running payload; pictures in target/web.
-test-web: setup-python
+test-web: setup-python debug
 	@sh tests/setup/packages.sh chromium
-	$(CARGO) build --locked
 	$(VENV)/bin/python -m unittest discover -s tests/web -p 'test_*.py' -v
 
 # Real recordings and frames, and what the program must make of them: make test-real DATA=FOLDER.
-test-real: setup
+test-real: debug
 	@sh tests/setup/packages.sh python3
-	$(CARGO) build --locked
 	@if [ -d "$(DATA)" ]; then python3 tests/real/run.py target/debug/windhover "$(DATA)"; \
 	else sh .ci/skip "real data" "no folder $(if $(DATA),$(DATA),is named: make test-real DATA=FOLDER)"; fi
 
@@ -78,14 +80,13 @@ proofs: setup
 check: lint docs configs licences oldest aarch64
 
 lint: setup
-	$(CARGO) fmt --check
-	$(CARGO) clippy --locked --all-targets --all-features -- -D warnings
+	$(CARGO) fmt --all --check
+	$(CARGO) clippy --locked --workspace --all-targets --all-features -- -D warnings
 
 docs: setup
-	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --no-deps --all-features --document-private-items
+	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --workspace --no-deps --all-features --document-private-items
 
-configs: setup
-	$(CARGO) build --locked
+configs: debug
 	for file in config/*.toml; do target/debug/windhover check-config $$file > /dev/null || exit 1; done
 
 licences:

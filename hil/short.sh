@@ -13,7 +13,7 @@ skip() {
 command -v apt-get >/dev/null || skip "nothing was flown: the image is made of Debian's packages"
 make hil-tools && sh hil/base.sh target/hil || skip "nothing was flown: Debian's packages are not to be had"
 # What feeds the machine is there from the tests.
-cargo build --locked --example hil_feed --example hil_frames --example hil_stream
+make debug
 make deb PARTS="--bin windhover"
 sh hil/image.sh
 

@@ -4,9 +4,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::config::Config;
-use crate::msg::{Event, EventBody, TargetEstimate};
-use crate::pipeline::{Health, Output, Pipeline, Ticks};
-use crate::time::{MonoTime, Span};
+use crate::pipeline::{Pipeline, Ticks};
+use windhover_base::msg::{Event, EventBody, Health, Output, TargetEstimate};
+use windhover_base::time::{MonoTime, Span};
 
 use super::card::CardOrders;
 use super::config_file;
@@ -160,7 +160,7 @@ impl Brain<'_> {
         for output in &outputs {
             match output {
                 Output::Notice(notice) => {
-                    let about = notice.source.map_or("", crate::msg::Source::name);
+                    let about = notice.source.map_or("", windhover_base::msg::Source::name);
                     let line = events::line_of_notice(notice);
                     let event = OperatorEvent::Pipeline(notice.kind);
                     // A target's notices tell its name in their words only.

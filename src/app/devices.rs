@@ -2,14 +2,15 @@
 
 use std::sync::Arc;
 
-use crate::config::{CompassFormat, Config, Part};
+use crate::config::{Config, Part};
 use crate::io::camera::{self, CameraSettings};
 use crate::io::clock::HostClock;
 use crate::io::device::{Fault, NoteKind, Report, Stop};
 use crate::io::pps;
 use crate::io::serial::{self, SerialSettings};
-use crate::msg::{EventBody, Source};
-use crate::time::MonoTime;
+use windhover_base::msg::{EventBody, Source};
+use windhover_base::settings::CompassFormat;
+use windhover_base::time::MonoTime;
 
 use super::events::Event;
 use super::inbox::Inbox;
@@ -112,11 +113,7 @@ impl<'a> Told<'a> {
             }
             Report::Bytes(t, bytes) => {
                 self.delivers();
-                let body = match self.source {
-                    Source::Gps => EventBody::GnssBytes(bytes),
-                    Source::Compass | Source::Camera => EventBody::CompassBytes(bytes),
-                };
-                self.around.inbox.put(t, body);
+                self.around.inbox.put(t, EventBody::Bytes { source: self.source, data: bytes });
             }
             Report::Frame(t, frame) => {
                 self.delivers();

@@ -5,8 +5,8 @@
 
 use crate::config::LogLevel;
 use crate::io::device::NoteKind;
-use crate::pipeline::{Notice, NoticeKind};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{Notice, NoticeKind};
+use windhover_base::time::{MonoTime, Span};
 
 use super::log::Line;
 
@@ -79,7 +79,7 @@ struct Row {
 }
 
 const fn row(name: &'static str, level: LogLevel, every_s: i64) -> Row {
-    Row { name, level, every: Span::from_ns(every_s * crate::time::NS_PER_S) }
+    Row { name, level, every: Span::from_ns(every_s * windhover_base::time::NS_PER_S) }
 }
 
 use LogLevel::{Error, Info, Warn};
@@ -161,8 +161,11 @@ const fn pipeline_row(notice: NoticeKind) -> Row {
         | NoticeKind::Declination
         | NoticeKind::TargetTracking => (Info, 0),
         NoticeKind::TargetCoasting => (Info, 5),
-        NoticeKind::FixLost | NoticeKind::SourceSilent | NoticeKind::FilterReset => (Warn, 0),
-        NoticeKind::TargetLost => (Warn, 0),
+        NoticeKind::FixLost
+        | NoticeKind::SourceSilent
+        | NoticeKind::TerrainMissing
+        | NoticeKind::FilterReset
+        | NoticeKind::TargetLost => (Warn, 0),
         NoticeKind::BytesRefused
         | NoticeKind::FrameUnusable
         | NoticeKind::Dropped

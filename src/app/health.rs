@@ -2,9 +2,8 @@
 
 use crate::config::{Config, LogLevel};
 use crate::io::records::DaemonFigures;
-use crate::msg::{FixKind, TrackStatus};
-use crate::pipeline::{Health, SourceHealth, TargetHealth};
-use crate::time::Span;
+use windhover_base::msg::{FixKind, Health, Source, SourceHealth, TargetHealth, TrackStatus};
+use windhover_base::time::Span;
 
 use super::log::{Line, Value};
 
@@ -80,14 +79,16 @@ impl Figures {
 /// The health line; `figures` where a daemon runs, none in replay.
 pub fn line(health: &Health, config: &Config, figures: Option<&Figures>) -> Line {
     let mut line = Line::new(health.t, level(health, figures), "health");
-    line = gps(line, health);
-    line = source(line, "compass", &health.compass);
-    line = source(line, "camera", &health.camera);
+    for of_source in &health.sources {
+        line = source(line, of_source);
+        if of_source.source == Source::Gps {
+            line = fix(line, health);
+        }
+    }
     for (target, name) in health.targets.iter().zip(config.target.iter().map(|t| t.name.as_str())) {
         line = of_target(line, name, target);
     }
-    let dropped = health.gps.dropped + health.compass.dropped + health.camera.dropped;
-    line = line.count("dropped", dropped);
+    line = line.count("dropped", health.sources.iter().map(|s| s.dropped).sum());
     match figures {
         Some(figures) => of_daemon(line, figures),
         None => line,
@@ -96,18 +97,17 @@ pub fn line(health: &Health, config: &Config, figures: Option<&Figures>) -> Line
 
 /// Normal flight is information; a silent source or a failing card is a warning.
 fn level(health: &Health, figures: Option<&Figures>) -> LogLevel {
-    let silent = |source: &SourceHealth| source.rate_hz <= 0.0;
-    let troubled = silent(&health.gps) || silent(&health.compass) || silent(&health.camera);
+    let troubled = health.sources.iter().any(|source| source.rate_hz <= 0.0);
     if troubled || figures.is_some_and(|f| f.warn) { LogLevel::Warn } else { LogLevel::Info }
 }
 
-fn gps(line: Line, health: &Health) -> Line {
+fn fix(line: Line, health: &Health) -> Line {
     let fix = match health.fix {
         FixKind::None => "none",
         FixKind::TwoD => "2d",
         FixKind::ThreeD => "3d",
     };
-    let line = source(line, "gps", &health.gps).with("fix", fix);
+    let line = line.with("fix", fix);
     match health.sats {
         Some(sats) => line.count("sats", u64::from(sats)),
         None => line,
@@ -115,7 +115,8 @@ fn gps(line: Line, health: &Health) -> Line {
 }
 
 /// Rate, and the age where there is one: `gps=5.0Hz/0.12s`.
-fn source(line: Line, name: &str, health: &SourceHealth) -> Line {
+fn source(line: Line, health: &SourceHealth) -> Line {
+    let name = health.source.name();
     let line = line.figure(format!("{name}_hz"), health.rate_hz, 1);
     match health.age {
         Some(age) => line.figure(format!("{name}_age_s"), age.s(), 2),
@@ -174,8 +175,11 @@ mod tests {
         let numbers: Vec<(&str, f64)> = told.figures.iter().map(|(name, value)| (&**name, *value)).collect();
         assert_eq!(numbers, [("card_free_mb", 812.0), ("latency_p99_ms", 31.0)]);
         assert_eq!(told.words.iter().map(|(a, b)| (&**a, &**b)).collect::<Vec<_>>(), [("card", "ok")]);
-        let text =
-            of_daemon(Line::new(crate::time::MonoTime::default(), LogLevel::Info, "health"), &figures).text();
+        let text = of_daemon(
+            Line::new(windhover_base::time::MonoTime::default(), LogLevel::Info, "health"),
+            &figures,
+        )
+        .text();
         assert!(text.contains("latency_p99_ms=31.0 card=ok card_free_mb=812"), "{text}");
     }
 
@@ -183,12 +187,13 @@ mod tests {
     fn a_silent_source_is_a_warning() {
         let config =
             crate::config::Config::parse(include_str!("../../config/windhover.toml")).expect("valid");
-        let up = SourceHealth { rate_hz: 5.0, age: Some(Span::from_ms(120.0)), ..SourceHealth::default() };
-        let mut health = Health { gps: up, compass: up, camera: up, ..Health::default() };
+        let age = Some(Span::from_ms(120.0));
+        let up = |&source: &Source| SourceHealth { rate_hz: 5.0, age, ..SourceHealth::nothing_from(source) };
+        let mut health = Health { sources: Source::ALL.iter().map(up).collect(), ..Health::default() };
         let text = line(&health, &config, None);
         assert_eq!(text.level, LogLevel::Info);
         assert!(text.text().contains("gps_hz=5.0 gps_age_s=0.12 fix=none"), "{}", text.text());
-        health.compass.rate_hz = 0.0;
+        health.sources[1].rate_hz = 0.0;
         let figures = Figures { link: "off".into(), temperature_c: Some(41.3), ..Figures::default() };
         let text = line(&health, &config, Some(&figures));
         assert_eq!(text.level, LogLevel::Warn);

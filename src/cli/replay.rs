@@ -8,7 +8,7 @@ use super::{CliError, CliResult};
 use crate::app::replay::{self, ReplayError, Step};
 use crate::app::{config_file, events, health};
 use crate::config::Config;
-use crate::pipeline::Output;
+use windhover_base::msg::Output;
 
 /// Run a recorded capture or flight through the pipeline that flies: the same bytes and frames give
 /// the same estimates.

@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::config::LogLevel;
-use crate::time::{MonoTime, UtcTime};
+use windhover_base::time::{MonoTime, UtcTime};
 
 /// A value of a field.
 #[derive(Clone, PartialEq, Debug)]

@@ -15,8 +15,8 @@ use std::thread::JoinHandle;
 use super::events::{Event, Throttle};
 use crate::config::{LogConfig, LogLevel};
 use crate::io::clock::HostClock;
-use crate::time::MonoTime;
 use sink::Sinks;
+use windhover_base::time::MonoTime;
 
 /// Lines that wait to be written; when one more comes it is dropped and counted, so that a terminal
 /// or disk that stalls holds nobody up.

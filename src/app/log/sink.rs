@@ -176,7 +176,8 @@ mod tests {
         let path = folder.path().join("w.log");
         let config = LogConfig { file: Some(path.to_string_lossy().into_owned()), ..LogConfig::default() };
         let mut sinks = Sinks::new(&config);
-        let line = Line::new(crate::time::MonoTime::from_ns(0), crate::config::LogLevel::Info, "started");
+        let line =
+            Line::new(windhover_base::time::MonoTime::from_ns(0), crate::config::LogLevel::Info, "started");
         sinks.write(&line);
         std::fs::rename(&path, folder.path().join("moved")).expect("moved");
         sinks.reopen();

@@ -5,8 +5,8 @@ use prost::Message as _;
 use crate::io::proto::link::Thumbnail;
 use crate::io::records;
 use crate::jpeg::{self, Layout};
-use crate::msg::{FeatureTrack, FramePayload, GrayImage, MarkerDetection};
-use crate::pipeline::frame;
+use crate::pixels;
+use windhover_base::msg::{FeatureTrack, FramePayload, GrayImage, MarkerDetection};
 
 /// JPEG quality: a thumbnail of 320 × 256 takes about 8 KB.
 const QUALITY: u8 = 60;
@@ -46,7 +46,7 @@ fn shrink(image: &GrayImage, factor: usize) -> GrayImage {
 impl Picture {
     /// The thumbnail, about `width` pixels wide; `None` where the frame cannot be read or is empty.
     pub fn thumbnail(&self, width: u32) -> Option<Thumbnail> {
-        let image = frame::decode(&self.frame, false).ok()?.gray;
+        let image = pixels::decode(&self.frame, false).ok()?.gray;
         let factor = (image.width / width.max(1) as usize).max(1);
         let small = shrink(&image, factor);
         let jpeg = jpeg::encode(&small.data, Layout::Grey, (small.width, small.height), QUALITY).ok()?;
@@ -66,8 +66,8 @@ impl Picture {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::msg::FrameEncoding;
-    use crate::time::MonoTime;
+    use windhover_base::msg::FrameEncoding;
+    use windhover_base::time::MonoTime;
 
     #[test]
     fn a_thumbnail_shows_the_mean_and_keeps_the_size_of_the_frame() {
