@@ -7,6 +7,7 @@ from photographs import middle, near
 from program import Figure
 
 LEAST_PX = 16
+# The bars of `figures` leave a tag, and a sixth of an error, to what was measured: 54 of 56, 0.078 and 0.138 px.
 # A tag's corners may be listed from any of them on, in either direction.
 ORDERS = [[(k + s * i) % 4 for i in range(4)] for k in range(4) for s in (1, -1)]
 

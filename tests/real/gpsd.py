@@ -20,6 +20,8 @@ FIELDS = [
 ]
 ANGLES = ("heading", "pitch", "roll")
 ANGLE_DEG = 1e-3
+# gpsd keeps what some compasses send as it is.
+COUNTS_A_TURN = 65536
 
 
 class Comparison:
@@ -56,9 +58,10 @@ def compare(program, log):
 
 def reports(path):
     """TPV by time, fields of the last that has them, and ATT in order."""
-    fixes, attitudes = {}, []
+    fixes, attitudes, sentence = {}, [], ""
     for line in path.read_text(errors="replace").splitlines():
         if not line.startswith('{"class"'):
+            sentence = line
             continue
         report = json.loads(line)
         if report["class"] == "TPV" and "time" in report:
@@ -66,7 +69,8 @@ def reports(path):
             known = fixes.get(report["time"], {"mode": 0})
             mode = report["mode"] or known["mode"]
             fixes[report["time"]] = {**known, **report, "mode": mode}
-        elif report["class"] == "ATT":
+        elif report["class"] == "ATT" and "XDR" not in sentence:
+            # An XDR says the same angles again.
             attitudes.append(report)
     return fixes, attitudes
 
@@ -95,12 +99,9 @@ def compare_attitudes(found, readings, attitudes):
         ours = [r[name + "_deg"] for r in readings if r[name + "_deg"] is not None]
         theirs = [a[name] for a in attitudes if name in a]
         if len(ours) != len(theirs):
-            found.differ(f"{name}: {len(ours)} here, {len(theirs)} there", log_line(ours, theirs))
+            found.differ(f"{name}: {len(ours)} here, {len(theirs)} there", f"first {ours[:1]} and {theirs[:1]}")
         for a, b in zip(ours, theirs):
             found.angles += 1
             if abs(a - b) > ANGLE_DEG:
-                found.differ(name, f"ours {a} gpsd {b}")
-
-
-def log_line(ours, theirs):
-    return f"first {ours[:1]} and {theirs[:1]}"
+                counts = abs(a * COUNTS_A_TURN / 360 - b) < 0.01
+                found.differ(name + (" in counts there" if counts else ""), f"ours {a} gpsd {b}")
