@@ -60,7 +60,7 @@ pub fn run(
         origin: Origin::here(config, around.clock),
         slot,
         outlets,
-        pipeline: Pipeline::with_terrain(config, config_file::terrain_of(config)),
+        pipeline: Pipeline::with_terrain(config.into(), config_file::terrain_of(config)),
         latencies: Latencies::default(),
         outputs: Vec::new(),
     };

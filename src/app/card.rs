@@ -57,7 +57,7 @@ const LAST_WORD: Span = Span::from_ns(1_000_000_000);
 pub fn open(config: &Config, clock: HostClock, slot: &Slot) -> Option<Opened> {
     // A configuration that was checked can be written.
     let text = config.to_toml().unwrap_or_default();
-    let (store, notices) = config.store.enabled.then(|| Store::start(config, text, clock))?;
+    let (store, notices) = config.store.enabled.then(|| Store::start(&config.store, text, clock))?;
     slot.set(Some(store.handle()));
     Some(Opened { store, notices })
 }

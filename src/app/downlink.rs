@@ -119,7 +119,7 @@ pub fn run(
     let fault =
         |why: &dyn std::fmt::Display| around.log.tell(OperatorEvent::LinkFault, "link", why.to_string());
     if config.mavlink.enabled {
-        match MavlinkSender::open(config) {
+        match MavlinkSender::open(&config.mavlink, &config.target, &config.ground) {
             Ok(sender) => downlink.lines().mavlink = Some(sender),
             Err(error) => fault(&error),
         }

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use crate::config::Config;
 use windhover_base::msg::{
     Disposition, FixKind, Health, Notice, NoticeKind, Output, PerSource, Source, SourceHealth,
     TargetEstimate, TargetHealth, TrackStatus,
@@ -38,7 +37,7 @@ pub(super) struct Monitor {
 }
 
 impl Monitor {
-    pub(super) fn new(config: &Config) -> Self {
+    pub(super) fn new(names: Vec<String>) -> Self {
         let lost = |target| TargetEstimate {
             t_valid: MonoTime::default(),
             frame: 0,
@@ -47,14 +46,12 @@ impl Monitor {
             state: None,
         };
         Self {
-            names: config.target.iter().map(|t| t.name.clone()).collect(),
             sources: PerSource::default(),
             fix: FixKind::None,
             sats: None,
             clock_sigma: None,
-            targets: (0..config.target.len())
-                .map(|i| TargetHealth { frames_seen: 0, last: lost(i) })
-                .collect(),
+            targets: (0..names.len()).map(|i| TargetHealth { frames_seen: 0, last: lost(i) }).collect(),
+            names,
             dispositions: BTreeMap::new(),
             began: None,
             next_health: None,

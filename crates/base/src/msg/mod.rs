@@ -22,7 +22,7 @@ pub use health::{Health, SourceHealth, TargetHealth};
 pub use image::{GrayImage, ImageView, RgbImage};
 pub use measure::{
     AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, MarkerDetection, MarkerId,
-    Measurement, Stamped,
+    SensorReading, Stamped,
 };
 pub use notice::{Notice, NoticeKind};
 pub use output::{Output, TimedOutput};
