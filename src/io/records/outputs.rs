@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use nalgebra::{UnitQuaternion, Vector3};
 use prost::Message;
 
-use super::messages::{
+use super::output_messages::{
     annotations, detections, fix_number, health, log_message, ownship, stamp, target_state, transform,
 };
 use super::{Record, Schema, topic};
