@@ -22,9 +22,9 @@ use site::SiteFinder;
 use ticks::Ticks;
 use windhover_base::geo::{Geodetic, Tile};
 use windhover_base::msg::{
-    AttitudeSample, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload, FramePrediction,
-    GnssEpoch, MarkerDetection, MarkerId, NoticeKind, Output, SensorReading, Source, Stamped, TargetEstimate,
-    TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
+    AttitudeSample, Delivery, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload,
+    FramePrediction, GnssEpoch, MarkerDetection, MarkerId, NoticeKind, Output, SensorReading, Source,
+    Stamped, TargetEstimate, TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
 };
 use windhover_base::settings::{MarkerKind, TargetConfig};
 use windhover_base::time::{MonoTime, Span};
@@ -70,16 +70,20 @@ impl Pipeline {
     /// The same over the terrain tile that `ground.terrain` of the configuration names.
     pub fn with_terrain(settings: PipelineSettings, terrain: Option<Arc<Tile>>) -> Self {
         let rig = &settings.rig;
+        let mut lines = SourceLines::new(&rig.gps, &rig.compass);
+        let there = |source: &Source| source.delivers() == Delivery::Frames || lines.of(*source).is_some();
+        let watched = Source::ALL.iter().copied().filter(there).collect();
+        let names = rig.target.iter().map(|target| target.name.clone()).collect();
         Self {
             want_rgb: wants_rgb(&rig.target),
-            lines: SourceLines::new(&rig.gps, &rig.compass),
+            lines,
             detector: FrameDetector::new(&settings.detector, &rig.target, &rig.camera.intrinsics),
             observations: FrameObservations::default(),
             prediction: FramePrediction::default(),
             finder: SiteFinder::new(&settings, terrain),
             estimators: None,
             warm: None,
-            monitor: Monitor::new(rig.target.iter().map(|target| target.name.clone()).collect()),
+            monitor: Monitor::new(watched, names),
             ticks: Ticks::default(),
             now: MonoTime::default(),
             last_exposure: None,

@@ -37,7 +37,7 @@ impl SourceLines {
         Self { gps: GpsLine::new(gps), compass: CompassLine::new(compass) }
     }
 
-    /// The line of a source; `None` where it does not deliver bytes.
+    /// The line of a source; `None` where it does not deliver bytes, or is not configured.
     pub(super) fn of(&mut self, source: Source) -> Option<&mut dyn SourceLine> {
         match source {
             Source::Gps => Some(&mut self.gps),
