@@ -70,7 +70,7 @@ impl Pipeline {
     /// The same over the terrain tile that `ground.terrain` of the configuration names.
     pub fn with_terrain(settings: PipelineSettings, terrain: Option<Arc<Tile>>) -> Self {
         let rig = &settings.rig;
-        let mut lines = SourceLines::new(&rig.gps, &rig.compass);
+        let mut lines = SourceLines::new(rig);
         let there = |source: &Source| source.delivers() == Delivery::Frames || lines.of(*source).is_some();
         let watched = Source::ALL.iter().copied().filter(there).collect();
         let names = rig.target.iter().map(|target| target.name.clone()).collect();

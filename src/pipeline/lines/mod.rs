@@ -7,7 +7,7 @@ pub(super) use compass::CompassLine;
 pub(super) use gps::GpsLine;
 
 use windhover_base::msg::{SensorReading, Source};
-use windhover_base::settings::{CompassConfig, GpsConfig};
+use windhover_base::settings::Rig;
 use windhover_base::time::{MonoTime, Span};
 use windhover_decode::DecodeCounts;
 
@@ -33,8 +33,8 @@ pub(super) struct SourceLines {
 }
 
 impl SourceLines {
-    pub(super) fn new(gps: &GpsConfig, compass: &CompassConfig) -> Self {
-        Self { gps: GpsLine::new(gps), compass: CompassLine::new(compass) }
+    pub(super) fn new(rig: &Rig) -> Self {
+        Self { gps: GpsLine::new(&rig.gps), compass: CompassLine::new(&rig.compass) }
     }
 
     /// The line of a source; `None` where it does not deliver bytes, or is not configured.
