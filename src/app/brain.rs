@@ -11,8 +11,8 @@ use crate::time::{MonoTime, Span};
 use super::card::CardOrders;
 use super::config_file;
 use super::devices::Surroundings;
-use super::events::{self, Event as OperatorEvent};
-use super::health::{self, Figures};
+use super::events::{self, OperatorEvent};
+use super::health::{Figures, HealthLine};
 use super::latencies::Latencies;
 use super::outlets::Outlets;
 use super::supervise::Heart;
@@ -62,6 +62,7 @@ pub fn run(
         pipeline: Pipeline::with_terrain(config, config_file::terrain_of(config)),
         ticks: Ticks::default(),
         latencies: Latencies::default(),
+        health_line: HealthLine::new(config),
         outputs: Vec::new(),
     };
     brain.continue_from_earlier(heart);
@@ -93,6 +94,7 @@ struct Brain<'a> {
     pipeline: Pipeline,
     ticks: Ticks,
     latencies: Latencies,
+    health_line: HealthLine,
     outputs: Vec<Output>,
 }
 
@@ -145,12 +147,7 @@ impl Brain<'_> {
         self.pipeline.finish(&mut self.outputs);
         self.pass_on(self.around.clock.now());
         if let Some(all) = self.latencies.of_flight() {
-            self.around.log.tell_with(OperatorEvent::Latencies, "", "", |line| {
-                line.count("frames", all.frames)
-                    .figure("p50_ms", all.p50.ms(), 2)
-                    .figure("p99_ms", all.p99.ms(), 2)
-                    .figure("max_ms", all.longest.ms(), 2)
-            });
+            events::latencies(&all);
         }
     }
 
@@ -159,14 +156,7 @@ impl Brain<'_> {
         let outputs = std::mem::take(&mut self.outputs);
         for output in &outputs {
             match output {
-                Output::Notice(notice) => {
-                    let about = notice.source.map_or("", crate::msg::Source::name);
-                    let line = events::line_of_notice(notice);
-                    let event = OperatorEvent::Pipeline(notice.kind);
-                    // A target's notices tell its name in their words only.
-                    let key = if about.is_empty() { notice.detail.clone() } else { about.to_owned() };
-                    self.around.log.tell_keyed(notice.t, event, key, |_| line);
-                }
+                Output::Notice(notice) => events::notice(notice),
                 Output::Health(health) => self.health(health),
                 Output::Estimate(estimate) => self.estimate(estimate),
                 _ => {}
@@ -192,7 +182,7 @@ impl Brain<'_> {
             shown.figures.clone()
         });
         self.outlets.figures(figures.by_name());
-        self.around.log.write(health::line(health, self.config, Some(&figures)));
+        self.health_line.emit(health, Some(&figures));
         if let (Some(state), Some(store)) = (self.pipeline.warm_state(), self.outlets.slot().get()) {
             warm::save(&store, &self.origin, health.t, &state);
         }

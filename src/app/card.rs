@@ -12,7 +12,7 @@ use crate::time::Span;
 
 use super::brain::Board;
 use super::devices::Surroundings;
-use super::events::Event;
+use super::events::OperatorEvent as Event;
 use super::health::CardFigures;
 use super::presence::PartState;
 use super::supervise::Heart;
@@ -137,8 +137,7 @@ fn attend(
 
 fn tell_all(notices: &Receiver<StoreNotice>, around: &Surroundings) {
     for notice in notices.try_iter() {
-        let event = Event::Card { name: notice.name(), warning: notice.is_warning() };
-        around.log.tell(event, "card", notice.to_string());
+        around.log.tell((&notice).into(), "card", notice.to_string());
     }
 }
 

@@ -11,7 +11,7 @@ use crate::io::serial::{self, SerialSettings};
 use crate::msg::{EventBody, Source};
 use crate::time::MonoTime;
 
-use super::events::Event;
+use super::events::{self, OperatorEvent as Event};
 use super::inbox::Inbox;
 use super::log::Log;
 use super::presence::{PartState, Presence};
@@ -79,7 +79,7 @@ pub fn pulses(config: &Config, around: &Surroundings, heart: &Heart) {
         heart.beat();
         match report {
             Report::Up(text) => around.log.tell(Event::DeviceUp, "pps", text),
-            Report::Down(fault) => around.log.tell(Event::DeviceDown, "pps", fault.to_string()),
+            Report::Down(fault) => events::device_down("pps", &fault),
             _ => {}
         }
     };
@@ -127,7 +127,7 @@ impl<'a> Told<'a> {
                 if kind == NoteKind::FramesMissed {
                     self.put(EventBody::Dropped { source: self.source, count });
                 }
-                self.around.log.tell(Event::Device(kind), name, text);
+                self.around.log.tell(kind.into(), name, text);
             }
         }
     }
@@ -147,12 +147,6 @@ impl<'a> Told<'a> {
         if matches!(before, PartState::Open | PartState::Delivers) {
             self.put(EventBody::SourceDown(self.source));
         }
-        let name = self.part.name();
-        // The same fault again and again is one line in half a minute, until the device comes up; another fault
-        // shows at once.
-        let key = format!("{name} {}", fault.kind.name());
-        self.around.log.tell_keyed(self.around.clock.now(), Event::DeviceDown, key, |line| {
-            line.says(fault.to_string()).with("about", name).with("fault", fault.kind.name())
-        });
+        events::device_down(self.part.name(), fault);
     }
 }

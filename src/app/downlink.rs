@@ -24,7 +24,7 @@ use crate::time::{Span, UtcTime};
 use super::brain::Board;
 use super::card::Slot;
 use super::devices::Surroundings;
-use super::events::Event as OperatorEvent;
+use super::events::OperatorEvent;
 use super::supervise::Heart;
 
 /// How often the task looks round.

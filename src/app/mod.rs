@@ -1,6 +1,7 @@
 //! Wiring: configuration files, the task graph, supervision, the operator log, reports.
 
 pub mod brain;
+mod callsite;
 pub mod card;
 pub mod config_file;
 pub mod declination;

@@ -6,7 +6,7 @@ use std::time::Duration;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::config_file::{self, ConfigFileError};
-use super::events::Event;
+use super::events::{self, OperatorEvent as Event};
 use super::log::{self, Log};
 use super::topology::{self, Graph};
 use super::watch::Watch;
@@ -45,10 +45,11 @@ const WRITING: Duration = Duration::from_millis(2_400);
 pub fn run(config_path: &Path) -> Result<(), RunError> {
     let config = config_file::load(config_path)?;
     let clock = HostClock::start();
-    let (log, log_thread) = log::start(&config.log, clock);
+    let (log, log_end) = log::start(&config.log, clock);
     tell_of_panics(&log);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let result = runtime.block_on(daemon(config_path.to_owned(), config, clock, &log));
+    log.settle();
     log.tell(
         Event::Stopped,
         "",
@@ -57,7 +58,7 @@ pub fn run(config_path: &Path) -> Result<(), RunError> {
             Err(error) => error.to_string(),
         },
     );
-    drop(log_thread);
+    drop(log_end);
     result
 }
 
@@ -93,9 +94,7 @@ impl Signals {
 
 async fn daemon(path: PathBuf, config: Config, clock: HostClock, log: &Log) -> Result<(), RunError> {
     let mut signals = Signals::new()?;
-    log.tell_with(Event::Started, "", "", |line| {
-        line.with("version", env!("CARGO_PKG_VERSION")).with("config", path.display().to_string())
-    });
+    events::started(&path);
     let graph = topology::start(&config, clock, log)?;
     let mut watch = Watch::new(path, config, graph);
     let mut round = tokio::time::interval(ROUND);

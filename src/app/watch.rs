@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
 use super::config_file;
-use super::events::Event;
+use super::events::{self, OperatorEvent as Event};
 use super::presence::Presence;
 use super::reload;
 use super::topology::Graph;
@@ -146,6 +146,7 @@ impl Watch {
                 PowerState::Good => log.tell(Event::PowerBack, "", what),
             }
         }
+        self.graph.around.log.report_losses();
         self.status();
     }
 
@@ -161,7 +162,7 @@ impl Watch {
                 reading.set
             }
             Err(fault) => {
-                log.tell(Event::DeviceDown, "power_line", fault.to_string());
+                events::device_down("power_line", &fault);
                 false
             }
         }
