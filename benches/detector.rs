@@ -21,7 +21,7 @@ use windhover::msg::{
     EventBody, FrameObservations, FramePrediction, GrayImage, ImageView, MarkerDetection, MarkerId,
     MarkerPrediction,
 };
-use windhover::pipeline::frame::{self as frames, DecodedFrame};
+use windhover::pixels::{self, DecodedFrame};
 
 fn put_tag(image: &mut GrayImage, id: u32, at: (usize, usize), cell: usize) {
     let pattern = tag_pattern(TagFamily::Tag36h11, id);
@@ -214,7 +214,7 @@ fn flight(capture: &Path) -> Result<(), Box<dyn std::error::Error>> {
     ];
     for item in CaptureReader::open(capture)? {
         let Some(EventBody::Frame(payload)) = item.event.map(|event| event.body) else { continue };
-        let image = frames::decode(&payload, true)?;
+        let image = pixels::decode(&payload, true)?;
         ways.iter_mut().for_each(|way| way.take(&image));
     }
     println!(

@@ -26,7 +26,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use windhover::app::replay::config_of;
 use windhover::io::capture::CaptureReader;
-use windhover::msg::EventBody;
+use windhover::msg::{EventBody, Source};
 use windhover::time::Span;
 
 #[derive(Parser)]
@@ -131,8 +131,8 @@ fn unpack(flight: &Path, camera: &Path) -> Result<Bytes> {
     for event in CaptureReader::open(flight)?.filter_map(|item| item.event) {
         let since = event.t_recv - *first.get_or_insert(event.t_recv);
         match event.body {
-            EventBody::GnssBytes(data) => bytes.push((since, true, data)),
-            EventBody::CompassBytes(data) => bytes.push((since, false, data)),
+            EventBody::Bytes { source: Source::Gps, data } => bytes.push((since, true, data)),
+            EventBody::Bytes { source: Source::Compass, data } => bytes.push((since, false, data)),
             EventBody::Frame(frame) => {
                 let name = format!("{:05}.pgm", frame.index);
                 let head = format!("P5\n{} {}\n255\n", frame.width, frame.height);

@@ -19,7 +19,7 @@ use windhover::io::records::{Record, Schema, topic};
 use windhover::io::store::index::{Change, Index, QueuedRecord};
 use windhover::io::store::volume::Volume;
 use windhover::io::store::{Store, StoreHandle};
-use windhover::msg::{Event, EventBody, FrameEncoding, FramePayload};
+use windhover::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
 use windhover::time::{MonoTime, Span};
 
 #[derive(Parser)]
@@ -104,8 +104,14 @@ impl Feeder {
     fn serial(&mut self) {
         let line = format!("$GPGGA,{:08},4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n", self.fed);
         self.bytes += 2 * line.len() as u64;
-        self.event(u64::from(self.fed), EventBody::GnssBytes(line.clone().into_bytes()));
-        self.event(u64::from(self.fed), EventBody::CompassBytes(line.into_bytes()));
+        self.event(
+            u64::from(self.fed),
+            EventBody::Bytes { source: Source::Gps, data: line.clone().into_bytes() },
+        );
+        self.event(
+            u64::from(self.fed),
+            EventBody::Bytes { source: Source::Compass, data: line.into_bytes() },
+        );
         self.fed += 1;
     }
 

@@ -18,8 +18,8 @@ use std::time::Duration;
 use windhover::config::Config;
 use windhover::io::capture::{CaptureReader, attached_config};
 use windhover::io::clock::HostClock;
-use windhover::msg::{EventBody, FramePayload, GrayImage};
-use windhover::pipeline::Pipeline;
+use windhover::msg::{EventBody, FramePayload, GrayImage, Source};
+use windhover::pixels;
 use windhover::time::{MonoTime, Span};
 
 type Trouble = Box<dyn std::error::Error>;
@@ -95,8 +95,8 @@ impl Lines {
             }
             self.sleep_until(event.t_recv + shift);
             match event.body {
-                EventBody::GnssBytes(bytes) => say(&mut self.gps, &bytes)?,
-                EventBody::CompassBytes(bytes) => say(&mut self.compass, &bytes)?,
+                EventBody::Bytes { source: Source::Gps, data: bytes } => say(&mut self.gps, &bytes)?,
+                EventBody::Bytes { source: Source::Compass, data: bytes } => say(&mut self.compass, &bytes)?,
                 EventBody::Frame(frame) => {
                     if let Some(image) = numbered(&frame) {
                         let _ = self.frames.try_send((frame.index, image));
@@ -145,7 +145,7 @@ fn first_pulse(capture: &str) -> Result<Option<MonoTime>, Trouble> {
     let config = attached_config(path)?.ok_or("the capture has no configuration")?;
     let latency = Span::from_ms(Config::parse(&config)?.gps.latency_ms);
     let heard = CaptureReader::open(path)?.filter_map(|item| item.event).filter_map(|event| {
-        let EventBody::GnssBytes(bytes) = &event.body else { return None };
+        let EventBody::Bytes { source: Source::Gps, data: bytes } = &event.body else { return None };
         let text = String::from_utf8_lossy(bytes);
         let seconds: f64 = text.split_once("RMC,")?.1.split(',').next()?.get(4..)?.parse().ok()?;
         Some(event.t_recv - Span::from_s(seconds.fract()))
@@ -186,7 +186,7 @@ fn packing(format: &str) -> Option<Packing> {
 
 /// The frame as packed grey with its number in the corner.
 fn numbered(frame: &FramePayload) -> Option<GrayImage> {
-    let decoded = Pipeline::prepare(frame, false).ok()?;
+    let decoded = pixels::decode(frame, false).ok()?;
     let view = decoded.gray.view();
     let mut data = Vec::with_capacity(view.width * view.height);
     for v in 0..view.height {

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 
 use windhover::io::capture::CaptureReader;
 use windhover::msg::{EventBody, ImageView};
-use windhover::pipeline::Pipeline;
+use windhover::pixels;
 
 fn main() -> ExitCode {
     let Some(flight) = std::env::args().nth(1) else {
@@ -23,7 +23,7 @@ fn main() -> ExitCode {
     println!("frame,time_ns,number");
     for event in reader.filter_map(|item| item.event) {
         let EventBody::Frame(frame) = event.body else { continue };
-        let number = Pipeline::prepare(&frame, false).ok().and_then(|decoded| number(&decoded.gray.view()));
+        let number = pixels::decode(&frame, false).ok().and_then(|decoded| number(&decoded.gray.view()));
         let number = number.map_or(String::new(), |number| number.to_string());
         println!("{},{},{number}", frame.index, frame.t_exposure.ns());
     }

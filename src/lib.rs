@@ -16,6 +16,7 @@ pub mod geo;
 pub mod config;
 pub mod msg;
 pub mod jpeg;
+pub mod pixels;
 pub mod decode;
 pub mod align;
 pub mod detect;

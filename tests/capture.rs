@@ -17,8 +17,8 @@ fn events() -> Vec<Event> {
     let mut events = Vec::new();
     for i in 0..100_i64 {
         let body = match i % 4 {
-            0 => EventBody::GnssBytes(format!("$GPGGA,{i}").into_bytes()),
-            1 => EventBody::CompassBytes(vec![0xff, i as u8, 0]),
+            0 => EventBody::Bytes { source: Source::Gps, data: format!("$GPGGA,{i}").into_bytes() },
+            1 => EventBody::Bytes { source: Source::Compass, data: vec![0xff, i as u8, 0] },
             2 => EventBody::Frame(FramePayload {
                 index: (i / 4) as u32,
                 t_exposure: at(i * 50 - 7),

@@ -17,7 +17,7 @@ use windhover::io::clock::HostClock;
 use windhover::io::store::flight::{self, FLIGHTS};
 use windhover::io::store::volume::Volume;
 use windhover::io::store::{Recording, Store, StoreHandle, StoreNotice, inspect};
-use windhover::msg::{Event, EventBody};
+use windhover::msg::{Event, EventBody, Source};
 use windhover::time::MonoTime;
 
 /// A mount point and what is in it.
@@ -94,7 +94,11 @@ fn expect(notices: &Receiver<StoreNotice>, name: &str) -> String {
 }
 
 fn say(handle: &StoreHandle, t_recv: MonoTime, words: &str) {
-    handle.event(&Event { t_recv, seq: 0, body: EventBody::GnssBytes(words.as_bytes().to_vec()) });
+    handle.event(&Event {
+        t_recv,
+        seq: 0,
+        body: EventBody::Bytes { source: Source::Gps, data: words.as_bytes().to_vec() },
+    });
 }
 
 /// What was heard, flight by flight.
@@ -104,7 +108,7 @@ fn heard(card: &Path) -> Vec<String> {
     let lines = names.iter().flat_map(|name| CaptureReader::open(&card.join(FLIGHTS).join(name)).unwrap());
     lines
         .filter_map(|item| match item.event?.body {
-            EventBody::GnssBytes(bytes) => Some(String::from_utf8(bytes).unwrap()),
+            EventBody::Bytes { source: Source::Gps, data: bytes } => Some(String::from_utf8(bytes).unwrap()),
             _ => None,
         })
         .collect()
@@ -195,7 +199,11 @@ fn a_device_that_refuses_writes_stops_recording_and_the_same_card_comes_back() {
             noise.to_le_bytes()
         });
         let bytes: Vec<u8> = words.take(16 << 10).flatten().collect();
-        handle.event(&Event { t_recv: clock.now(), seq: 0, body: EventBody::CompassBytes(bytes) });
+        handle.event(&Event {
+            t_recv: clock.now(),
+            seq: 0,
+            body: EventBody::Bytes { source: Source::Compass, data: bytes },
+        });
         match notices.recv_timeout(Duration::from_millis(50)) {
             Ok(notice) if notice.name() == "recording_stopped" => break notice.to_string(),
             _ => {}

@@ -5,15 +5,19 @@ use std::path::Path;
 use windhover::app::import::{ImportFailure, Imported, Sources, import};
 use windhover::io::capture::{CaptureReader, attached_config};
 use windhover::io::import::VideoSource;
-use windhover::msg::{EventBody, FrameEncoding};
+use windhover::msg::{EventBody, FrameEncoding, Source};
 
 /// What a capture holds: milliseconds since its first event, and what it is.
 fn contents(path: &Path) -> Vec<(i64, String)> {
     let events: Vec<_> = CaptureReader::open(path).unwrap().filter_map(|item| item.event).collect();
     let first = events[0].t_recv;
     let name = |body: &EventBody| match body {
-        EventBody::GnssBytes(bytes) => format!("gps {}", String::from_utf8_lossy(bytes).trim_end()),
-        EventBody::CompassBytes(bytes) => format!("compass {}", String::from_utf8_lossy(bytes).trim_end()),
+        EventBody::Bytes { source: Source::Gps, data: bytes } => {
+            format!("gps {}", String::from_utf8_lossy(bytes).trim_end())
+        }
+        EventBody::Bytes { source: Source::Compass, data: bytes } => {
+            format!("compass {}", String::from_utf8_lossy(bytes).trim_end())
+        }
         EventBody::Frame(frame) => format!("{:?} {} {}", frame.encoding, frame.index, frame.data.len()),
         other => format!("{other:?}"),
     };

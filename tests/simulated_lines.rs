@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use windhover::config::CompassFormat;
 use windhover::geo::wrap_angle;
-use windhover::msg::{AttitudeSample, GnssEpoch, Stamped};
-use windhover::pipeline::{Output, Pipeline};
+use windhover::msg::{AttitudeSample, GnssEpoch, NoticeKind, Output, Stamped};
+use windhover::pipeline::Pipeline;
 use windhover::simulate::{Flight, FrameStorage, Sample, Scenario, SensorSuite, World};
 use windhover::time::{MonoTime, Span};
 
@@ -177,4 +177,28 @@ fn fixes_are_read_as_they_were_sent() {
         compared += 1;
     }
     assert!(compared > 260, "{compared} fixes compared of {}", sent.len());
+}
+
+/// The datum is settled all the same, and each is an event of its own.
+#[test]
+fn a_terrain_tile_that_is_missing_is_an_event_of_its_own() {
+    // Given a configuration that names a terrain tile, and a pipeline that could not be given it.
+    let mut scenario = Scenario::named("follow").expect("known");
+    scenario.duration_s = 4.0;
+    let world = Arc::new(World::new(scenario, 3));
+    let mut config = world.scenario().config.clone();
+    config.ground.elevation_msl_m = None;
+    config.ground.source = None;
+    config.ground.terrain = Some("N30W086.hgt".into());
+    let mut pipeline = Pipeline::new(&config);
+    // When the first fixes come.
+    let mut outputs = Vec::new();
+    for event in Flight::new(world, FrameStorage::None, 1) {
+        pipeline.handle(&event.expect("serial lines need no encoder"), &mut outputs);
+    }
+    // Then it is said once, as what it is, and the datum is settled.
+    let count = |kind: NoticeKind| {
+        outputs.iter().filter(|o| matches!(o, Output::Notice(notice) if notice.kind == kind)).count()
+    };
+    assert_eq!((count(NoticeKind::TerrainMissing), count(NoticeKind::DatumSet)), (1, 1));
 }

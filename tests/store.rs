@@ -18,7 +18,7 @@ use windhover::io::store::flight::{self, FLIGHTS, FlightInfo};
 use windhover::io::store::summary::TopicStats;
 use windhover::io::store::volume::Volume;
 use windhover::io::store::{Store, StoreNotice};
-use windhover::msg::{Event, EventBody};
+use windhover::msg::{Event, EventBody, Source};
 
 fn windhover(root: &Path, arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_windhover"))
@@ -51,7 +51,7 @@ fn record_flight(root: &Path, lines: u32) {
         handle.event(&Event {
             t_recv,
             seq: u64::from(n),
-            body: EventBody::GnssBytes(n.to_le_bytes().to_vec()),
+            body: EventBody::Bytes { source: Source::Gps, data: n.to_le_bytes().to_vec() },
         });
         let topic = topic::target_state("ugv").into();
         let data = windhover::io::proto::windhover::TargetState::default();
@@ -180,7 +180,7 @@ fn lines_kept(root: &Path) -> BTreeSet<u32> {
     for name in flight::flight_names(root).unwrap() {
         let mut reader = CaptureReader::open(&root.join(FLIGHTS).join(name)).unwrap();
         for item in &mut reader {
-            if let Some(EventBody::GnssBytes(bytes)) = item.event.map(|e| e.body) {
+            if let Some(EventBody::Bytes { source: Source::Gps, data: bytes }) = item.event.map(|e| e.body) {
                 kept.extend(String::from_utf8_lossy(&bytes).get(7..15).and_then(|n| n.parse::<u32>().ok()));
             }
         }

@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 
 use windhover::config::Config;
 use windhover::io::capture::CaptureReader;
+use windhover::msg::Output;
 use windhover::msg::{Event, EventBody, TrackStatus, WarmState};
-use windhover::pipeline::{Output, Pipeline};
+use windhover::pipeline::Pipeline;
 use windhover::time::{MonoTime, Span};
 
 fn capture() -> PathBuf {

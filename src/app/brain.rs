@@ -4,8 +4,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::config::Config;
-use crate::msg::{Event, EventBody, TargetEstimate};
-use crate::pipeline::{Health, Output, Pipeline, Ticks};
+use crate::msg::{Event, EventBody, Health, Output, TargetEstimate};
+use crate::pipeline::{Pipeline, Ticks};
 use crate::time::{MonoTime, Span};
 
 use super::card::CardOrders;

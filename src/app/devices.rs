@@ -112,11 +112,7 @@ impl<'a> Told<'a> {
             }
             Report::Bytes(t, bytes) => {
                 self.delivers();
-                let body = match self.source {
-                    Source::Gps => EventBody::GnssBytes(bytes),
-                    Source::Compass | Source::Camera => EventBody::CompassBytes(bytes),
-                };
-                self.around.inbox.put(t, body);
+                self.around.inbox.put(t, EventBody::Bytes { source: self.source, data: bytes });
             }
             Report::Frame(t, frame) => {
                 self.delivers();

@@ -17,8 +17,7 @@ use crate::io::link::{
 };
 use crate::io::mavlink::MavlinkSender;
 use crate::io::records::Record;
-use crate::msg::{Event, EventBody, FramePayload};
-use crate::pipeline::Output;
+use crate::msg::{Event, EventBody, FramePayload, Output};
 use crate::time::{Span, UtcTime};
 
 use super::brain::Board;

@@ -11,7 +11,7 @@ use tracing::{Level, Metadata, Span};
 
 use crate::io::device::{Fault, NoteKind};
 use crate::io::store::StoreNotice;
-use crate::pipeline::{Notice, NoticeKind};
+use crate::msg::{Notice, NoticeKind, Source};
 use crate::time::{self, MonoTime, NS_PER_S};
 
 use super::latencies::OfFlight;
@@ -103,6 +103,8 @@ table! {
     Dropped: "dropped", WARN, every 5 s;
     /// The origin of the NED frame was settled.
     DatumSet: "datum_set", INFO, every 0 s;
+    /// The terrain tile of the configuration cannot be used here: the ground is level instead.
+    TerrainMissing: "terrain_missing", WARN, every 0 s;
     /// Declination was taken from the World Magnetic Model, or could not be.
     Declination: "declination", INFO, every 0 s;
     /// A target was found and settled.
@@ -255,6 +257,7 @@ impl From<NoticeKind> for OperatorEvent {
             NoticeKind::FrameUnusable => Self::FrameUnusable,
             NoticeKind::Dropped => Self::Dropped,
             NoticeKind::DatumSet => Self::DatumSet,
+            NoticeKind::TerrainMissing => Self::TerrainMissing,
             NoticeKind::Declination => Self::Declination,
             NoticeKind::TargetTracking => Self::TargetTracking,
             NoticeKind::TargetCoasting => Self::TargetCoasting,
@@ -285,7 +288,7 @@ impl From<&StoreNotice> for OperatorEvent {
 
 /// Emits the pipeline's notice, at its own time; replay and daemon show it alike.
 pub fn notice(notice: &Notice) {
-    let about = notice.source.map_or("", crate::msg::Source::name);
+    let about = notice.source.map_or("", Source::name);
     OperatorEvent::from(notice.kind).send(Some(notice.t), about, &notice.detail);
 }
 
@@ -329,11 +332,11 @@ pub fn flight_of_run(span: &Span, run: u32, flight: &str) {
 pub fn decimals(field: &str) -> Option<usize> {
     Some(match field.strip_suffix("_sigma").unwrap_or(field) {
         "card_free_mb" | "cpu_pct" | "mem_mb" => 0,
-        "gps_hz" | "compass_hz" | "camera_hz" => 1,
         "latency_p50_ms" | "latency_p99_ms" | "card_sync_p99_ms" | "temp_c" => 1,
         "heading_deg" | "yaw_rate_dps" => 1,
-        "gps_age_s" | "compass_age_s" | "camera_age_s" | "supply_v" => 2,
-        "north_m" | "east_m" | "speed_mps" | "p50_ms" | "p99_ms" | "max_ms" => 2,
+        "supply_v" | "north_m" | "east_m" | "speed_mps" | "p50_ms" | "p99_ms" | "max_ms" => 2,
+        rate if rate.ends_with("_hz") => 1,
+        age if age.ends_with("_age_s") => 2,
         _ => return None,
     })
 }

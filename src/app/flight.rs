@@ -12,7 +12,7 @@ use crate::io::capture::{CaptureReader, attached_config};
 use crate::io::mcap_read::{RawMessage, ReadError};
 use crate::io::proto::{foxglove as fox, host_time, windhover as wh};
 use crate::io::records::topic;
-use crate::msg::{EventBody, FramePayload};
+use crate::msg::{EventBody, FramePayload, Source};
 use crate::time::{MonoTime, UtcTime};
 
 /// What was estimated of one target.
@@ -97,8 +97,12 @@ impl Flight {
             }
             flight.ended = flight.ended.max(t);
             match item.event.map(|event| event.body) {
-                Some(EventBody::GnssBytes(bytes)) => flight.gps_reads.push((t, bytes.len())),
-                Some(EventBody::CompassBytes(bytes)) => flight.compass_reads.push((t, bytes.len())),
+                Some(EventBody::Bytes { source: Source::Gps, data: bytes }) => {
+                    flight.gps_reads.push((t, bytes.len()))
+                }
+                Some(EventBody::Bytes { source: Source::Compass, data: bytes }) => {
+                    flight.compass_reads.push((t, bytes.len()))
+                }
                 Some(EventBody::Frame(frame)) => flight.frames.push(FrameArrival {
                     t_recv: t,
                     t_exposure: frame.t_exposure,

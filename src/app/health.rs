@@ -4,8 +4,7 @@ use tracing::Level;
 
 use crate::config::Config;
 use crate::io::records::DaemonFigures;
-use crate::msg::{FixKind, TrackStatus};
-use crate::pipeline::{Health, SourceHealth, TargetHealth};
+use crate::msg::{FixKind, Health, Source, SourceHealth, TargetHealth, TrackStatus};
 use crate::time::Span;
 
 use super::callsite::RuntimeCallsite;
@@ -120,7 +119,8 @@ impl Fields {
     }
 
     /// Rate, and the age where there is one.
-    fn source(&mut self, name: &str, health: &SourceHealth) {
+    fn source(&mut self, health: &SourceHealth) {
+        let name = health.source.name();
         self.figure(&format!("{name}_hz"), Some(health.rate_hz));
         self.figure(&format!("{name}_age_s"), health.age.map(|age| age.s()));
     }
@@ -181,8 +181,7 @@ impl HealthLine {
     /// Emits it, at its own time; `figures` where a daemon runs, none in replay. Normal flight is information; a
     /// silent source or a failing card is a warning.
     pub fn emit(&self, health: &Health, figures: Option<&Figures>) {
-        let silent = |source: &SourceHealth| source.rate_hz <= 0.0;
-        let troubled = silent(&health.gps) || silent(&health.compass) || silent(&health.camera);
+        let troubled = health.sources.iter().any(|source| source.rate_hz <= 0.0);
         let callsite = if troubled || figures.is_some_and(|f| f.warn) { self.warn } else { self.info };
         let fields = fields(health, &self.targets, figures).0;
         let values: Vec<_> = fields.iter().map(|(_, value)| value.as_ref().map(Value::as_tracing)).collect();
@@ -199,15 +198,17 @@ fn fields(health: &Health, targets: &[String], figures: Option<&Figures>) -> Fie
     };
     let mut fields = Fields::default();
     fields.0.push(("t_ns".into(), Some(Value::Time(health.t.ns()))));
-    fields.source("gps", &health.gps);
-    fields.text("fix", Some(fix));
-    fields.count("sats", health.sats.map(u64::from));
-    fields.source("compass", &health.compass);
-    fields.source("camera", &health.camera);
+    for &source in Source::ALL {
+        fields.source(&health.source(source));
+        if source == Source::Gps {
+            fields.text("fix", Some(fix));
+            fields.count("sats", health.sats.map(u64::from));
+        }
+    }
     for (number, name) in targets.iter().enumerate() {
         fields.target(name, health.targets.get(number));
     }
-    fields.count("dropped", Some(health.gps.dropped + health.compass.dropped + health.camera.dropped));
+    fields.count("dropped", Some(health.sources.iter().map(|s| s.dropped).sum()));
     if let Some(figures) = figures {
         fields.daemon(figures);
     }
@@ -240,11 +241,12 @@ mod tests {
     #[test]
     fn a_silent_source_is_a_warning() {
         let line = HealthLine::new(&config());
-        let up = SourceHealth { rate_hz: 5.0, age: Some(Span::from_ms(120.0)), ..SourceHealth::default() };
-        let mut health = Health { gps: up, compass: up, camera: up, ..Health::default() };
+        let age = Some(Span::from_ms(120.0));
+        let up = |&source: &Source| SourceHealth { rate_hz: 5.0, age, ..SourceHealth::nothing_from(source) };
+        let mut health = Health { sources: Source::ALL.iter().map(up).collect(), ..Health::default() };
         let text = lines_of(|| line.emit(&health, None));
         assert!(text.contains("level=info event=health gps_hz=5.0 gps_age_s=0.12 fix=none"), "{text}");
-        health.compass.rate_hz = 0.0;
+        health.sources[1].rate_hz = 0.0;
         let figures = Figures { link: "off".into(), temperature_c: Some(41.3), ..Figures::default() };
         let text = lines_of(|| line.emit(&health, Some(&figures)));
         assert!(text.contains("level=warn") && text.contains("link=off temp_c=41.3"), "{text}");

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use crate::io::capture::CaptureWriter;
 use crate::io::import::{Frames, ImportError, VideoSource, open_video, read_serial_log};
 use crate::io::mcap_write::WriteError;
-use crate::msg::{Event, EventBody, FramePayload};
+use crate::msg::{Event, EventBody, FramePayload, Source};
 use crate::time::{MonoTime, Span};
 
 /// What to import.
@@ -60,12 +60,18 @@ pub fn import(sources: &Sources, config_toml: &str, out: &Path) -> Result<Import
     if let Some(path) = &sources.gps {
         let lines = serial_lines(path, &mut imported.warnings)?;
         imported.gps_lines = lines.len();
-        serial.extend(lines.into_iter().map(|(t, bytes)| (t, EventBody::GnssBytes(bytes))));
+        serial.extend(
+            lines.into_iter().map(|(t, bytes)| (t, EventBody::Bytes { source: Source::Gps, data: bytes })),
+        );
     }
     if let Some(path) = &sources.compass {
         let lines = serial_lines(path, &mut imported.warnings)?;
         imported.compass_lines = lines.len();
-        serial.extend(lines.into_iter().map(|(t, bytes)| (t, EventBody::CompassBytes(bytes))));
+        serial.extend(
+            lines
+                .into_iter()
+                .map(|(t, bytes)| (t, EventBody::Bytes { source: Source::Compass, data: bytes })),
+        );
     }
     serial.sort_by_key(|(t, _)| *t);
     let start = sources.video_start.or_else(|| serial.first().map(|(t, _)| *t)).unwrap_or_default();

@@ -4,8 +4,7 @@ use std::collections::VecDeque;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use crate::io::device::RawFrame;
-use crate::msg::{Event, EventBody, FramePayload, Source};
+use crate::msg::{Event, EventBody, FramePayload, PerSource, Source};
 use crate::time::{MonoTime, Span};
 
 /// Reads of the serial lines that wait: more than ten seconds' worth. A pipeline that is further
@@ -39,27 +38,17 @@ pub struct Inbox {
 #[derive(Debug, Default)]
 struct Lanes {
     reads: VecDeque<(MonoTime, EventBody)>,
-    frames: VecDeque<(MonoTime, RawFrame)>,
+    frames: VecDeque<(MonoTime, FramePayload)>,
     /// Whether the oldest frame is the next one, once the reads before it are handled.
     pinned: bool,
     /// Whether lost frames were told since the last frame.
     told: bool,
     /// Since when more frames wait than the queue is set to hold; until all are taken.
     crowded: Option<MonoTime>,
-    dropped: [u32; 3],
+    dropped: PerSource<u32>,
     last: Option<MonoTime>,
     next_seq: u64,
     next_frame: u32,
-}
-
-const SOURCES: [Source; 3] = [Source::Gps, Source::Compass, Source::Camera];
-
-fn slot(source: Source) -> usize {
-    match source {
-        Source::Gps => 0,
-        Source::Compass => 1,
-        Source::Camera => 2,
-    }
 }
 
 impl Inbox {
@@ -73,9 +62,9 @@ impl Inbox {
         let mut lanes = self.lock();
         if lanes.reads.len() >= READS
             && let Some((_, oldest)) = lanes.reads.pop_front()
-            && let Some(source) = source_of(&oldest)
+            && let Some(source) = oldest.delivered_by()
         {
-            lanes.dropped[slot(source)] += 1;
+            lanes.dropped[source] += 1;
         }
         lanes.reads.push_back((t_recv, body));
         drop(lanes);
@@ -83,7 +72,7 @@ impl Inbox {
     }
 
     /// Puts in a frame; where too many wait, the oldest goes that is not the next one.
-    pub fn put_frame(&self, t_recv: MonoTime, frame: RawFrame) {
+    pub fn put_frame(&self, t_recv: MonoTime, frame: FramePayload) {
         let mut lanes = self.lock();
         lanes.frames.push_back((t_recv, frame));
         if lanes.frames.len() > self.frames {
@@ -92,7 +81,7 @@ impl Inbox {
             while lanes.frames.len() > most {
                 let goes = usize::from(lanes.pinned);
                 lanes.frames.remove(goes);
-                lanes.dropped[slot(Source::Camera)] += 1;
+                lanes.dropped[Source::Camera] += 1;
             }
         }
         drop(lanes);
@@ -119,15 +108,6 @@ impl Inbox {
     }
 }
 
-fn source_of(body: &EventBody) -> Option<Source> {
-    match body {
-        EventBody::GnssBytes(_) => Some(Source::Gps),
-        EventBody::CompassBytes(_) => Some(Source::Compass),
-        EventBody::Frame(_) => Some(Source::Camera),
-        _ => None,
-    }
-}
-
 impl Lanes {
     fn is_empty(&self) -> bool {
         self.reads.is_empty() && self.frames.is_empty()
@@ -142,10 +122,11 @@ impl Lanes {
         // What was lost is told before what is still here; frames with the next one, not one by one.
         let frames_due = frame.is_none() || (frame_is_next && !self.told);
         let due = |source: Source| source != Source::Camera || frames_due;
-        if let Some(lost) = (0..SOURCES.len()).find(|&i| self.dropped[i] > 0 && due(SOURCES[i])) {
-            let count = std::mem::take(&mut self.dropped[lost]);
-            self.told |= SOURCES[lost] == Source::Camera;
-            return Some(self.number(earliest, EventBody::Dropped { source: SOURCES[lost], count }));
+        let lost = Source::ALL.iter().copied().find(|&source| self.dropped[source] > 0 && due(source));
+        if let Some(source) = lost {
+            let count = std::mem::take(&mut self.dropped[source]);
+            self.told |= source == Source::Camera;
+            return Some(self.number(earliest, EventBody::Dropped { source, count }));
         }
         if frame_is_next {
             let (t, frame) = self.frames.pop_front()?;
@@ -153,8 +134,9 @@ impl Lanes {
             if self.frames.is_empty() {
                 self.crowded = None;
             }
-            let payload = self.payload(frame);
-            return Some(self.number(t, EventBody::Frame(payload)));
+            let index = self.next_frame;
+            self.next_frame = index.wrapping_add(1);
+            return Some(self.number(t, EventBody::Frame(FramePayload { index, ..frame })));
         }
         let (t, body) = self.reads.pop_front()?;
         Some(self.number(t, body))
@@ -169,20 +151,6 @@ impl Lanes {
         self.next_seq += 1;
         Event { t_recv, seq, body }
     }
-
-    fn payload(&mut self, frame: RawFrame) -> FramePayload {
-        let index = self.next_frame;
-        self.next_frame = index.wrapping_add(1);
-        FramePayload {
-            index,
-            t_exposure: frame.t_exposure,
-            encoding: frame.encoding,
-            width: frame.width,
-            height: frame.height,
-            stride: frame.stride,
-            data: frame.data,
-        }
-    }
 }
 
 #[cfg(test)]
@@ -196,8 +164,9 @@ mod tests {
         MonoTime::from_ns(ms * 1_000_000)
     }
 
-    fn frame(ms: i64) -> RawFrame {
-        RawFrame {
+    fn frame(ms: i64) -> FramePayload {
+        FramePayload {
+            index: 0,
             t_exposure: at(ms),
             encoding: FrameEncoding::Grey,
             width: 1,
@@ -215,10 +184,10 @@ mod tests {
     fn events_leave_in_order_of_time_and_never_go_back() {
         let inbox = Inbox::new(3);
         inbox.put_frame(at(20), frame(15));
-        inbox.put(at(10), EventBody::GnssBytes(vec![1]));
-        inbox.put(at(30), EventBody::CompassBytes(vec![2]));
+        inbox.put(at(10), EventBody::Bytes { source: Source::Gps, data: vec![1] });
+        inbox.put(at(30), EventBody::Bytes { source: Source::Compass, data: vec![2] });
         let first = drain(&inbox);
-        inbox.put(at(25), EventBody::GnssBytes(vec![3]));
+        inbox.put(at(25), EventBody::Bytes { source: Source::Gps, data: vec![3] });
         let late = drain(&inbox);
         let times: Vec<i64> = first.iter().chain(&late).map(|e| e.t_recv.ns() / 1_000_000).collect();
         assert_eq!(times, [10, 20, 30, 30]);
@@ -287,12 +256,12 @@ mod tests {
         // Given a pipeline that takes one read in the time of a frame, three reads behind.
         let inbox = Inbox::new(2);
         for ms in [0, 10, 20] {
-            inbox.put(at(ms), EventBody::CompassBytes(vec![0]));
+            inbox.put(at(ms), EventBody::Bytes { source: Source::Compass, data: vec![0] });
         }
         let mut taken = Vec::new();
         for ms in (30..300).step_by(10) {
             inbox.put_frame(at(ms), frame(ms));
-            inbox.put(at(ms + 1), EventBody::CompassBytes(vec![0]));
+            inbox.put(at(ms + 1), EventBody::Bytes { source: Source::Compass, data: vec![0] });
             taken.extend(inbox.take(Duration::ZERO));
         }
         // Then it comes to a frame all the same, after the reads before it, and what was lost is told with it, once.
@@ -305,7 +274,7 @@ mod tests {
     fn reads_are_bounded() {
         let inbox = Inbox::new(1);
         for n in 0..READS + 5 {
-            inbox.put(at(n as i64), EventBody::CompassBytes(vec![0]));
+            inbox.put(at(n as i64), EventBody::Bytes { source: Source::Compass, data: vec![0] });
         }
         let events = drain(&inbox);
         assert_eq!(events.len(), READS + 1);

@@ -4,8 +4,7 @@ use std::sync::Arc;
 
 use crate::config::Config;
 use crate::io::records::{DaemonFigures, Record, Recorder};
-use crate::msg::{Event, GnssEpoch, MarkerDetection, Stamped};
-use crate::pipeline::Output;
+use crate::msg::{Event, GnssEpoch, MarkerDetection, Output, Stamped};
 use crate::time::{MonoTime, UtcTime};
 
 use super::card::Slot;

@@ -12,8 +12,9 @@ use crate::io::clock::HostClock;
 use crate::io::mcap_read::ReadError;
 use crate::io::mcap_write::{McapWriter, WriteError};
 use crate::io::records::{Recorder, topic};
-use crate::msg::{Event, EventBody};
-use crate::pipeline::{DecodedFrame, FrameFault, Output, Pipeline, Ticks};
+use crate::msg::{Event, EventBody, Output};
+use crate::pipeline::{Pipeline, Ticks};
+use crate::pixels::{self, DecodedFrame, FrameFault};
 use crate::time::{MonoTime, Span};
 
 /// Events read and frames decoded ahead of the pipeline.
@@ -115,7 +116,7 @@ enum Ahead {
 fn read_ahead(mut reader: CaptureReader, want_rgb: bool, sender: &SyncSender<Ahead>) {
     while let Some(item) = reader.next() {
         let prepared = match item.event.as_ref().map(|e| &e.body) {
-            Some(EventBody::Frame(frame)) => Some(Pipeline::prepare(frame, want_rgb)),
+            Some(EventBody::Frame(frame)) => Some(pixels::decode(frame, want_rgb)),
             _ => None,
         };
         let warnings = reader.take_warnings().into_iter().map(Ahead::Warning);

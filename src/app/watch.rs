@@ -15,6 +15,7 @@ use crate::io::notify::ServiceManager;
 use crate::io::power::{PowerReader, PowerState, PowerWatch};
 use crate::io::power_line::PowerLine;
 use crate::io::process;
+use crate::msg::Source;
 use crate::time::{MonoTime, Span};
 
 /// Everything the health task keeps.
@@ -172,16 +173,13 @@ impl Watch {
     fn status(&self) {
         let text = if self.ready {
             let health = self.graph.board.with(|shown| shown.health.clone()).unwrap_or_default();
+            let rate =
+                |&source: &Source| format!("{} {:.1} Hz", source.name(), health.source(source).rate_hz);
+            let rates: Vec<String> = Source::ALL.iter().map(rate).collect();
             let targets = self.config.target.iter().zip(&health.targets);
             let targets: Vec<String> =
                 targets.map(|(t, h)| format!("{} {}", t.name, h.last.status.name())).collect();
-            format!(
-                "gps {:.1} Hz, compass {:.1} Hz, camera {:.1} Hz; {}",
-                health.gps.rate_hz,
-                health.compass.rate_hz,
-                health.camera.rate_hz,
-                targets.join(", ")
-            )
+            format!("{}; {}", rates.join(", "), targets.join(", "))
         } else {
             let around = &self.graph.around;
             format!("waiting: {}", Presence::words(&around.presence.missing(&self.config.daemon.optional)))

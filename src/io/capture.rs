@@ -12,7 +12,7 @@ use super::mcap_read::{self, McapReader, RawMessage, ReadError};
 use super::mcap_write::{CONFIG_ATTACHMENT, McapWriter, WriteError};
 use super::proto::{foxglove, host_time, windhover};
 use super::records::{self, FRAME_NUMBER_KEY, IN_SEQUENCE, topic, warm};
-use crate::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
+use crate::msg::{Delivery, Event, EventBody, FrameEncoding, FramePayload, Source};
 use crate::time::{MonoTime, Span};
 
 /// Messages are put in order of their log time over this span: writers of several threads do not
@@ -23,9 +23,10 @@ const REORDER_BYTES: usize = 1 << 28;
 /// Memory of a message beside its bytes, near enough for a limit.
 const MESSAGE_COST: usize = 256;
 
-/// Topics of what was heard.
-const EVENTS: [&str; 5] =
-    [topic::GPS_SERIAL, topic::COMPASS_SERIAL, topic::CAMERA_IMAGE, topic::SOURCE_EVENT, topic::WARM_START];
+/// Whether a topic is of events.
+fn is_event(topic: &str) -> bool {
+    Source::on_topic(topic).is_some() || [topic::SOURCE_EVENT, topic::WARM_START].contains(&topic)
+}
 
 /// One message of a capture: as recorded, and as the event it stands for, if any.
 #[derive(Clone, Debug)]
@@ -123,20 +124,11 @@ impl CaptureReader {
     }
 
     fn body(&mut self, raw: &RawMessage) -> Result<Option<EventBody>, prost::DecodeError> {
-        Ok(match raw.channel.topic.as_str() {
-            topic::GPS_SERIAL => {
-                Some(EventBody::GnssBytes(windhover::SerialBytes::decode(&raw.data[..])?.data))
-            }
-            topic::COMPASS_SERIAL => {
-                Some(EventBody::CompassBytes(windhover::SerialBytes::decode(&raw.data[..])?.data))
-            }
-            topic::CAMERA_IMAGE => {
-                // A frame that does not even decode as a message still counts as one.
-                let numbered = raw.channel.metadata.get(FRAME_NUMBER_KEY).is_some_and(|v| v == IN_SEQUENCE);
-                let index = if numbered { raw.sequence } else { self.frames };
-                self.frames = index.saturating_add(1);
-                Some(EventBody::Frame(frame(raw, index)?))
-            }
+        let topic = raw.channel.topic.as_str();
+        if let Some(source) = Source::on_topic(topic) {
+            return self.delivered(source, raw).map(Some);
+        }
+        Ok(match topic {
             topic::WARM_START => {
                 let told = warm::state(&windhover::WarmState::decode(&raw.data[..])?);
                 told.map(|state| EventBody::Warm(Box::new(state)))
@@ -144,6 +136,18 @@ impl CaptureReader {
             topic::SOURCE_EVENT => source_event(&windhover::SourceEvent::decode(&raw.data[..])?),
             _ => None,
         })
+    }
+
+    fn delivered(&mut self, source: Source, raw: &RawMessage) -> Result<EventBody, prost::DecodeError> {
+        if source.delivers() == Delivery::Bytes {
+            let data = windhover::SerialBytes::decode(&raw.data[..])?.data;
+            return Ok(EventBody::Bytes { source, data });
+        }
+        // A frame that does not even decode as a message still counts as one.
+        let numbered = raw.channel.metadata.get(FRAME_NUMBER_KEY).is_some_and(|v| v == IN_SEQUENCE);
+        let index = if numbered { raw.sequence } else { self.frames };
+        self.frames = index.saturating_add(1);
+        Ok(EventBody::Frame(frame(raw, index)?))
     }
 }
 
@@ -179,8 +183,7 @@ fn frame(raw: &RawMessage, index: u32) -> Result<FramePayload, prost::DecodeErro
 }
 
 fn source_event(event: &windhover::SourceEvent) -> Option<EventBody> {
-    let source =
-        [Source::Gps, Source::Compass, Source::Camera].into_iter().find(|s| s.name() == event.source)?;
+    let source = Source::named(&event.source)?;
     match event.what.as_str() {
         "dropped" => Some(EventBody::Dropped { source, count: event.count }),
         "pulse" => Some(EventBody::Pulse),
@@ -199,7 +202,7 @@ impl Iterator for CaptureReader {
                 || self.waiting.peek().is_some_and(|first| self.newest - first.raw.log_time >= REORDER);
             if !due && let Some(raw) = self.reader.next() {
                 // Others may be dated by other clocks than what was heard.
-                if EVENTS.contains(&raw.channel.topic.as_str()) {
+                if is_event(&raw.channel.topic) {
                     self.newest = self.newest.max(raw.log_time);
                 }
                 self.waiting_bytes += raw.data.len() + MESSAGE_COST;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use crate::msg::FrameEncoding;
+use crate::msg::FramePayload;
 use crate::time::MonoTime;
 
 /// Asks threads to end. Copies are the same switch.
@@ -129,30 +129,13 @@ pub enum Report {
     /// The bytes one read returned, and when it returned.
     Bytes(MonoTime, Vec<u8>),
     /// A frame, and when it was dequeued.
-    Frame(MonoTime, RawFrame),
+    Frame(MonoTime, FramePayload),
     /// The device does not deliver; it will be tried again.
     Down(Fault),
     /// Something to know about a device that delivers; `count` things of the kind.
     Note(NoteKind, u32, String),
     /// The thread is alive.
     Beat,
-}
-
-/// A frame as a device gave it, not yet numbered.
-#[derive(Clone, Debug)]
-pub struct RawFrame {
-    /// The driver's exposure stamp, host time.
-    pub t_exposure: MonoTime,
-    /// How to read `data`.
-    pub encoding: FrameEncoding,
-    /// Width in pixels; 0 where the encoding tells.
-    pub width: u32,
-    /// Height in pixels; 0 where the encoding tells.
-    pub height: u32,
-    /// Bytes from one row to the next; 0 where the encoding tells.
-    pub stride: u32,
-    /// The bytes.
-    pub data: Arc<[u8]>,
 }
 
 /// How long a thread sleeps at a time, so that it answers while it waits.

@@ -2,30 +2,8 @@
 
 use std::sync::Arc;
 
-use super::WarmState;
+use super::{Source, WarmState};
 use crate::time::MonoTime;
-
-/// Where an event comes from.
-#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
-pub enum Source {
-    /// GPS receiver.
-    Gps,
-    /// Digital compass.
-    Compass,
-    /// Camera.
-    Camera,
-}
-
-impl Source {
-    /// Its name in logs.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Gps => "gps",
-            Self::Compass => "compass",
-            Self::Camera => "camera",
-        }
-    }
-}
 
 /// One thing heard, in the order it was heard.
 #[derive(Clone, Debug)]
@@ -41,10 +19,13 @@ pub struct Event {
 /// What was heard.
 #[derive(Clone, Debug)]
 pub enum EventBody {
-    /// The bytes one read of the GPS line returned.
-    GnssBytes(Vec<u8>),
-    /// The bytes one read of the compass line returned.
-    CompassBytes(Vec<u8>),
+    /// The bytes one read of a source's line returned.
+    Bytes {
+        /// Whose.
+        source: Source,
+        /// The bytes.
+        data: Vec<u8>,
+    },
     /// One camera frame.
     Frame(FramePayload),
     /// Time passed: silence is an event too, so that time-outs replay.
@@ -64,6 +45,17 @@ pub enum EventBody {
     SourceDown(Source),
     /// What an earlier run of the same flight had learnt; comes before everything else, or not at all.
     Warm(Box<WarmState>),
+}
+
+impl EventBody {
+    /// The source that delivered it; `None` for what no source delivers.
+    pub const fn delivered_by(&self) -> Option<Source> {
+        match self {
+            Self::Bytes { source, .. } => Some(*source),
+            Self::Frame(_) => Some(Source::Camera),
+            _ => None,
+        }
+    }
 }
 
 /// How the bytes of a frame are to be read.
@@ -92,7 +84,8 @@ pub enum FrameEncoding {
 /// A frame as the driver or the capture gave it.
 #[derive(Clone, Debug)]
 pub struct FramePayload {
-    /// Number of the frame since recording began, from 0, undecodable ones included.
+    /// Number of the frame since recording began, from 0, undecodable ones included. A device leaves 0: frames
+    /// are numbered where they join the stream of events.
     pub index: u32,
     /// The driver's exposure stamp, host time.
     pub t_exposure: MonoTime,

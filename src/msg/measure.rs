@@ -52,7 +52,7 @@ pub struct GnssEpoch {
     pub speed_mps: Option<f64>,
     /// Course over ground, degrees, true.
     pub course_deg: Option<f64>,
-    /// Velocity north, east, down, m/s; the last is `None`'s stand-in only where `vel_has_down`.
+    /// Velocity north, east, down, m/s; down is 0 and means nothing unless `vel_has_down`.
     pub vel_ned_mps: Option<Vector3<f64>>,
     /// Whether the down component of `vel_ned_mps` was measured (PGRMV) or is not known (RMC, VTG).
     pub vel_has_down: bool,

@@ -4,15 +4,11 @@
 //! from it. It reads no clock: time is what the events say, so a replay of the same events gives the
 //! same outputs to the last bit.
 
-pub mod frame;
 mod lines;
 mod monitor;
-mod output;
 mod site;
 mod ticks;
 
-pub use frame::{DecodedFrame, FrameFault};
-pub use output::{Health, Notice, NoticeKind, Output, SourceHealth, TargetHealth};
 pub use ticks::{TICK, Ticks};
 
 use std::sync::Arc;
@@ -23,8 +19,10 @@ use crate::estimate::{Estimator, EstimatorOutput, PaperEstimator};
 use crate::geo::{Geodetic, Tile};
 use crate::msg::{
     AttitudeSample, Event, EventBody, FrameObservations, FramePayload, FramePrediction, GnssEpoch,
-    MarkerDetection, MarkerId, Source, Stamped, TargetEstimate, TrackStatus, WarmFilter, WarmSite, WarmState,
+    MarkerDetection, MarkerId, NoticeKind, Output, Source, Stamped, TargetEstimate, TrackStatus, WarmFilter,
+    WarmSite, WarmState,
 };
+use crate::pixels::{self, DecodedFrame, FrameFault};
 use crate::time::{MonoTime, Span};
 use lines::{CompassLine, GpsLine};
 use monitor::{Monitor, notice};
@@ -101,7 +99,7 @@ impl Pipeline {
         self.handle_prepared(event, None, out);
     }
 
-    /// As [`Self::handle`], with the event's frame already decoded by [`Self::prepare`] elsewhere.
+    /// As [`Self::handle`], with the event's frame already decoded elsewhere.
     pub fn handle_prepared(
         &mut self,
         event: &Event,
@@ -111,10 +109,9 @@ impl Pipeline {
         let t = event.t_recv;
         self.monitor.advance(t, out);
         match &event.body {
-            EventBody::GnssBytes(bytes) => self.gnss_bytes(bytes, event, out),
-            EventBody::CompassBytes(bytes) => self.compass_bytes(bytes, event, out),
+            EventBody::Bytes { source, data } => self.bytes(*source, data, event, out),
             EventBody::Frame(frame) => {
-                let decoded = prepared.unwrap_or_else(|| frame::decode(frame, self.want_rgb));
+                let decoded = prepared.unwrap_or_else(|| pixels::decode(frame, self.want_rgb));
                 self.frame(frame, decoded, event, out);
             }
             EventBody::Dropped { source, count } => self.monitor.dropped(*source, t, *count, out),
@@ -130,11 +127,6 @@ impl Pipeline {
             EventBody::Warm(state) => self.resume(state),
             EventBody::SourceUp(_) | EventBody::SourceDown(_) => {}
         }
-    }
-
-    /// The pure part of a frame's handling, which may run ahead on other threads.
-    pub fn prepare(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault> {
-        frame::decode(frame, want_rgb)
     }
 
     /// Whether frames are wanted with their colours.
@@ -162,6 +154,14 @@ impl Pipeline {
         self.gps.resume(&warm.arrivals);
         self.finder.resume(warm.site);
         self.warm = warm.filter.clone().filter(WarmFilter::is_sound);
+    }
+
+    fn bytes(&mut self, source: Source, bytes: &[u8], event: &Event, out: &mut Vec<Output>) {
+        match source {
+            Source::Gps => self.gnss_bytes(bytes, event, out),
+            Source::Compass => self.compass_bytes(bytes, event, out),
+            Source::Camera => {}
+        }
     }
 
     fn gnss_bytes(&mut self, bytes: &[u8], event: &Event, out: &mut Vec<Output>) {
@@ -193,7 +193,7 @@ impl Pipeline {
             out.push(notice(t, NoticeKind::Declination, Some(Source::Compass), words));
         }
         if let Some(words) = settled.ground_notice {
-            out.push(notice(t, NoticeKind::DatumSet, Some(Source::Gps), words));
+            out.push(notice(t, NoticeKind::TerrainMissing, None, words));
         }
         let datum: Geodetic = settled.site.frame.datum();
         let words = format!(
@@ -243,7 +243,7 @@ impl Pipeline {
         self.observations.markers.clear();
         self.observations.features.clear();
         let (width, height) = (self.config.camera.width, self.config.camera.height);
-        match decoded.and_then(|d| frame::check_size(&d, width, height).map(|()| d)) {
+        match decoded.and_then(|d| pixels::check_size(&d, width, height).map(|()| d)) {
             Ok(decoded) => {
                 self.monitor.heard(Source::Camera, t, out);
                 let prediction = self.estimators.as_mut().map(|e| {

@@ -2,15 +2,15 @@
 
 use std::collections::BTreeMap;
 
-use super::output::{Health, Notice, NoticeKind, Output, SourceHealth, TargetHealth};
 use crate::config::Config;
-use crate::msg::{Disposition, FixKind, Source, TargetEstimate, TrackStatus};
+use crate::msg::{
+    Disposition, FixKind, Health, Notice, NoticeKind, Output, PerSource, Source, SourceHealth,
+    TargetEstimate, TargetHealth, TrackStatus,
+};
 use crate::time::{MonoTime, Span};
 
 /// Health is told this often.
 const HEALTH_PERIOD: Span = Span::from_ns(1_000_000_000);
-/// A source that says nothing for this long is silent.
-const SILENCE: Span = Span::from_ns(1_500_000_000);
 
 /// Counts one source.
 #[derive(Clone, Copy, Default)]
@@ -27,9 +27,7 @@ struct SourceCount {
 /// Watches what flows and says what an operator should know.
 pub(super) struct Monitor {
     names: Vec<String>,
-    gps: SourceCount,
-    compass: SourceCount,
-    camera: SourceCount,
+    sources: PerSource<SourceCount>,
     fix: FixKind,
     sats: Option<u32>,
     clock_sigma: Option<Span>,
@@ -50,9 +48,7 @@ impl Monitor {
         };
         Self {
             names: config.target.iter().map(|t| t.name.clone()).collect(),
-            gps: SourceCount::default(),
-            compass: SourceCount::default(),
-            camera: SourceCount::default(),
+            sources: PerSource::default(),
             fix: FixKind::None,
             sats: None,
             clock_sigma: None,
@@ -62,14 +58,6 @@ impl Monitor {
             dispositions: BTreeMap::new(),
             began: None,
             next_health: None,
-        }
-    }
-
-    fn source(&mut self, source: Source) -> &mut SourceCount {
-        match source {
-            Source::Gps => &mut self.gps,
-            Source::Compass => &mut self.compass,
-            Source::Camera => &mut self.camera,
         }
     }
 
@@ -92,10 +80,10 @@ impl Monitor {
 
     fn silences(&mut self, t: MonoTime, out: &mut Vec<Output>) {
         let began = self.began.unwrap_or(t);
-        for source in [Source::Gps, Source::Compass, Source::Camera] {
-            let count = self.source(source);
+        for &source in Source::ALL {
+            let count = &mut self.sources[source];
             let quiet = t - count.last.unwrap_or(began);
-            if !count.silent && quiet >= SILENCE {
+            if !count.silent && quiet >= source.silent_after() {
                 count.silent = true;
                 let detail = format!("nothing to use from the {} for {:.1} s", source.name(), quiet.s());
                 out.push(notice(t, NoticeKind::SourceSilent, Some(source), detail));
@@ -104,10 +92,12 @@ impl Monitor {
     }
 
     fn health(&mut self, t: MonoTime) -> Health {
-        let figures = |count: &mut SourceCount| {
+        let mut figures = |&source: &Source| {
+            let count = &mut self.sources[source];
             let rate_hz = (count.total - count.at_last_health) as f64 / HEALTH_PERIOD.s();
             count.at_last_health = count.total;
             SourceHealth {
+                source,
                 rate_hz,
                 age: count.last.map(|last| t - last),
                 total: count.total,
@@ -117,9 +107,7 @@ impl Monitor {
         };
         let health = Health {
             t,
-            gps: figures(&mut self.gps),
-            compass: figures(&mut self.compass),
-            camera: figures(&mut self.camera),
+            sources: Source::ALL.iter().map(&mut figures).collect(),
             fix: self.fix,
             sats: self.sats,
             clock_sigma: self.clock_sigma,
@@ -132,7 +120,7 @@ impl Monitor {
 
     /// A source gave something that can be used.
     pub(super) fn heard(&mut self, source: Source, t: MonoTime, out: &mut Vec<Output>) {
-        let count = self.source(source);
+        let count = &mut self.sources[source];
         count.total += 1;
         if count.silent {
             count.silent = false;
@@ -140,7 +128,7 @@ impl Monitor {
             let detail = format!("the {} is back{quiet}", source.name());
             out.push(notice(t, NoticeKind::SourceBack, Some(source), detail));
         }
-        self.source(source).last = Some(t);
+        count.last = Some(t);
     }
 
     /// How many pieces of a source's bytes were refused so far, and the last reason.
@@ -152,7 +140,7 @@ impl Monitor {
         why: &str,
         out: &mut Vec<Output>,
     ) {
-        let count = self.source(source);
+        let count = &mut self.sources[source];
         count.refused = total;
         if total > count.refused_told {
             let detail = format!("{} refused from the {}: {why}", total - count.refused_told, source.name());
@@ -163,13 +151,13 @@ impl Monitor {
 
     /// A frame could not be used.
     pub(super) fn frame_unusable(&mut self, t: MonoTime, why: String, out: &mut Vec<Output>) {
-        self.camera.refused += 1;
+        self.sources[Source::Camera].refused += 1;
         out.push(notice(t, NoticeKind::FrameUnusable, Some(Source::Camera), why));
     }
 
     /// Something was lost before it could be recorded.
     pub(super) fn dropped(&mut self, source: Source, t: MonoTime, lost: u32, out: &mut Vec<Output>) {
-        self.source(source).dropped += u64::from(lost);
+        self.sources[source].dropped += u64::from(lost);
         let detail = format!("{lost} lost from the {} before they could be recorded", source.name());
         out.push(notice(t, NoticeKind::Dropped, Some(source), detail));
     }

@@ -12,7 +12,7 @@ use super::random::{Purpose, Stream};
 use super::render::Renderer;
 use super::world::World;
 use crate::jpeg::{self, Layout};
-use crate::msg::{Event, EventBody, FrameEncoding, FramePayload, GrayImage};
+use crate::msg::{Event, EventBody, FrameEncoding, FramePayload, GrayImage, Source};
 use crate::time::{MonoTime, Span};
 
 /// How frames are stored.
@@ -181,11 +181,11 @@ impl Iterator for Flight {
         let first = [gnss, compass, frame.map(|f| f.t_recv)].into_iter().flatten().min()?;
         if gnss == Some(first) {
             let (t, bytes) = self.gnss_line.pop()?;
-            return Some(Ok(self.event(t, EventBody::GnssBytes(bytes))));
+            return Some(Ok(self.event(t, EventBody::Bytes { source: Source::Gps, data: bytes })));
         }
         if compass == Some(first) {
             let (t, bytes) = self.compass_line.pop()?;
-            return Some(Ok(self.event(t, EventBody::CompassBytes(bytes))));
+            return Some(Ok(self.event(t, EventBody::Bytes { source: Source::Compass, data: bytes })));
         }
         Some(self.frame_event(frame?))
     }

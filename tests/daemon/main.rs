@@ -3,6 +3,7 @@
 
 mod devices;
 mod harness;
+mod log;
 mod warm;
 
 use std::process::Command;

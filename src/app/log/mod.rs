@@ -212,7 +212,7 @@ impl Log {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::pipeline::{Notice, NoticeKind};
+    use crate::msg::{Notice, NoticeKind};
     use crate::time::MonoTime;
 
     /// A writer whose text can be read.

@@ -9,7 +9,7 @@ use crate::io::mcap_read::ReadError;
 use crate::io::proto::windhover as wh;
 use crate::jpeg::{self, Layout};
 use crate::msg::GrayImage;
-use crate::pipeline::frame::decode;
+use crate::pixels::decode;
 use crate::time::MonoTime;
 
 /// Frames shown.

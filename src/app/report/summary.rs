@@ -213,7 +213,7 @@ fn troubles(context: &Context<'_>, pictures: &Pictures) -> Vec<String> {
         }
     }
     let resets =
-        flight.notices.iter().filter(|n| n.name == crate::pipeline::NoticeKind::FilterReset.name()).count();
+        flight.notices.iter().filter(|n| n.name == crate::msg::NoticeKind::FilterReset.name()).count();
     if resets > 0 {
         found.push(format!("The filter started again {resets} times."));
     }

@@ -9,14 +9,14 @@ use std::time::Duration;
 use super::CameraSettings;
 use crate::io::capture::CaptureReader;
 use crate::io::clock::HostClock;
-use crate::io::device::{Fault, FaultKind, NAP, NoteKind, RawFrame, Report, Stop};
-use crate::msg::{EventBody, FrameEncoding};
+use crate::io::device::{Fault, FaultKind, NAP, NoteKind, Report, Stop};
+use crate::msg::{EventBody, FrameEncoding, FramePayload};
 use crate::time::{MonoTime, Span};
 
 /// A recorded frame and when it was delivered, both on the recording's own clock.
 struct Recorded {
     t_recv: MonoTime,
-    frame: RawFrame,
+    frame: FramePayload,
 }
 
 /// Plays a recording until its end and beyond (`None` when the end of the program was asked for), or
@@ -90,14 +90,6 @@ fn open(path: &Path) -> Result<Box<dyn Iterator<Item = Recorded>>, String> {
     Ok(Box::new(reader.filter_map(|item| {
         let event = item.event?;
         let EventBody::Frame(frame) = event.body else { return None };
-        let frame = RawFrame {
-            t_exposure: frame.t_exposure,
-            encoding: frame.encoding,
-            width: frame.width,
-            height: frame.height,
-            stride: frame.stride,
-            data: frame.data,
-        };
         Some(Recorded { t_recv: event.t_recv, frame })
     })))
 }
@@ -123,7 +115,7 @@ fn folder(path: &Path) -> Result<impl Iterator<Item = Recorded> + use<>, String>
 }
 
 /// An image file as a frame: PGM as raw grey, JPEG and PNG as they are.
-fn image(t_exposure: MonoTime, file: &Path) -> Option<RawFrame> {
+fn image(t_exposure: MonoTime, file: &Path) -> Option<FramePayload> {
     let data = std::fs::read(file).ok()?;
     let extension = file.extension()?.to_str()?.to_ascii_lowercase();
     let encoding = match extension.as_str() {
@@ -132,13 +124,21 @@ fn image(t_exposure: MonoTime, file: &Path) -> Option<RawFrame> {
             let pixels = data.get(start..start.checked_add(width as usize * height as usize)?)?;
             let data: Arc<[u8]> = Arc::from(pixels);
             let encoding = FrameEncoding::Grey;
-            return Some(RawFrame { t_exposure, encoding, width, height, stride: width, data });
+            return Some(FramePayload { index: 0, t_exposure, encoding, width, height, stride: width, data });
         }
         "jpg" | "jpeg" => FrameEncoding::Jpeg,
         "png" => FrameEncoding::Png,
         _ => FrameEncoding::Unknown,
     };
-    Some(RawFrame { t_exposure, encoding, width: 0, height: 0, stride: 0, data: Arc::from(data) })
+    Some(FramePayload {
+        index: 0,
+        t_exposure,
+        encoding,
+        width: 0,
+        height: 0,
+        stride: 0,
+        data: Arc::from(data),
+    })
 }
 
 /// Width, height and first pixel of a binary 8-bit PGM (`P5`).

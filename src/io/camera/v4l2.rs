@@ -15,8 +15,8 @@ use v4l::{Device, Format, FourCC, Fraction};
 use super::CameraSettings;
 use super::format::{self, FourCc};
 use crate::io::clock::HostClock;
-use crate::io::device::{Fault, FaultKind, NAP, NoteKind, RawFrame, Report, Stop};
-use crate::msg::FrameEncoding;
+use crate::io::device::{Fault, FaultKind, NAP, NoteKind, Report, Stop};
+use crate::msg::{FrameEncoding, FramePayload};
 use crate::time::{MonoTime, Span};
 
 /// Mapped buffers. One is being copied while the others fill: at 30 frames a second the driver can
@@ -228,7 +228,7 @@ impl Camera<'_> {
         following: &mut Following,
         clock: HostClock,
         tell: &dyn Fn(Report),
-    ) -> Option<(MonoTime, RawFrame)> {
+    ) -> Option<(MonoTime, FramePayload)> {
         let missed = following
             .sequence
             .replace(meta.sequence)
@@ -253,7 +253,8 @@ impl Camera<'_> {
         }
         let t_exposure = self.exposure(meta, t_recv, following, clock, tell);
         let data: Arc<[u8]> = Arc::from(&bytes[..needed.unwrap_or(used)]);
-        let frame = RawFrame {
+        let frame = FramePayload {
+            index: 0,
             t_exposure,
             encoding: self.encoding,
             width: self.width,

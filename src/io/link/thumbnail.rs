@@ -6,7 +6,7 @@ use crate::io::proto::link::Thumbnail;
 use crate::io::records;
 use crate::jpeg::{self, Layout};
 use crate::msg::{FeatureTrack, FramePayload, GrayImage, MarkerDetection};
-use crate::pipeline::frame;
+use crate::pixels;
 
 /// JPEG quality: a thumbnail of 320 × 256 takes about 8 KB.
 const QUALITY: u8 = 60;
@@ -46,7 +46,7 @@ fn shrink(image: &GrayImage, factor: usize) -> GrayImage {
 impl Picture {
     /// The thumbnail, about `width` pixels wide; `None` where the frame cannot be read or is empty.
     pub fn thumbnail(&self, width: u32) -> Option<Thumbnail> {
-        let image = frame::decode(&self.frame, false).ok()?.gray;
+        let image = pixels::decode(&self.frame, false).ok()?.gray;
         let factor = (image.width / width.max(1) as usize).max(1);
         let small = shrink(&image, factor);
         let jpeg = jpeg::encode(&small.data, Layout::Grey, (small.width, small.height), QUALITY).ok()?;

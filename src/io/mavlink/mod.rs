@@ -13,8 +13,7 @@ use std::path::{Path, PathBuf};
 use crate::config::Config;
 use crate::geo::Geodetic;
 use crate::io::link::keys::{KeyError, read_private};
-use crate::msg::{TargetEstimate, TrackStatus};
-use crate::pipeline::Output;
+use crate::msg::{Output, TargetEstimate, TrackStatus};
 use crate::time::{MonoTime, Span, UtcTime};
 
 use frame::{Refused, Sender, SigningKey};

@@ -23,8 +23,7 @@ pub fn of_event(event: &Event) -> Option<Record> {
         record(topic::SOURCE_EVENT, Schema::SourceEvent, t, t, message.encode_to_vec())
     };
     Some(match &event.body {
-        EventBody::GnssBytes(bytes) => serial(topic::GPS_SERIAL, t, bytes),
-        EventBody::CompassBytes(bytes) => serial(topic::COMPASS_SERIAL, t, bytes),
+        EventBody::Bytes { source, data } => serial(source.topic(), t, data),
         EventBody::Frame(frame) => image(t, frame),
         EventBody::Dropped { source, count } => source_event(*source, "dropped", *count),
         EventBody::Pulse => source_event(Source::Gps, "pulse", 0),
@@ -77,7 +76,7 @@ fn image(t: MonoTime, frame: &FramePayload) -> Record {
             (Schema::CompressedImage, message.encode_to_vec())
         }
     };
-    record(topic::CAMERA_IMAGE, schema, t, frame.t_exposure, data)
+    record(Source::Camera.topic(), schema, t, frame.t_exposure, data)
 }
 
 /// The name of an uncompressed encoding in `foxglove.RawImage`.

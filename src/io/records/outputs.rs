@@ -11,10 +11,9 @@ use crate::config::Config;
 use crate::geo::rot_z;
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
 use crate::msg::{
-    AttitudeSample, FeatureTrack, FixKind, FusionResult, GnssEpoch, MarkerDetection, MarkerId, Ownship,
-    Stamped, TargetEstimate, TrackStatus,
+    AttitudeSample, FeatureTrack, FixKind, FusionResult, GnssEpoch, Health, MarkerDetection, MarkerId,
+    Notice, NoticeKind, Output, Ownship, SourceHealth, Stamped, TargetEstimate, TrackStatus,
 };
-use crate::pipeline::{Health, Notice, NoticeKind, Output, SourceHealth};
 use crate::time::MonoTime;
 
 /// What only a daemon knows of itself (card, link, computer), by name.
@@ -399,6 +398,7 @@ fn log_message(notice: &Notice) -> fox::Log {
         | NoticeKind::FrameUnusable
         | NoticeKind::Dropped
         | NoticeKind::ClockJump
+        | NoticeKind::TerrainMissing
         | NoticeKind::BytesRefused => fox::log::Level::Warning,
         _ => fox::log::Level::Info,
     };
@@ -413,8 +413,8 @@ fn log_message(notice: &Notice) -> fox::Log {
 
 /// Health, as a message.
 pub fn health(now: &Health, config: &Config) -> wh::Health {
-    let source = |name: &str, s: &SourceHealth| wh::SourceHealth {
-        name: name.into(),
+    let source = |s: &SourceHealth| wh::SourceHealth {
+        name: s.source.name().into(),
         rate_hz: s.rate_hz,
         age_ms: s.age.map_or(-1.0, |age| age.ms()),
         total: s.total,
@@ -432,11 +432,7 @@ pub fn health(now: &Health, config: &Config) -> wh::Health {
     });
     wh::Health {
         timestamp: stamp(now.t),
-        sources: vec![
-            source("gps", &now.gps),
-            source("compass", &now.compass),
-            source("camera", &now.camera),
-        ],
+        sources: now.sources.iter().map(source).collect(),
         targets: targets.collect(),
         fix: fix_number(now.fix),
         sats: now.sats.unwrap_or(0),

@@ -1,11 +1,5 @@
-//! Topic names.
+//! Topic names. Those of what sources deliver are in the table of sources ([`crate::msg::Source`]).
 
-/// Bytes of the GPS line.
-pub const GPS_SERIAL: &str = "/gps/serial";
-/// Bytes of the compass line.
-pub const COMPASS_SERIAL: &str = "/compass/serial";
-/// Camera frames.
-pub const CAMERA_IMAGE: &str = "/camera/image";
 /// Losses, arrivals and departures of devices.
 pub const SOURCE_EVENT: &str = "/source/event";
 /// What a restarted daemon continued from.

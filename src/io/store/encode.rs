@@ -10,7 +10,7 @@ use super::queue::{Entry, Popped, Queue};
 use super::record::{ChannelDef, RawRecord, STATE_TOPIC, Weight};
 use super::shared::Shared;
 use crate::io::records::{self, Record, Schema};
-use crate::msg::{Event, EventBody};
+use crate::msg::{Event, EventBody, Source};
 use crate::time::MonoTime;
 
 /// What waits to be encoded.
@@ -39,7 +39,7 @@ impl Channels {
                 schema: record.schema.descriptor(),
                 message_encoding: "protobuf".into(),
                 backfill,
-                frame_numbers: record.topic == records::topic::CAMERA_IMAGE,
+                frame_numbers: record.topic == Source::Camera.topic(),
             })
         };
         Arc::clone(self.0.entry(key).or_insert_with(make))

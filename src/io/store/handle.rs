@@ -20,7 +20,7 @@ use super::volume::Volume;
 use crate::config::{Config, StoreConfig};
 use crate::io::clock::HostClock;
 use crate::io::records::{Record, topic};
-use crate::msg::{Event, EventBody, WarmState};
+use crate::msg::{Event, EventBody, Source, WarmState};
 use crate::time::UtcTime;
 
 /// Dates before this are a receiver's error (a week number that rolled over, a clock without a
@@ -126,9 +126,8 @@ impl StoreHandle {
     pub fn event(&self, event: &Event) {
         let (topic, bytes, weight) = match &event.body {
             EventBody::Tick => return,
-            EventBody::GnssBytes(bytes) => (topic::GPS_SERIAL, bytes.len(), Weight::Small),
-            EventBody::CompassBytes(bytes) => (topic::COMPASS_SERIAL, bytes.len(), Weight::Small),
-            EventBody::Frame(frame) => (topic::CAMERA_IMAGE, frame.data.len(), Weight::Frame),
+            EventBody::Bytes { source, data } => (source.topic(), data.len(), Weight::Small),
+            EventBody::Frame(frame) => (Source::Camera.topic(), frame.data.len(), Weight::Frame),
             EventBody::Warm(_) => (topic::WARM_START, size_of::<WarmState>() + 1024, Weight::Small),
             EventBody::Dropped { .. }
             | EventBody::Pulse

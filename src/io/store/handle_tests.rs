@@ -13,11 +13,15 @@ use crate::config::{FramePolicy, StoreConfig};
 use crate::io::capture::CaptureReader;
 use crate::io::clock::HostClock;
 use crate::io::records::{Record, Schema, topic};
-use crate::msg::{Event, EventBody, FrameEncoding, FramePayload};
+use crate::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
 use crate::time::{Span, UtcTime};
 
 fn gps(clock: &HostClock, seq: u64) -> Event {
-    Event { t_recv: clock.now(), seq, body: EventBody::GnssBytes(format!("$GPGGA,{seq}\r\n").into_bytes()) }
+    Event {
+        t_recv: clock.now(),
+        seq,
+        body: EventBody::Bytes { source: Source::Gps, data: format!("$GPGGA,{seq}\r\n").into_bytes() },
+    }
 }
 
 fn frame(clock: &HostClock, index: u32) -> Event {
@@ -87,7 +91,7 @@ fn events_of(dir: &Path) -> (Vec<Vec<u8>>, u32) {
     let mut reader = CaptureReader::open(dir).unwrap();
     for item in &mut reader {
         match item.event.map(|e| e.body) {
-            Some(EventBody::GnssBytes(bytes)) => lines.push(bytes),
+            Some(EventBody::Bytes { source: Source::Gps, data: bytes }) => lines.push(bytes),
             Some(EventBody::Frame(_)) => frames += 1,
             _ => {}
         }

@@ -1,4 +1,4 @@
-//! Frames as cameras and captures give them, made into images in memory.
+//! Pixels out of the bytes of a frame, as cameras and captures give it.
 
 use std::io::Cursor;
 

@@ -1,0 +1,75 @@
+//! Notices: what an operator should know of a flight.
+
+use super::Source;
+use crate::time::MonoTime;
+
+/// What a notice is about. Names are fixed: people search logs for them.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub enum NoticeKind {
+    /// The receiver has a position.
+    FixAcquired,
+    /// The receiver lost its position.
+    FixLost,
+    /// Nothing was heard from a source for longer than its time-out.
+    SourceSilent,
+    /// A silent source speaks again.
+    SourceBack,
+    /// Bytes of a source were refused (checksum, range, grammar).
+    BytesRefused,
+    /// A frame could not be read, or has the wrong size.
+    FrameUnusable,
+    /// Frames or bytes were lost before they could be recorded.
+    Dropped,
+    /// The origin of the NED frame was settled.
+    DatumSet,
+    /// The terrain tile of the configuration cannot be used here: the ground is level instead.
+    TerrainMissing,
+    /// Declination was taken from the World Magnetic Model, or could not be.
+    Declination,
+    /// A target was found and settled.
+    TargetTracking,
+    /// A target has not been seen for a moment.
+    TargetCoasting,
+    /// A target is lost.
+    TargetLost,
+    /// The filter started again.
+    FilterReset,
+    /// A stamp went back or leapt ahead.
+    ClockJump,
+}
+
+impl NoticeKind {
+    /// Its fixed name.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::FixAcquired => "fix_acquired",
+            Self::FixLost => "fix_lost",
+            Self::SourceSilent => "source_silent",
+            Self::SourceBack => "source_back",
+            Self::BytesRefused => "bytes_refused",
+            Self::FrameUnusable => "frame_unusable",
+            Self::Dropped => "dropped",
+            Self::DatumSet => "datum_set",
+            Self::TerrainMissing => "terrain_missing",
+            Self::Declination => "declination",
+            Self::TargetTracking => "target_tracking",
+            Self::TargetCoasting => "target_coasting",
+            Self::TargetLost => "target_lost",
+            Self::FilterReset => "filter_reset",
+            Self::ClockJump => "clock_jump",
+        }
+    }
+}
+
+/// Something an operator should know.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct Notice {
+    /// When, host time.
+    pub t: MonoTime,
+    /// What it is about.
+    pub kind: NoticeKind,
+    /// Which source, where it is about one.
+    pub source: Option<Source>,
+    /// In words: what, where, how many.
+    pub detail: String,
+}

@@ -1,0 +1,136 @@
+//! The table of sources: every sensor that delivers events, one row each.
+
+use crate::time::Span;
+
+/// How a source delivers.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub enum Delivery {
+    /// Bytes of a line, as each read returned them.
+    Bytes,
+    /// Camera frames.
+    Frames,
+}
+
+/// What is the same for a source in every recording and every run.
+#[derive(Clone, Copy, PartialEq, Debug)]
+struct SourceRow {
+    name: &'static str,
+    delivers: Delivery,
+    topic: &'static str,
+    silent_after: Span,
+}
+
+/// One row a source; the enum and everything that goes through all sources follow from the rows.
+macro_rules! sources {
+    ($($(#[$doc:meta])* $source:ident: $name:literal, $delivers:ident, $topic:literal, silent after $ms:literal ms;)+) => {
+        /// Where an event comes from.
+        #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+        pub enum Source {
+            $($(#[$doc])* $source,)+
+        }
+
+        impl Source {
+            /// Every source, in the order in which health lists them.
+            pub const ALL: &'static [Self] = &[$(Self::$source),+];
+
+            const fn row(self) -> SourceRow {
+                match self {
+                    $(Self::$source => SourceRow {
+                        name: $name,
+                        delivers: Delivery::$delivers,
+                        topic: $topic,
+                        silent_after: Span::from_ns($ms * 1_000_000),
+                    },)+
+                }
+            }
+        }
+    };
+}
+
+sources! {
+    /// GPS receiver.
+    Gps: "gps", Bytes, "/gps/serial", silent after 1500 ms;
+    /// Digital compass.
+    Compass: "compass", Bytes, "/compass/serial", silent after 1500 ms;
+    /// Camera.
+    Camera: "camera", Frames, "/camera/image", silent after 1500 ms;
+}
+
+impl Source {
+    /// Its fixed name in logs, health and files.
+    pub const fn name(self) -> &'static str {
+        self.row().name
+    }
+
+    /// How it delivers.
+    pub const fn delivers(self) -> Delivery {
+        self.row().delivers
+    }
+
+    /// Topic of what it delivers.
+    pub const fn topic(self) -> &'static str {
+        self.row().topic
+    }
+
+    /// It is silent when it delivered nothing usable for this long.
+    pub const fn silent_after(self) -> Span {
+        self.row().silent_after
+    }
+
+    /// The source of that name.
+    pub fn named(name: &str) -> Option<Self> {
+        Self::ALL.iter().copied().find(|source| source.name() == name)
+    }
+
+    /// The source that delivers on a topic.
+    pub fn on_topic(topic: &str) -> Option<Self> {
+        Self::ALL.iter().copied().find(|source| source.topic() == topic)
+    }
+}
+
+/// One value for each source.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct PerSource<T>(Vec<T>);
+
+impl<T: Default> Default for PerSource<T> {
+    fn default() -> Self {
+        Self(Source::ALL.iter().map(|_| T::default()).collect())
+    }
+}
+
+impl<T> std::ops::Index<Source> for PerSource<T> {
+    type Output = T;
+
+    fn index(&self, source: Source) -> &T {
+        &self.0[source as usize]
+    }
+}
+
+impl<T> std::ops::IndexMut<Source> for PerSource<T> {
+    fn index_mut(&mut self, source: Source) -> &mut T {
+        &mut self.0[source as usize]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_source_is_found_by_its_name_and_topic() {
+        for &source in Source::ALL {
+            assert_eq!(Source::named(source.name()), Some(source));
+            assert_eq!(Source::on_topic(source.topic()), Some(source));
+        }
+        assert_eq!((Source::named("sonar"), Source::on_topic("/tf")), (None, None));
+    }
+
+    #[test]
+    fn every_source_has_a_value_of_its_own() {
+        let mut counts = PerSource::<usize>::default();
+        for (n, &source) in Source::ALL.iter().enumerate() {
+            counts[source] += n;
+        }
+        assert!(Source::ALL.iter().enumerate().all(|(n, &source)| counts[source] == n));
+    }
+}
