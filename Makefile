@@ -38,7 +38,7 @@ demo: build
 	@sh tests/demo.sh target/release/windhover $(DEMO)
 
 test: setup-python
-	$(CARGO) test --locked --no-fail-fast
+	$(CARGO) test --locked --workspace --no-fail-fast
 	$(MAKE) test-python
 
 # The flight file opened by readers that know nothing of us.
@@ -64,14 +64,14 @@ check: lint docs
 	sh .ci/deny
 
 lint: setup
-	$(CARGO) fmt --check
-	$(CARGO) clippy --locked --all-targets -- -D warnings
+	$(CARGO) fmt --all --check
+	$(CARGO) clippy --locked --workspace --all-targets -- -D warnings
 
 docs: setup
-	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --no-deps --document-private-items
+	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --workspace --no-deps --document-private-items
 
 bench: setup
-	$(CARGO) bench --locked
+	$(CARGO) bench --locked --workspace
 
 # Latency and load of the daemon. Figures mean something on an idle machine only; the load is printed.
 load: PARTS = --bin windhover --example daemon_load

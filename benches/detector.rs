@@ -13,15 +13,16 @@ use criterion::{Criterion, criterion_group};
 use nalgebra::Vector2;
 use rand::{Rng, SeedableRng};
 use windhover::app::replay::config_of;
-use windhover::config::{Config, TagFamily};
-use windhover::detect::{FrameDetector, Region, Simd, TagDetector, tag_pattern};
+use windhover::config::Config;
 use windhover::io::capture::CaptureReader;
 use windhover::io::clock::HostClock;
-use windhover::msg::{
+use windhover::pixels::{self, DecodedFrame};
+use windhover_base::msg::TagFamily;
+use windhover_base::msg::{
     EventBody, FrameObservations, FramePrediction, GrayImage, ImageView, MarkerDetection, MarkerId,
     MarkerPrediction,
 };
-use windhover::pixels::{self, DecodedFrame};
+use windhover_detect::{FrameDetector, Region, Simd, TagDetector, tag_pattern};
 
 fn put_tag(image: &mut GrayImage, id: u32, at: (usize, usize), cell: usize) {
     let pattern = tag_pattern(TagFamily::Tag36h11, id);
@@ -119,7 +120,7 @@ fn tracked(c: &mut Criterion) {
     for features in [0, 8] {
         let mut config = Config::parse(&text).expect("the shipped configuration");
         config.detector.ground_features = features;
-        let mut detector = FrameDetector::new(&config);
+        let mut detector = FrameDetector::new(&config.detector, &config.target, &config.camera.intrinsics);
         let mut seen = FrameObservations::default();
         let mut n = 0;
         c.bench_function(&format!("detector/tracked frame/{features} features"), |b| {
@@ -151,7 +152,7 @@ impl Way {
         Self {
             name,
             track,
-            detector: FrameDetector::new(&config),
+            detector: FrameDetector::new(&config.detector, &config.target, &config.camera.intrinsics),
             before: Vec::new(),
             prediction: FramePrediction::default(),
             seen: FrameObservations::default(),

@@ -6,13 +6,13 @@
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
-use windhover::config::Config;
-use windhover::estimate::{Bound, BoundTruth, Estimator, EstimatorOutput, PaperEstimator, Site};
-use windhover::geo::{Ground, wrap_angle};
 use windhover::io::clock::HostClock;
-use windhover::msg::{FrameObservations, MarkerId, Stamped, TargetEstimate, TrackStatus};
-use windhover::simulate::{Sample, Scenario, SensorSuite, World};
-use windhover::time::{MonoTime, Span};
+use windhover_base::geo::{Ground, wrap_angle};
+use windhover_base::msg::{FrameObservations, MarkerId, Stamped, TargetEstimate, TrackStatus};
+use windhover_base::settings::{EstimatorConfig, Rig};
+use windhover_base::time::{MonoTime, Span};
+use windhover_estimate::{Bound, BoundTruth, Estimator, EstimatorOutput, PaperEstimator, Site};
+use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 
 /// What is scored begins here, seconds into the flight.
 const BURN_S: f64 = 6.0;
@@ -44,7 +44,7 @@ impl Score {
             self.lost += 1;
             return;
         };
-        let reference = truth.reference(world.scenario().config.target[estimate.target].reference_m);
+        let reference = truth.reference(world.scenario().rig.target[estimate.target].reference_m);
         let e = SVector::<f64, 5>::from([
             state.north_m - reference.x,
             state.east_m - reference.y,
@@ -97,7 +97,7 @@ fn line(e: &TargetEstimate, world: &World) -> String {
     let head = format!("{:6.2} target {} {:?}", world.seconds(e.t_valid), e.target, e.status);
     let Some((state, p)) = e.state.as_ref().and_then(|s| Some((s, s.covariance?))) else { return head };
     let truth = world.vehicle(e.target, e.t_valid);
-    let reference = truth.reference(world.scenario().config.target[e.target].reference_m);
+    let reference = truth.reference(world.scenario().rig.target[e.target].reference_m);
     let sigma = |i: usize| p[(i, i)].sqrt();
     format!(
         "{head} north {:.2}±{:.2} m, east {:.2}±{:.2} m, heading {:.2}±{:.2} deg, speed {:.3}±{:.3} m/s, \
@@ -176,10 +176,10 @@ fn intensities(world: &World, scales_s: &[f64; 6]) -> Intensities {
 }
 
 /// The configuration with these intensities and the true noise figures.
-fn told_the_truth(world: &World, q: &Intensities) -> Config {
+fn told_the_truth(world: &World, q: &Intensities) -> (Rig, EstimatorConfig) {
     let scenario = world.scenario();
-    let mut config = scenario.config.clone();
-    let e = &mut config.estimator;
+    let mut rig = scenario.rig.clone();
+    let mut e = EstimatorConfig::default();
     (e.target_speed_walk, e.target_yaw_rate_walk) = (q[0].sqrt(), q[1].sqrt());
     (e.tilt_rate_walk, e.yaw_rate_walk) = (q[2].sqrt(), q[3].sqrt());
     // A Gauss–Markov process of variance s² walks by 2 s²/τ.
@@ -187,18 +187,18 @@ fn told_the_truth(world: &World, q: &Intensities) -> Config {
     (e.side_force_mps2, e.thrust_mps2) = (sigma(q[4]), sigma(q[5]));
     let (gps, compass) = (&scenario.gps, &scenario.compass);
     (e.marker_noise_px, e.feature_sigma_factor) = (0.0, 1.0);
-    (config.gps.bias_sigma_m, config.gps.noise_m) = (gps.bias_sigma_m, gps.noise_m);
-    config.gps.velocity_noise_mps = gps.velocity_noise_mps;
-    config.compass.heading_noise_deg = compass.heading_noise_deg;
-    config.compass.tilt_noise_deg = compass.tilt_noise_deg;
-    config
+    (rig.gps.bias_sigma_m, rig.gps.noise_m) = (gps.bias_sigma_m, gps.noise_m);
+    rig.gps.velocity_noise_mps = gps.velocity_noise_mps;
+    rig.compass.heading_noise_deg = compass.heading_noise_deg;
+    rig.compass.tilt_noise_deg = compass.tilt_noise_deg;
+    (rig, e)
 }
 
 /// Whether a frame shows a marker of a target.
-fn shows(seen: &FrameObservations, config: &Config, target: usize) -> bool {
+fn shows(seen: &FrameObservations, rig: &Rig, target: usize) -> bool {
     seen.markers.iter().any(|detection| match detection.marker {
         MarkerId::Disc { target: of, .. } => of == target,
-        MarkerId::Tag { id, .. } => config.target[target].marker.iter().any(|marker| marker.id == Some(id)),
+        MarkerId::Tag { id, .. } => rig.target[target].marker.iter().any(|marker| marker.id == Some(id)),
     })
 }
 
@@ -260,8 +260,8 @@ type Taken = Vec<(MonoTime, Sample, Option<FrameObservations>)>;
 /// Times the bound is computed until the scales of the motion fit it.
 const PASSES: usize = 4;
 
-fn bound_pass(world: &World, site: &Site, config: &Config, taken: &Taken) -> BoundScore {
-    let mut bound = Bound::new(config, site);
+fn bound_pass(world: &World, site: &Site, told: &(Rig, EstimatorConfig), taken: &Taken) -> BoundScore {
+    let mut bound = Bound::new(&told.0, &told.1, site);
     let mut score = BoundScore::default();
     for (t, sample, seen) in taken {
         // A fix enters where its stamp puts it, with the delay that is to be learnt.
@@ -275,7 +275,7 @@ fn bound_pass(world: &World, site: &Site, config: &Config, taken: &Taken) -> Bou
                 }
                 let scored = world.seconds(*t) >= BURN_S;
                 let shown = |target: &usize| {
-                    seen.as_ref().is_some_and(|seen| shows(seen, &world.scenario().config, *target))
+                    seen.as_ref().is_some_and(|seen| shows(seen, &world.scenario().rig, *target))
                 };
                 for target in (0..world.vehicles()).filter(|_| scored).filter(shown) {
                     if let Some(covariance) = bound.target(target) {
@@ -335,20 +335,20 @@ struct Run {
 
 fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
     let world = Arc::new(World::new(scenario.clone(), seed));
-    let config = &world.scenario().config;
+    let rig = &world.scenario().rig;
     let site = Site {
         frame: *world.frame(),
         ground: Ground::Flat { down_m: 0.0 },
         declination_rad: scenario.declination_deg.to_radians(),
     };
-    let mut filter = Estimator::new(config, &site);
-    let mut paper = PaperEstimator::new(config, &site);
+    let mut filter = Estimator::new(rig, &EstimatorConfig::default(), &site);
+    let mut paper = PaperEstimator::new(rig, &EstimatorConfig::default(), &site);
     let mut suite = SensorSuite::new(Arc::clone(&world));
     let (mut out, mut paper_out) = (Vec::new(), Vec::new());
     let (mut f, mut s, mut p) = (Score::default(), Score::default(), Score::default());
     let mut in_view = Score::default();
     let (mut busy, mut frames, mut resets) = (Span::ZERO, 0usize, 0usize);
-    let offset = Span::from_ms(config.camera.exposure_offset_ms);
+    let offset = Span::from_ms(rig.camera.exposure_offset_ms);
     let error = suite.gps_latency_error().ms();
     while let Some(sample) = suite.next() {
         let begun = HostClock::thread_processor_time();
@@ -386,7 +386,7 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
                         println!("{}", line(&e, &world));
                     }
                     f.add(&e, &world);
-                    if shows(suite.observations(), config, e.target) {
+                    if shows(suite.observations(), rig, e.target) {
                         in_view.add(&e, &world);
                     }
                 }

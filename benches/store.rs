@@ -12,8 +12,8 @@ use windhover::io::store::record::{ChannelDef, RawRecord, Weight};
 use windhover::io::store::segment::Head;
 use windhover::io::store::volume::Volume;
 use windhover::io::store::{flight, inspect};
-use windhover::msg::{FrameEncoding, FramePayload};
-use windhover::time::MonoTime;
+use windhover_base::msg::{FrameEncoding, FramePayload};
+use windhover_base::time::MonoTime;
 
 fn frame() -> FramePayload {
     let (width, height) = (1280usize, 1024usize);

@@ -26,8 +26,8 @@ use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use windhover::app::replay::config_of;
 use windhover::io::capture::CaptureReader;
-use windhover::msg::{EventBody, Source};
-use windhover::time::Span;
+use windhover_base::msg::{EventBody, Source};
+use windhover_base::time::Span;
 
 #[derive(Parser)]
 struct Args {

@@ -10,8 +10,8 @@ use nalgebra::{Matrix3, Unit, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use windhover::config::TagFamily;
-use windhover::detect::{TagPattern, tag_pattern};
+use windhover_base::msg::TagFamily;
+use windhover_detect::{TagPattern, tag_pattern};
 
 const WIDTH: usize = 1280;
 const HEIGHT: usize = 1024;

@@ -19,8 +19,8 @@ use windhover::io::records::{Record, Schema, topic};
 use windhover::io::store::index::{Change, Index, QueuedRecord};
 use windhover::io::store::volume::Volume;
 use windhover::io::store::{Store, StoreHandle};
-use windhover::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
-use windhover::time::{MonoTime, Span};
+use windhover_base::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
+use windhover_base::time::{MonoTime, Span};
 
 #[derive(Parser)]
 struct Args {

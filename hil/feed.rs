@@ -18,9 +18,9 @@ use std::time::Duration;
 use windhover::config::Config;
 use windhover::io::capture::{CaptureReader, attached_config};
 use windhover::io::clock::HostClock;
-use windhover::msg::{EventBody, FramePayload, GrayImage, Source};
 use windhover::pixels;
-use windhover::time::{MonoTime, Span};
+use windhover_base::msg::{EventBody, FramePayload, GrayImage, Source};
+use windhover_base::time::{MonoTime, Span};
 
 type Trouble = Box<dyn std::error::Error>;
 

@@ -5,8 +5,8 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use windhover::io::capture::CaptureReader;
-use windhover::msg::{EventBody, ImageView};
 use windhover::pixels;
+use windhover_base::msg::{EventBody, ImageView};
 
 fn main() -> ExitCode {
     let Some(flight) = std::env::args().nth(1) else {

@@ -4,26 +4,18 @@
 //! it points, how fast it drives and turns comes out, each with its covariance. `ARCHITECTURE.md`
 //! tells how the parts fit.
 //!
-//! A module names only modules listed above it here. Core (up to `pipeline`) turns values into
+//! What is worth having alone are crates of their own (`crates/`). A module names only modules listed
+//! above it here. Core (the crates, and modules up to `pipeline`) turns values into
 //! values: it never reads a clock, logs, waits or touches a device. `io` moves events and records;
 //! `app` wires; `cli` talks to people. `tests/architecture.rs` holds this.
 
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 // -- core: values in, values out
-pub mod time;
-pub mod geo;
 pub mod config;
-pub mod msg;
 pub mod jpeg;
 pub mod pixels;
-pub mod decode;
-pub mod align;
-pub mod detect;
-pub mod estimate;
 pub mod plot;
-pub mod calibrate;
-pub mod simulate;
 pub mod pipeline;
 // -- edge: devices, disk, network
 pub mod io;

@@ -4,10 +4,11 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::sync::Arc;
 
-use windhover::estimate::{Estimator, EstimatorOutput, Site};
-use windhover::geo::Ground;
-use windhover::msg::{FrameObservations, FramePrediction, Stamped};
-use windhover::simulate::{Sample, Scenario, SensorSuite, World};
+use windhover_base::geo::Ground;
+use windhover_base::msg::{FrameObservations, FramePrediction, Stamped};
+use windhover_base::settings::EstimatorConfig;
+use windhover_estimate::{Estimator, EstimatorOutput, Site};
+use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 
 thread_local! {
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
@@ -47,7 +48,7 @@ fn allocations(name: &str, seconds: f64) -> Vec<u64> {
     let declination_rad = scenario.declination_deg.to_radians();
     let world = Arc::new(World::new(scenario, 5));
     let site = Site { frame: *world.frame(), ground: Ground::Flat { down_m: 0.0 }, declination_rad };
-    let mut filter = Estimator::new(&world.scenario().config, &site);
+    let mut filter = Estimator::new(&world.scenario().rig, &EstimatorConfig::default(), &site);
     let mut suite = SensorSuite::new(Arc::clone(&world));
     let mut out: Vec<EstimatorOutput> = Vec::with_capacity(1024);
     let mut expected = FramePrediction::default();

@@ -5,10 +5,10 @@ mod guide;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use windhover::calibrate::boresight::{Boresight, BoresightError, Recording, boresight};
-use windhover::config::MarkerConfig;
-use windhover::simulate::{HelicopterPath, Route, Sample, Scenario, SensorSuite, World};
-use windhover::time::Span;
+use windhover_base::settings::MarkerConfig;
+use windhover_base::time::Span;
+use windhover_calibrate::boresight::{Boresight, BoresightError, Recording, boresight};
+use windhover_simulate::{HelicopterPath, Route, Sample, Scenario, SensorSuite, World};
 
 /// A minute over a marker at rest with a crooked camera and compass: a figure of eight, turning.
 fn pattern(seed: u64) -> Scenario {
@@ -29,12 +29,12 @@ fn pattern(seed: u64) -> Scenario {
 fn pattern_over_a_cross(seed: u64) -> Scenario {
     let mut scenario = pattern(seed);
     scenario.vehicles.pop();
-    scenario.config.target.pop();
+    scenario.rig.target.pop();
     guide::lead(&mut scenario, 4.0, Route::Eight { a_m: 7.0, b_m: 5.0 });
-    let first = scenario.config.target[0].marker[0].clone();
+    let first = scenario.rig.target[0].marker[0].clone();
     for (id, north_m, east_m) in [(21, 5.0, 0.0), (22, -5.0, 0.0), (23, 0.0, 5.0), (24, 0.0, -5.0)] {
         let tag = MarkerConfig { id: Some(id), position_m: [north_m, east_m, 0.0], ..first.clone() };
-        scenario.config.target[0].marker.push(tag);
+        scenario.rig.target[0].marker.push(tag);
     }
     scenario.helicopter.agitation_mps2 = 0.3;
     scenario
@@ -49,17 +49,17 @@ fn fly(scenario: Scenario, seed: u64) -> (Boresight, Vec<f64>) {
             Sample::Gnss { stamped, .. } => recording.gnss.push(stamped),
             Sample::Attitude { stamped, .. } => recording.attitude.push(stamped),
             Sample::Frame { truth, .. } => {
-                let t = truth.t_stamp + Span::from_ms(scenario.config.camera.exposure_offset_ms);
+                let t = truth.t_stamp + Span::from_ms(scenario.rig.camera.exposure_offset_ms);
                 recording.frames.push((t, suite.observations().markers.clone()));
             }
         }
     }
     let declination = scenario.declination_deg.to_radians();
     let found =
-        boresight(&scenario.config, declination, &[recording], &BTreeMap::new()).expect("a whole flight");
+        boresight(&scenario.rig, declination, &[recording], &BTreeMap::new()).expect("a whole flight");
     let zero = suite.compass_bias_rad().to_degrees();
     let [yaw, pitch, roll] = scenario.camera.mount_error_deg;
-    let [forward, right, down] = scenario.config.camera.mount.position_m;
+    let [forward, right, down] = scenario.rig.camera.mount.position_m;
     let late = [suite.compass_latency_error().ms(), suite.gps_latency_error().ms()];
     let truth = vec![
         yaw,
@@ -80,7 +80,7 @@ fn fly(scenario: Scenario, seed: u64) -> (Boresight, Vec<f64>) {
     (found, truth)
 }
 
-fn findings(found: &Boresight) -> impl Iterator<Item = &windhover::calibrate::boresight::Finding> {
+fn findings(found: &Boresight) -> impl Iterator<Item = &windhover_calibrate::boresight::Finding> {
     found.parameters.iter().chain(&found.camera_to_compass)
 }
 
@@ -109,9 +109,9 @@ fn hovering_still_says_what_it_cannot_tell() {
 
 #[test]
 fn a_flight_without_fixes_is_refused() {
-    let config = Scenario::named("static-survey").expect("a named scenario").config;
-    assert_eq!(boresight(&config, 0.0, &[], &BTreeMap::new()), Err(BoresightError::NoFlight));
-    let empty = boresight(&config, 0.0, &[Recording::default()], &BTreeMap::new());
+    let rig = Scenario::named("static-survey").expect("a named scenario").rig;
+    assert_eq!(boresight(&rig, 0.0, &[], &BTreeMap::new()), Err(BoresightError::NoFlight));
+    let empty = boresight(&rig, 0.0, &[Recording::default()], &BTreeMap::new());
     assert!(matches!(empty, Err(BoresightError::Unusable { number: 1, .. })));
 }
 

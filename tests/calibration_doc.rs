@@ -5,9 +5,9 @@ use std::process::Command;
 use std::sync::LazyLock;
 
 use nalgebra::{Rotation3, Vector2, Vector3};
-use windhover::config::TagFamily;
-use windhover::detect::{TagPattern, tag_pattern};
-use windhover::geo::{CameraModel, ned_from_body_321};
+use windhover_base::geo::{CameraModel, ned_from_body_321};
+use windhover_base::msg::TagFamily;
+use windhover_detect::{TagPattern, tag_pattern};
 
 const DOC: &str = include_str!("../docs/calibration.md");
 

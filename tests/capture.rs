@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use windhover::io::capture::{CaptureReader, CaptureWriter, attached_config};
-use windhover::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
-use windhover::time::{MonoTime, Span};
+use windhover_base::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
+use windhover_base::time::{MonoTime, Span};
 
 const CONFIG: &str = "# a configuration\n";
 

@@ -17,8 +17,8 @@ use windhover::io::clock::HostClock;
 use windhover::io::store::flight::{self, FLIGHTS};
 use windhover::io::store::volume::Volume;
 use windhover::io::store::{Recording, Store, StoreHandle, StoreNotice, inspect};
-use windhover::msg::{Event, EventBody, Source};
-use windhover::time::MonoTime;
+use windhover_base::msg::{Event, EventBody, Source};
+use windhover_base::time::MonoTime;
 
 /// A mount point and what is in it.
 struct Slot(TempDir);

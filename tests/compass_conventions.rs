@@ -7,10 +7,12 @@ use std::sync::Arc;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use windhover::app::export::{self, Format};
 use windhover::app::replay;
-use windhover::geo::TiltConvention;
+use windhover::config::Config;
 use windhover::io::capture::CaptureWriter;
-use windhover::msg::EventBody;
-use windhover::simulate::{Flight, FrameStorage, Scenario, World};
+use windhover::jpeg;
+use windhover_base::geo::TiltConvention;
+use windhover_base::msg::{EventBody, GrayImage};
+use windhover_simulate::{Flight, FrameStorage, Scenario, World};
 
 const KINDS: [TiltConvention; 4] = [
     TiltConvention::Euler321,
@@ -19,17 +21,22 @@ const KINDS: [TiltConvention; 4] = [
     TiltConvention::Projection,
 ];
 
+fn encode(image: &GrayImage) -> Result<Vec<u8>, String> {
+    jpeg::encode_grey(image, 80).map_err(|e| e.to_string())
+}
+
 /// Records a flight whose compass speaks this way. Gives which way is down in the body frame at each
 /// frame, by the truth.
 fn record(angles: TiltConvention, path: &Path) -> Vec<Vector3<f64>> {
     let mut scenario = Scenario::named("elevation-compass").unwrap().with_resolution(0.3);
-    scenario.config.compass.angles = angles;
+    scenario.rig.compass.angles = angles;
     scenario.duration_s = 12.0;
-    scenario.config.camera.fps = 4.0;
+    scenario.rig.camera.fps = 4.0;
     let world = Arc::new(World::new(scenario, 17));
-    let config = world.scenario().config.to_toml().unwrap();
+    let scenario = world.scenario();
+    let config = Config::of_rig(scenario.rig.clone(), scenario.ground()).to_toml().unwrap();
     let mut writer = CaptureWriter::create(path, &config, world.scenario().start).unwrap();
-    let mut flight = Flight::new(Arc::clone(&world), FrameStorage::Jpeg(80), 2);
+    let mut flight = Flight::new(Arc::clone(&world), FrameStorage::Jpeg(Arc::new(encode)), 2);
     let mut down = Vec::new();
     while let Some(event) = flight.next() {
         let event = event.unwrap();

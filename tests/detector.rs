@@ -7,12 +7,14 @@ use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use windhover::config::{Brightness, Config, TagFamily};
-use windhover::detect::{FrameDetector, Simd, TagDetector, TagPattern, tag_pattern};
-use windhover::msg::{
+use windhover::config::Config;
+use windhover_base::msg::TagFamily;
+use windhover_base::msg::{
     FrameObservations, FramePrediction, GrayImage, ImageView, MarkerDetection, MarkerId, MarkerPrediction,
     RgbImage,
 };
+use windhover_base::settings::Brightness;
+use windhover_detect::{FrameDetector, Simd, TagDetector, TagPattern, tag_pattern};
 
 /// A generated image and where its tag's corners are.
 struct Drawn {
@@ -249,6 +251,10 @@ fn noise_and_stripes_hold_no_tags() {
     }
 }
 
+fn detector_of(config: &Config) -> FrameDetector {
+    FrameDetector::new(&config.detector, &config.target, &config.camera.intrinsics)
+}
+
 /// The shipped configuration and a target of two discs, one of them of a colour or dark.
 fn with_discs(is_red: bool) -> Config {
     let mut config =
@@ -301,7 +307,7 @@ proptest! {
             size_range_px: Some((0.5 * size_px, size_px)),
             occupied: vec![(center_px, size_px)],
         };
-        let mut detector = FrameDetector::new(&with_discs(is_red));
+        let mut detector = detector_of(&with_discs(is_red));
         let mut seen = FrameObservations::default();
         for (k, (width, height)) in sizes.into_iter().flat_map(|size| [size; 3]).enumerate() {
             let at = |i: usize| pixels[((i % width + k) / coarse * 31 + i / width / coarse * 17) % pixels.len()];

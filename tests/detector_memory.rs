@@ -7,9 +7,13 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
 use nalgebra::Vector2;
-use windhover::config::{Brightness, Config, TagFamily};
-use windhover::detect::{FrameDetector, Region, TagDetector, tag_pattern};
-use windhover::msg::{FrameObservations, FramePrediction, GrayImage, MarkerId, MarkerPrediction, RgbImage};
+use windhover::config::Config;
+use windhover_base::msg::TagFamily;
+use windhover_base::msg::{
+    FrameObservations, FramePrediction, GrayImage, MarkerId, MarkerPrediction, RgbImage,
+};
+use windhover_base::settings::Brightness;
+use windhover_detect::{FrameDetector, Region, TagDetector, tag_pattern};
 
 /// Counts what the calling thread asks for.
 struct Counting;
@@ -80,6 +84,10 @@ fn frames_after_the_first_take_no_memory() {
     assert_eq!(ASKED.with(Cell::get), before, "allocations in the second pass over the same frames");
 }
 
+fn detector_of(config: &Config) -> FrameDetector {
+    FrameDetector::new(&config.detector, &config.target, &config.camera.intrinsics)
+}
+
 /// The shipped configuration's target with tags 3 and 7, and a second one with a pair of dark discs.
 fn config() -> Config {
     let text =
@@ -148,7 +156,7 @@ fn foretold(n: usize) -> FramePrediction {
 fn whole_frames_with_discs_and_features_take_none_either() {
     let frames = [full_frame(0), full_frame(1), full_frame(2)];
     let predictions = [foretold(0), foretold(1), foretold(2)];
-    let mut detector = FrameDetector::new(&config());
+    let mut detector = detector_of(&config());
     let mut seen = FrameObservations::default();
     let mut pass = |detector: &mut FrameDetector| {
         // Tracked after the first, and over a cut in which most features are lost.

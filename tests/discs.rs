@@ -7,11 +7,12 @@ use nalgebra::{Rotation3, Unit, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use windhover::config::{Brightness, Config};
-use windhover::detect::FrameDetector;
-use windhover::msg::{
+use windhover::config::Config;
+use windhover_base::msg::{
     FrameObservations, FramePrediction, GrayImage, MarkerDetection, MarkerId, MarkerPrediction, RgbImage,
 };
+use windhover_base::settings::Brightness;
+use windhover_detect::FrameDetector;
 
 const WIDTH: usize = 260;
 const HEIGHT: usize = 220;
@@ -46,6 +47,10 @@ impl Look {
             Self::Red => None,
         }
     }
+}
+
+fn detector_of(config: &Config) -> FrameDetector {
+    FrameDetector::new(&config.detector, &config.target, &config.camera.intrinsics)
 }
 
 fn config(look: Look, diameters: [f64; 2]) -> Config {
@@ -147,7 +152,7 @@ fn centres_are_within_the_bar_light_dark_and_red_round_and_aslant() {
     for look in [Look::Light, Look::Dark, Look::Red] {
         for tilt in [0.02, 0.45] {
             let mut rng = ChaCha8Rng::seed_from_u64(2);
-            let mut detector = FrameDetector::new(&config(look, DIAMETERS));
+            let mut detector = detector_of(&config(look, DIAMETERS));
             let (mut square, mut sum, mut nes, mut found) = (0.0, Vector2::zeros(), 0.0, 0.0);
             const FRAMES: usize = 25;
             for _ in 0..FRAMES {
@@ -180,12 +185,12 @@ fn what_is_ambiguous_is_refused() {
     // Two alike: which is which cannot be told.
     let alike = [(-0.5, 0.0, 0.42), (0.5, 0.0, 0.42)];
     let scene = Scene::random(&mut rng, Look::Light, 0.2, &alike);
-    let mut detector = FrameDetector::new(&config(Look::Light, [0.42, 0.42]));
+    let mut detector = detector_of(&config(Look::Light, [0.42, 0.42]));
     assert_eq!(seen(&mut detector, &scene.render(&mut rng), None), [], "a pair of equals");
     // A third that would do as well as the first.
     let three = [(-0.5, 0.4, 0.42), (-0.5, -0.4, 0.42), (0.4, 0.0, 0.6)];
     let scene = Scene::random(&mut rng, Look::Light, 0.2, &three);
-    let mut detector = FrameDetector::new(&config(Look::Light, DIAMETERS));
+    let mut detector = detector_of(&config(Look::Light, DIAMETERS));
     let image = scene.render(&mut rng);
     assert_eq!(seen(&mut detector, &image, None), [], "two that can be the first");
     // Told by their places, while tracking.
@@ -214,7 +219,7 @@ fn a_disc_whose_partner_is_covered_is_found_where_it_is_foretold() {
     let mut rng = ChaCha8Rng::seed_from_u64(5);
     let scene = Scene::random(&mut rng, Look::Light, 0.2, &[(0.5, 0.0, DIAMETERS[1])]);
     let image = scene.render(&mut rng);
-    let mut detector = FrameDetector::new(&config(Look::Light, DIAMETERS));
+    let mut detector = detector_of(&config(Look::Light, DIAMETERS));
     assert_eq!(seen(&mut detector, &image, None), [], "alone it may be anything round");
     let here = scene.truth(0) + Vector2::new(1.0, -1.5);
     let marker = |marker: usize, center_px: Vector2<f64>| MarkerPrediction {

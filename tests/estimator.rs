@@ -4,14 +4,14 @@
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, Vector2};
-use windhover::config::Config;
-use windhover::estimate::{Estimator, EstimatorOutput, PaperEstimator, Site};
-use windhover::geo::{Ground, wrap_angle};
-use windhover::msg::{
+use windhover_base::geo::{Ground, wrap_angle};
+use windhover_base::msg::{
     AttitudeSample, Disposition, FrameObservations, GnssEpoch, Ownship, Stamped, TargetEstimate, TrackStatus,
 };
-use windhover::simulate::{Sample, Scenario, SensorSuite, World};
-use windhover::time::{MonoTime, Span};
+use windhover_base::settings::{EstimatorConfig, Rig};
+use windhover_base::time::{MonoTime, Span};
+use windhover_estimate::{Estimator, EstimatorOutput, PaperEstimator, Site};
+use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 
 /// One measurement as the pipeline hands it over.
 #[derive(Clone)]
@@ -78,12 +78,12 @@ fn fly(name: &str, seconds: f64, seed: u64, change: impl FnOnce(&mut Scenario)) 
 }
 
 impl Flight {
-    fn config(&self) -> &Config {
-        &self.world.scenario().config
+    fn rig(&self) -> &Rig {
+        &self.world.scenario().rig
     }
 
     fn filter(&self) -> Estimator {
-        Estimator::new(self.config(), &self.site)
+        Estimator::new(self.rig(), &EstimatorConfig::default(), &self.site)
     }
 
     fn outputs(&self) -> Vec<EstimatorOutput> {
@@ -356,7 +356,7 @@ fn a_lasting_jump_of_the_receiver_anchors_the_scene_anew() {
         s if s > 29.0 => Some(72.0),
         _ => None,
     };
-    let gps = flight.config();
+    let gps = flight.rig();
     let prior_m = gps.gps.bias_sigma_m.hypot(gps.gps.noise_m);
     for own in ownships(&jumped).iter().filter(|o| flight.world.seconds(o.t_valid) > 6.0) {
         let truth = flight.world.ownship(own.t_valid);
@@ -408,10 +408,11 @@ fn the_papers_estimator_is_exact_without_noise() {
         (compass.latency_spread_ms, compass.jitter_ms, compass.rate_hz) = (0.0, 0.0, 200.0);
         (s.camera.marker_noise_px, s.camera.stamp_noise_ms) = (0.0, 0.0);
         // Everything heard as soon as it is true, so that the latest reading is that of the frame.
-        s.config.compass.baud = 921_600;
-        (s.config.gps.latency_ms, s.config.compass.latency_ms) = (0.0, 0.0);
+        s.rig.compass.baud = 921_600;
+        (s.rig.gps.latency_ms, s.rig.compass.latency_ms) = (0.0, 0.0);
     });
-    let (mut paper, mut out) = (PaperEstimator::new(flight.config(), &flight.site), Vec::new());
+    let (mut paper, mut out) =
+        (PaperEstimator::new(flight.rig(), &EstimatorConfig::default(), &flight.site), Vec::new());
     for heard in &flight.heard {
         match heard {
             Heard::Gnss(g) => paper.gnss(g, &mut out),

@@ -6,20 +6,21 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nalgebra::{Rotation3, Vector2, Vector3};
-use windhover::estimate::{Estimator, EstimatorOutput, Site};
-use windhover::geo::{Geodetic, Ground, LocalFrame, Terrain, Tile, euler_321, rot_y, wrap_angle};
-use windhover::msg::{AttitudeSample, GnssEpoch, Stamped, TargetEstimate, TrackStatus};
-use windhover::simulate::{Route, Sample, Scenario, SensorSuite, World};
+use windhover_base::geo::{Geodetic, Ground, LocalFrame, Terrain, Tile, euler_321, rot_y, wrap_angle};
+use windhover_base::msg::{AttitudeSample, GnssEpoch, Stamped, TargetEstimate, TrackStatus};
+use windhover_base::settings::EstimatorConfig;
+use windhover_estimate::{Estimator, EstimatorOutput, Site};
+use windhover_simulate::{Route, Sample, Scenario, SensorSuite, World};
 
 /// Flies a scenario on a plane turned by `tilt` about the scenario's origin, through the filter over
 /// `ground`. Turning the whole world leaves every image as it is: only fixes and compass turn.
 fn estimates(world: &Arc<World>, tilt: &Rotation3<f64>, ground: Ground) -> Vec<TargetEstimate> {
     let scenario = world.scenario();
-    let mut config = scenario.config.clone();
-    config.target.truncate(1);
+    let mut rig = scenario.rig.clone();
+    rig.target.truncate(1);
     let declination_rad = scenario.declination_deg.to_radians();
     let site = Site { frame: *world.frame(), ground, declination_rad };
-    let mut filter = Estimator::new(&config, &site);
+    let mut filter = Estimator::new(&rig, &EstimatorConfig::default(), &site);
     let mut suite = SensorSuite::new(Arc::clone(world));
     let mut out = Vec::new();
     while let Some(sample) = suite.next() {
@@ -57,7 +58,7 @@ fn turn_fix(epoch: &mut GnssEpoch, frame: &LocalFrame, tilt: &Rotation3<f64>) {
 
 fn turn_compass(sample: &mut AttitudeSample, scenario: &Scenario, tilt: &Rotation3<f64>) {
     let (Some(heading), Some(level)) = (sample.heading, sample.tilt) else { return };
-    let angles = scenario.config.compass.angles;
+    let angles = scenario.rig.compass.angles;
     let north = if sample.heading_is_true { 0.0 } else { scenario.declination_deg.to_radians() };
     let Some(upright) = angles.ned_from_body(heading + north, level) else { return };
     let turned = tilt * upright;
@@ -155,7 +156,7 @@ fn passes(seconds: f64) -> Scenario {
     let mut scenario = Scenario::named("static-survey").expect("a named scenario");
     scenario.duration_s = seconds;
     scenario.camera.features = 0;
-    scenario.config.camera.fps = 4.0;
+    scenario.rig.camera.fps = 4.0;
     guide::lead(&mut scenario, 4.0, Route::Eight { a_m: 25.0, b_m: 12.0 });
     scenario
 }
@@ -193,7 +194,7 @@ fn survey(seconds: f64, at_s: &[f64], runs: u64) -> BTreeMap<u64, [f64; 3]> {
 #[test]
 fn a_survey_gets_better_with_passes_down_to_what_the_receiver_sets() {
     let table = survey(300.0, &[20.0, 100.0, 300.0], 3);
-    let gps = passes(1.0).config.gps;
+    let gps = passes(1.0).rig.gps;
     println!("{table:?}");
     for (t, [sigma, _, nees]) in &table {
         let floor = floor_m(gps.bias_sigma_m, gps.bias_tau_s, *t as f64);
@@ -208,7 +209,7 @@ fn a_survey_gets_better_with_passes_down_to_what_the_receiver_sets() {
 #[ignore = "24 flights of 20 minutes take some minutes"]
 fn survey_table() {
     let times = [20.0, 60.0, 120.0, 300.0, 600.0, 1200.0];
-    let gps = passes(1.0).config.gps;
+    let gps = passes(1.0).rig.gps;
     for (t, [sigma, error, nees]) in survey(1200.0, &times, 24) {
         let floor = floor_m(gps.bias_sigma_m, gps.bias_tau_s, t as f64);
         println!(

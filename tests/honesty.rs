@@ -3,11 +3,12 @@
 
 use std::sync::Arc;
 
-use windhover::estimate::{Estimator, EstimatorOutput, Site};
-use windhover::geo::Ground;
-use windhover::msg::{FrameObservations, Stamped, TargetEstimate, TrackStatus};
-use windhover::simulate::{Sample, Scenario, SensorSuite, World};
-use windhover::time::Span;
+use windhover_base::geo::Ground;
+use windhover_base::msg::{FrameObservations, Stamped, TargetEstimate, TrackStatus};
+use windhover_base::settings::EstimatorConfig;
+use windhover_base::time::Span;
+use windhover_estimate::{Estimator, EstimatorOutput, Site};
+use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 
 /// Flies a scenario whose pixels are this good (px); gives the world and the estimates of its first target.
 fn fly(name: &str, seconds: f64, seed: u64, px: (f64, f64)) -> (Arc<World>, Vec<TargetEstimate>) {
@@ -28,9 +29,9 @@ fn fly_with(
     let declination_rad = scenario.declination_deg.to_radians();
     let world = Arc::new(World::new(scenario, seed));
     let site = Site { frame: *world.frame(), ground: Ground::Flat { down_m: 0.0 }, declination_rad };
-    let config = &world.scenario().config;
-    let offset = Span::from_ms(config.camera.exposure_offset_ms);
-    let mut filter = Estimator::new(config, &site);
+    let rig = &world.scenario().rig;
+    let offset = Span::from_ms(rig.camera.exposure_offset_ms);
+    let mut filter = Estimator::new(rig, &EstimatorConfig::default(), &site);
     let mut suite = SensorSuite::new(Arc::clone(&world));
     let mut out = Vec::new();
     while let Some(sample) = suite.next() {
@@ -111,7 +112,7 @@ fn ground_features_tell_nothing_of_where_they_are() {
     let last = estimates.last().and_then(|e| e.state).and_then(|s| s.covariance).expect("tracked");
     // Then position is known as well as a receiver with a Gauss-Markov bias of known sigma and correlation time tells
     // it in that time to one who knows every movement, and no better: `2 σ² τ / (T + 2 τ)`.
-    let gps = &world.scenario().config.gps;
+    let gps = &world.scenario().rig.gps;
     let least = 2.0 * gps.bias_sigma_m.powi(2) * gps.bias_tau_s / (seconds + 2.0 * gps.bias_tau_s);
     for axis in 0..2 {
         let ratio = last[(axis, axis)] / least;

@@ -5,7 +5,7 @@ use std::path::Path;
 use windhover::app::import::{ImportFailure, Imported, Sources, import};
 use windhover::io::capture::{CaptureReader, attached_config};
 use windhover::io::import::VideoSource;
-use windhover::msg::{EventBody, FrameEncoding, Source};
+use windhover_base::msg::{EventBody, FrameEncoding, Source};
 
 /// What a capture holds: milliseconds since its first event, and what it is.
 fn contents(path: &Path) -> Vec<(i64, String)> {

@@ -103,7 +103,10 @@ fn goldens_agree_with_the_truth() {
                 .filter_map(|(frame, value)| {
                     let (_, want) = true_values.iter().find(|(k, _)| k == frame)?;
                     let error = value - want;
-                    Some(if key == "heading_rad" { windhover::geo::wrap_angle(error) } else { error }.abs())
+                    Some(
+                        if key == "heading_rad" { windhover_base::geo::wrap_angle(error) } else { error }
+                            .abs(),
+                    )
                 })
                 .collect();
             errors.sort_by(f64::total_cmp);

@@ -4,18 +4,23 @@
 
 use std::sync::Arc;
 
-use windhover::config::CompassFormat;
-use windhover::geo::wrap_angle;
-use windhover::msg::{AttitudeSample, GnssEpoch, NoticeKind, Output, Stamped};
+use windhover::config::Config;
 use windhover::pipeline::Pipeline;
-use windhover::simulate::{Flight, FrameStorage, Sample, Scenario, SensorSuite, World};
-use windhover::time::{MonoTime, Span};
+use windhover_base::geo::wrap_angle;
+use windhover_base::msg::{AttitudeSample, GnssEpoch, NoticeKind, Output, Stamped};
+use windhover_base::settings::CompassFormat;
+use windhover_base::time::{MonoTime, Span};
+use windhover_simulate::{Flight, FrameStorage, Sample, Scenario, SensorSuite, World};
 
 /// Epochs and readings as the pipeline stamps them.
 type Decoded = (Vec<Stamped<GnssEpoch>>, Vec<Stamped<AttitudeSample>>);
 
+fn config_of(scenario: &Scenario) -> Config {
+    Config::of_rig(scenario.rig.clone(), scenario.ground())
+}
+
 fn decoded(flight: Flight) -> Decoded {
-    let mut pipeline = Pipeline::new(&flight.world().scenario().config);
+    let mut pipeline = Pipeline::new(&config_of(flight.world().scenario()));
     let (mut outputs, mut fixes, mut attitudes) = (Vec::new(), Vec::new(), Vec::new());
     let mut sort = |outputs: &mut Vec<Output>| {
         for output in outputs.drain(..) {
@@ -124,7 +129,7 @@ fn every_compass_format_is_read_as_it_was_sent() {
     ] {
         let mut scenario = Scenario::named("follow").expect("known");
         scenario.duration_s = 8.0;
-        scenario.config.compass.format = format;
+        scenario.rig.compass.format = format;
         let world = Arc::new(World::new(scenario, 21));
         let flight = Flight::new(Arc::clone(&world), FrameStorage::None, 1);
         let off = flight.compass_latency_error();
@@ -186,7 +191,7 @@ fn a_terrain_tile_that_is_missing_is_an_event_of_its_own() {
     let mut scenario = Scenario::named("follow").expect("known");
     scenario.duration_s = 4.0;
     let world = Arc::new(World::new(scenario, 3));
-    let mut config = world.scenario().config.clone();
+    let mut config = config_of(world.scenario());
     config.ground.elevation_msl_m = None;
     config.ground.source = None;
     config.ground.terrain = Some("N30W086.hgt".into());

@@ -18,7 +18,7 @@ use windhover::io::store::flight::{self, FLIGHTS, FlightInfo};
 use windhover::io::store::summary::TopicStats;
 use windhover::io::store::volume::Volume;
 use windhover::io::store::{Store, StoreNotice};
-use windhover::msg::{Event, EventBody, Source};
+use windhover_base::msg::{Event, EventBody, Source};
 
 fn windhover(root: &Path, arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_windhover"))

@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 
 use windhover::config::Config;
 use windhover::io::capture::CaptureReader;
-use windhover::msg::Output;
-use windhover::msg::{Event, EventBody, TrackStatus, WarmState};
 use windhover::pipeline::Pipeline;
-use windhover::time::{MonoTime, Span};
+use windhover_base::msg::Output;
+use windhover_base::msg::{Event, EventBody, TrackStatus, WarmState};
+use windhover_base::time::{MonoTime, Span};
 
 fn capture() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/captures/follow.mcap")

@@ -2,9 +2,9 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use windhover::config::CompassFormat;
-use windhover::decode::CompassDecoder;
-use windhover::time::MonoTime;
+use windhover_base::settings::CompassFormat;
+use windhover_decode::CompassDecoder;
+use windhover_base::time::MonoTime;
 
 const FORMATS: [CompassFormat; 7] = [
     CompassFormat::Tcm2,

@@ -4,9 +4,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::config::Config;
-use crate::msg::{Event, EventBody, Health, Output, TargetEstimate};
 use crate::pipeline::{Pipeline, Ticks};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{Event, EventBody, Health, Output, TargetEstimate};
+use windhover_base::time::{MonoTime, Span};
 
 use super::card::CardOrders;
 use super::config_file;

@@ -8,7 +8,7 @@ use crate::config::{Config, Part};
 use crate::io::clock::HostClock;
 use crate::io::device::Stop;
 use crate::io::store::{Recording, Store, StoreHandle, StoreNotice, StoreStatus};
-use crate::time::Span;
+use windhover_base::time::Span;
 
 use super::brain::Board;
 use super::devices::Surroundings;

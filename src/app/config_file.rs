@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::config::{Config, ConfigError};
-use crate::geo::Tile;
 use crate::io::{self, terrain::TileError};
+use windhover_base::geo::Tile;
 
 /// Why a configuration file gave no configuration.
 #[derive(Debug, thiserror::Error)]

@@ -3,8 +3,8 @@
 
 use super::flight::Flight;
 use crate::config::Config;
-use crate::geo::{DeclinationError, Geodetic, declination};
-use crate::time::UtcTime;
+use windhover_base::geo::{DeclinationError, Geodetic, declination};
+use windhover_base::time::UtcTime;
 
 /// Radians, east positive; zero where the configuration names neither figure nor model.
 pub fn of_flight(config: &Config, flight: &Flight) -> Result<f64, DeclinationError> {

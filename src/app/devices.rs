@@ -2,14 +2,15 @@
 
 use std::sync::Arc;
 
-use crate::config::{CompassFormat, Config, Part};
+use crate::config::{Config, Part};
 use crate::io::camera::{self, CameraSettings};
 use crate::io::clock::HostClock;
 use crate::io::device::{Fault, NoteKind, Report, Stop};
 use crate::io::pps;
 use crate::io::serial::{self, SerialSettings};
-use crate::msg::{EventBody, Source};
-use crate::time::MonoTime;
+use windhover_base::msg::{EventBody, Source};
+use windhover_base::settings::CompassFormat;
+use windhover_base::time::MonoTime;
 
 use super::events::{self, OperatorEvent as Event};
 use super::inbox::Inbox;

@@ -17,8 +17,8 @@ use crate::io::link::{
 };
 use crate::io::mavlink::MavlinkSender;
 use crate::io::records::Record;
-use crate::msg::{Event, EventBody, FramePayload, Output};
-use crate::time::{Span, UtcTime};
+use windhover_base::msg::{Event, EventBody, FramePayload, Output};
+use windhover_base::time::{Span, UtcTime};
 
 use super::brain::Board;
 use super::card::Slot;

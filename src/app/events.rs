@@ -11,8 +11,8 @@ use tracing::{Level, Metadata, Span};
 
 use crate::io::device::{Fault, NoteKind};
 use crate::io::store::StoreNotice;
-use crate::msg::{Notice, NoticeKind, Source};
-use crate::time::{self, MonoTime, NS_PER_S};
+use windhover_base::msg::{Notice, NoticeKind, Source};
+use windhover_base::time::{self, MonoTime, NS_PER_S};
 
 use super::latencies::OfFlight;
 

@@ -7,13 +7,13 @@ use prost::Message;
 use prost_types::Timestamp;
 
 use crate::config::Config;
-use crate::geo::Geodetic;
 use crate::io::capture::{CaptureReader, attached_config};
 use crate::io::mcap_read::{RawMessage, ReadError};
 use crate::io::proto::{foxglove as fox, host_time, windhover as wh};
 use crate::io::records::topic;
-use crate::msg::{EventBody, FramePayload, Source};
-use crate::time::{MonoTime, UtcTime};
+use windhover_base::geo::Geodetic;
+use windhover_base::msg::{EventBody, FramePayload, Source};
+use windhover_base::time::{MonoTime, UtcTime};
 
 /// What was estimated of one target.
 #[derive(Clone, Debug, Default)]

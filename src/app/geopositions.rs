@@ -6,9 +6,10 @@ use nalgebra::Vector3;
 use super::flight::Flight;
 use super::recording::recording;
 use super::truth::Truth;
-use crate::config::{Config, MarkerConfig};
-use crate::geo::{Geodetic, Ground, LocalFrame, Tilt, locate, rot_z};
-use crate::msg::{AttitudeSample, GnssEpoch, MarkerDetection, MarkerId, Stamped};
+use crate::config::Config;
+use windhover_base::geo::{Geodetic, Ground, LocalFrame, Tilt, locate, rot_z};
+use windhover_base::msg::{AttitudeSample, GnssEpoch, MarkerDetection, MarkerId, Stamped};
+use windhover_base::settings::MarkerConfig;
 
 /// Farthest slant used, metres.
 const LIMIT_M: f64 = 500.0;

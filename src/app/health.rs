@@ -4,8 +4,8 @@ use tracing::Level;
 
 use crate::config::Config;
 use crate::io::records::DaemonFigures;
-use crate::msg::{FixKind, Health, Source, SourceHealth, TargetHealth, TrackStatus};
-use crate::time::Span;
+use windhover_base::msg::{FixKind, Health, Source, SourceHealth, TargetHealth, TrackStatus};
+use windhover_base::time::Span;
 
 use super::callsite::RuntimeCallsite;
 use super::events::{OperatorEvent, TARGET};
@@ -219,7 +219,7 @@ fn fields(health: &Health, targets: &[String], figures: Option<&Figures>) -> Fie
 mod tests {
     use super::*;
     use crate::app::log::tests::lines_of;
-    use crate::msg::{TargetEstimate, TargetState};
+    use windhover_base::msg::{TargetEstimate, TargetState};
 
     #[test]
     fn the_flight_gets_what_the_line_tells() {

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use crate::io::capture::CaptureWriter;
 use crate::io::import::{Frames, ImportError, VideoSource, open_video, read_serial_log};
 use crate::io::mcap_write::WriteError;
-use crate::msg::{Event, EventBody, FramePayload, Source};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{Event, EventBody, FramePayload, Source};
+use windhover_base::time::{MonoTime, Span};
 
 /// What to import.
 #[derive(Clone, PartialEq, Debug, Default)]

@@ -4,8 +4,8 @@ use std::collections::VecDeque;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use crate::msg::{Event, EventBody, FramePayload, PerSource, Source};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{Event, EventBody, FramePayload, PerSource, Source};
+use windhover_base::time::{MonoTime, Span};
 
 /// Reads of the serial lines that wait: more than ten seconds' worth. A pipeline that is further
 /// behind than this does not answer, and the watchdog has it started again.
@@ -158,7 +158,7 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
-    use crate::msg::FrameEncoding;
+    use windhover_base::msg::FrameEncoding;
 
     fn at(ms: i64) -> MonoTime {
         MonoTime::from_ns(ms * 1_000_000)

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use crate::time::Span;
+use windhover_base::time::Span;
 
 /// Ten seconds at thirty frames a second.
 const KEPT: usize = 300;

@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use crate::config::Config;
 use crate::io::records::{DaemonFigures, Record, Recorder};
-use crate::msg::{Event, GnssEpoch, MarkerDetection, Output, Stamped};
-use crate::time::{MonoTime, UtcTime};
+use windhover_base::msg::{Event, GnssEpoch, MarkerDetection, Output, Stamped};
+use windhover_base::time::{MonoTime, UtcTime};
 
 use super::card::Slot;
 use super::downlink::Downlink;

@@ -4,12 +4,12 @@ use nalgebra::{Matrix2, Vector2, Vector3};
 use prost_types::Timestamp;
 
 use super::flight::Flight;
-use crate::calibrate::boresight::Recording;
-use crate::config::TagFamily;
-use crate::geo::Tilt;
 use crate::io::proto::{host_time, windhover as wh};
-use crate::msg::{AttitudeSample, FixKind, GnssEpoch, MarkerDetection, MarkerId, Stamped};
-use crate::time::UtcTime;
+use windhover_base::geo::Tilt;
+use windhover_base::msg::TagFamily;
+use windhover_base::msg::{AttitudeSample, FixKind, GnssEpoch, MarkerDetection, MarkerId, Stamped};
+use windhover_base::time::UtcTime;
+use windhover_calibrate::boresight::Recording;
 
 /// The raw measurements of a flight, stamped with their times of validity.
 pub fn recording(flight: &Flight) -> Recording {

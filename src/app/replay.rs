@@ -12,10 +12,10 @@ use crate::io::clock::HostClock;
 use crate::io::mcap_read::ReadError;
 use crate::io::mcap_write::{McapWriter, WriteError};
 use crate::io::records::{Recorder, topic};
-use crate::msg::{Event, EventBody, Output};
 use crate::pipeline::{Pipeline, Ticks};
 use crate::pixels::{self, DecodedFrame, FrameFault};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{Event, EventBody, Output};
+use windhover_base::time::{MonoTime, Span};
 
 /// Events read and frames decoded ahead of the pipeline.
 const AHEAD: usize = 16;

@@ -6,7 +6,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use crate::io::clock::HostClock;
-use crate::time::{MonoTime, Span};
+use windhover_base::time::{MonoTime, Span};
 
 /// What happens when a task cannot go on.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]

@@ -13,8 +13,8 @@ use crate::io::process;
 use crate::io::proto::{host_time, windhover};
 use crate::io::records::warm;
 use crate::io::store::{Recording, StoreHandle};
-use crate::msg::WarmState;
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::WarmState;
+use windhover_base::time::{MonoTime, Span};
 
 /// Its name among the store's last known states.
 const STATE: &str = "warm";
@@ -150,7 +150,7 @@ mod tests {
     use crate::config::StoreConfig;
     use crate::io::store::Store;
     use crate::io::store::volume::Volume;
-    use crate::msg::{WarmArrival, WarmSite};
+    use windhover_base::msg::{WarmArrival, WarmSite};
 
     fn origin() -> Origin {
         Origin { boot_id: Some("b".into()), host_from_monotonic: Span::from_s(1000.0), config_crc: 7 }

@@ -15,8 +15,8 @@ use crate::io::notify::ServiceManager;
 use crate::io::power::{PowerReader, PowerState, PowerWatch};
 use crate::io::power_line::PowerLine;
 use crate::io::process;
-use crate::msg::Source;
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::Source;
+use windhover_base::time::{MonoTime, Span};
 
 /// Everything the health task keeps.
 pub(super) struct Watch {

@@ -7,10 +7,12 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::{CliError, CliResult};
-use crate::config::CompassFormat;
-use crate::decode::{CompassDecoder, CompassReading, DecodeCounts, GnssDecoder, HeardAttitude, HeardEpoch};
-use crate::msg::{FixKind, GnssEpoch};
-use crate::time::{MonoTime, NS_PER_S, UtcTime};
+use windhover_base::msg::{FixKind, GnssEpoch};
+use windhover_base::settings::CompassFormat;
+use windhover_base::time::{MonoTime, NS_PER_S, UtcTime};
+use windhover_decode::{
+    CompassDecoder, CompassReading, DecodeCounts, GnssDecoder, HeardAttitude, HeardEpoch,
+};
 
 /// Decode a raw serial log: what the receiver or compass said, and what was refused.
 ///

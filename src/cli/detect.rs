@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use serde_json::{Value, json};
 
 use super::{CliError, CliResult};
-use crate::config::TagFamily;
-use crate::detect::{LARGEST_IMAGE_PX, TagDetector};
 use crate::io::clock::HostClock;
-use crate::msg::{GrayImage, MarkerDetection, MarkerId};
+use windhover_base::msg::TagFamily;
+use windhover_base::msg::{GrayImage, MarkerDetection, MarkerId};
+use windhover_detect::{LARGEST_IMAGE_PX, TagDetector};
 
 /// Find markers in images.
 #[derive(clap::Args, Debug)]

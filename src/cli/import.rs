@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use super::{CliError, CliResult};
 use crate::app::{config_file, import};
 use crate::io::import::parse_time;
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// Make a capture of recordings you already have: serial logs with a time a line, and a video.
 #[derive(clap::Args, Debug)]

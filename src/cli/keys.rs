@@ -6,7 +6,7 @@ use clap::{Args as ClapArgs, Subcommand};
 
 use super::{CliError, CliResult};
 use crate::io::link::keys::{Authority, Role};
-use crate::time::{NS_PER_S, UtcTime};
+use windhover_base::time::{NS_PER_S, UtcTime};
 
 /// Make the certificates with which payloads and ground stations know each other.
 ///

@@ -8,10 +8,10 @@ use super::{CliError, CliResult};
 use crate::app::flight::Flight;
 use crate::app::truth::Truth;
 use crate::app::{config_file, declination, geopositions};
-use crate::calibrate::montecarlo::{Analysis, Setup, radii};
-use crate::calibrate::{Overlay, scatter_svg};
 use crate::config::Config;
 use crate::plot;
+use crate::plot::montecarlo::{Overlay, scatter_svg};
+use windhover_calibrate::montecarlo::{Analysis, Setup, radii};
 
 /// The configuration shipped with the program: the paper's camera.
 const SHIPPED: &str = include_str!("../../config/windhover.toml");
@@ -59,7 +59,7 @@ pub(super) fn run(args: &Args) -> CliResult {
         (None, None) => Config::parse(SHIPPED).map_err(CliError::config)?,
     };
     let overlay = overlay(args, flight.as_ref(), &config)?;
-    let setup = Setup::from_config(&config);
+    let setup = Setup::new(&config.montecarlo, &config.camera);
     let analysis = setup
         .run(args.samples as usize, args.seed)
         .map_err(|e| CliError::config(format!("[montecarlo] pose and pixel: {e}")))?;

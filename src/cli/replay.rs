@@ -10,7 +10,7 @@ use crate::app::health::HealthLine;
 use crate::app::replay::{self, ReplayError, Step};
 use crate::app::{config_file, events, log};
 use crate::io::clock::HostClock;
-use crate::msg::Output;
+use windhover_base::msg::Output;
 
 /// Run a recorded capture or flight through the pipeline that flies: the same bytes and frames give
 /// the same estimates.

@@ -6,9 +6,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::{CliError, CliResult};
+use crate::config::Config;
 use crate::io::capture::CaptureWriter;
-use crate::msg::EventBody;
-use crate::simulate::{Flight, FrameStorage, FrameTruth, Scenario, World, truth};
+use crate::jpeg;
+use windhover_base::msg::{EventBody, GrayImage};
+use windhover_simulate::{Flight, FrameStorage, FrameTruth, Scenario, World, truth};
 
 /// Make a capture of a simulated flight, with the truth beside it.
 ///
@@ -67,7 +69,9 @@ pub(super) fn run(args: &Args) -> CliResult {
     }
     let out = args.out.as_deref().ok_or_else(|| CliError::usage("say which capture to write"))?;
     let scenario = scenario(args)?;
-    let storage = if args.lossless { FrameStorage::Raw } else { FrameStorage::Jpeg(args.quality) };
+    let quality = args.quality;
+    let encode = move |image: &GrayImage| jpeg::encode_grey(image, quality).map_err(|e| e.to_string());
+    let storage = if args.lossless { FrameStorage::Raw } else { FrameStorage::Jpeg(Arc::new(encode)) };
     write_flight(scenario, args.seed, storage, out)
 }
 
@@ -92,10 +96,17 @@ fn scenario(args: &Args) -> Result<Scenario, CliError> {
         scenario.duration_s = duration_s;
     }
     if let Some(fps) = args.fps {
-        scenario.config.camera.fps = fps;
+        scenario.rig.camera.fps = fps;
     }
-    scenario.config.check().map_err(|e| CliError::usage(format!("this flight cannot be configured: {e}")))?;
+    config_of(&scenario)
+        .check()
+        .map_err(|e| CliError::usage(format!("this flight cannot be configured: {e}")))?;
     Ok(scenario)
+}
+
+/// The configuration that a daemon would fly with.
+fn config_of(scenario: &Scenario) -> Config {
+    Config::of_rig(scenario.rig.clone(), scenario.ground())
 }
 
 /// `flight.mcap` → `flight.SUFFIX.csv`.
@@ -110,7 +121,7 @@ struct TruthFiles {
 impl TruthFiles {
     /// One file for each vehicle, then the helicopter's.
     fn create(out: &Path, world: &World) -> Result<Self, CliError> {
-        let targets = world.scenario().config.target.iter().enumerate();
+        let targets = world.scenario().rig.target.iter().enumerate();
         let mut headed: Vec<(PathBuf, String)> = targets
             .map(|(i, target)| {
                 let suffix = if i == 0 { "truth".into() } else { format!("truth_{}", target.name) };
@@ -153,9 +164,9 @@ fn cannot_write(path: &Path, error: &std::io::Error) -> CliError {
 
 fn write_flight(scenario: Scenario, seed: u64, storage: FrameStorage, out: &Path) -> CliResult {
     let name = scenario.name.clone();
-    let frames = (scenario.duration_s * scenario.config.camera.fps).round() as u64;
+    let frames = (scenario.duration_s * scenario.rig.camera.fps).round() as u64;
     let world = Arc::new(World::new(scenario, seed));
-    let config = world.scenario().config.to_toml().map_err(CliError::config)?;
+    let config = config_of(world.scenario()).to_toml().map_err(CliError::config)?;
     let mut writer = CaptureWriter::create(out, &config, world.scenario().start).map_err(CliError::failed)?;
     let mut truths = TruthFiles::create(out, &world)?;
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
@@ -181,4 +192,17 @@ fn write_flight(scenario: Scenario, seed: u64, storage: FrameStorage, out: &Path
     let written = bar.position();
     eprintln!("{}: {name}, seed {seed}, {written} frames; truth in {}", out.display(), beside.join(", "));
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_named_scenario_can_be_flown() {
+        for (name, _) in Scenario::names() {
+            let scenario = Scenario::named(name).expect("it is listed");
+            config_of(&scenario).check().unwrap_or_else(|e| panic!("{name}: {e}"));
+        }
+    }
 }

@@ -1,6 +1,8 @@
 //! What a configuration must satisfy beyond its syntax.
 
-use super::{Config, GroundConfig, MarkerConfig, MarkerKind, TargetConfig, TargetModel};
+use windhover_base::settings::{GroundConfig, MarkerConfig, MarkerKind, TargetConfig, TargetModel};
+
+use super::Config;
 
 /// What is wrong with a configuration.
 #[derive(Clone, PartialEq, Debug, thiserror::Error)]

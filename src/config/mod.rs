@@ -5,28 +5,21 @@
 
 mod check;
 mod daemon;
-mod estimator;
 mod link;
 mod log;
-mod montecarlo;
-mod sensors;
 mod store;
-mod target;
 
 pub use check::ConfigError;
 pub use daemon::{DaemonConfig, GoingLine, Part, PowerConfig};
-pub use estimator::{DetectorConfig, EstimatorConfig};
 pub use link::{LinkConfig, MavlinkConfig};
 pub use log::{LogConfig, LogFormat, LogLevel};
-pub use montecarlo::{Distribution, MonteCarloConfig};
-pub use sensors::{
-    CameraConfig, CameraMount, CompassConfig, CompassFormat, Datum, Declination, GpsConfig, GroundConfig,
-    GroundSource, PixelFormat,
-};
 pub use store::{FramePolicy, StoreConfig};
-pub use target::{Brightness, MarkerConfig, MarkerKind, TagFamily, TargetConfig, TargetModel};
 
 use serde::{Deserialize, Serialize};
+use windhover_base::settings::{
+    CameraConfig, CompassConfig, Datum, DetectorConfig, EstimatorConfig, GpsConfig, GroundConfig,
+    MonteCarloConfig, Rig, TargetConfig,
+};
 
 /// The whole configuration. Unknown keys are errors everywhere.
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
@@ -75,6 +68,45 @@ pub struct Config {
 }
 
 impl Config {
+    /// The configuration of a rig over known ground, with every other section at its default.
+    pub fn of_rig(rig: Rig, ground: GroundConfig) -> Self {
+        let Rig { gps, compass, camera, target } = rig;
+        Self {
+            gps,
+            compass,
+            camera,
+            ground,
+            datum: None,
+            target,
+            detector: DetectorConfig::default(),
+            estimator: EstimatorConfig::default(),
+            store: StoreConfig::default(),
+            link: LinkConfig::default(),
+            mavlink: MavlinkConfig::default(),
+            log: LogConfig::default(),
+            daemon: DaemonConfig::default(),
+            power: PowerConfig::default(),
+            montecarlo: MonteCarloConfig::default(),
+        }
+    }
+
+    /// The filter's section. No more features are in use at once than the detector follows: without any
+    /// the filter has no states of them.
+    pub fn filter(&self) -> EstimatorConfig {
+        let features = self.estimator.features.min(self.detector.ground_features);
+        EstimatorConfig { features, ..self.estimator.clone() }
+    }
+
+    /// The instruments and the targets.
+    pub fn rig(&self) -> Rig {
+        Rig {
+            gps: self.gps.clone(),
+            compass: self.compass.clone(),
+            camera: self.camera.clone(),
+            target: self.target.clone(),
+        }
+    }
+
     /// Parses and checks a configuration. The error names line and key where it can.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let config: Self = toml::from_str(text).map_err(|e| ConfigError::syntax(&e, text))?;

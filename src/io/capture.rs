@@ -12,8 +12,8 @@ use super::mcap_read::{self, McapReader, RawMessage, ReadError};
 use super::mcap_write::{CONFIG_ATTACHMENT, McapWriter, WriteError};
 use super::proto::{foxglove, host_time, windhover};
 use super::records::{self, FRAME_NUMBER_KEY, IN_SEQUENCE, topic, warm};
-use crate::msg::{Delivery, Event, EventBody, FrameEncoding, FramePayload, Source};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{Delivery, Event, EventBody, FrameEncoding, FramePayload, Source};
+use windhover_base::time::{MonoTime, Span};
 
 /// Messages are put in order of their log time over this span: writers of several threads do not
 /// keep it exactly.

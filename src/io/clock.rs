@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use rustix::time::{ClockId, Timespec, clock_gettime};
 
-use crate::time::{MonoTime, NS_PER_S, Span};
+use windhover_base::time::{MonoTime, NS_PER_S, Span};
 
 /// Host time of this process. Copies share the same constant, so their times compare.
 ///

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use crate::msg::FramePayload;
-use crate::time::MonoTime;
+use windhover_base::msg::FramePayload;
+use windhover_base::time::MonoTime;
 
 /// Asks threads to end. Copies are the same switch.
 #[derive(Clone, Debug, Default)]

@@ -16,7 +16,7 @@ use mcap::records::{Record as McapRecord, op};
 
 use super::mcap_definitions::{ChannelInfo, Definitions};
 use super::mcap_record::{RECORD_HEAD, longest, parse, sized_u32, split, unpack_chunk};
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// Longest attachment that is read: a configuration, not a film.
 const MAX_ATTACHMENT: u64 = 1 << 24;

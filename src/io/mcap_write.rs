@@ -11,7 +11,7 @@ use mcap::{Attachment, Compression, WriteOptions};
 
 use super::mcap_definitions::{ChannelInfo, SchemaInfo};
 use super::records::Record;
-use crate::time::{MonoTime, Span};
+use windhover_base::time::{MonoTime, Span};
 
 /// Name of the configuration's attachment.
 pub const CONFIG_ATTACHMENT: &str = "config.toml";

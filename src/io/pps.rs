@@ -8,7 +8,7 @@ use rustix::ioctl::{Ioctl, IoctlOutput, Opcode, ioctl, opcode};
 
 use super::clock::HostClock;
 use super::device::{Backoff, Fault, FaultKind, Report, Stop};
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// `struct pps_ktime` of linux/pps.h.
 #[repr(C)]

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use tiff::decoder::{Decoder, DecodingResult, Limits};
 use tiff::tags::Tag;
 
-use crate::geo::{TerrainError, Tile};
+use windhover_base::geo::{TerrainError, Tile};
 
 /// GDAL's tag for the value of missing heights, as text (GDAL, GeoTIFF driver).
 const GDAL_NODATA: Tag = Tag::Unknown(42_113);

@@ -1,6 +1,7 @@
 //! Pictures made into JPEG, colour formats of cameras as they stand: chroma is neither invented nor lost.
 
 use turbojpeg::{Compressor, Image, PixelFormat, Subsamp, YuvImage};
+use windhover_base::msg::GrayImage;
 
 /// What the bytes of a picture are, row after row without gaps.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -112,6 +113,14 @@ pub fn encode(
     };
     compressor.set_subsamp(if layout == Layout::Grey { Subsamp::Gray } else { Subsamp::None })?;
     Ok(compressor.compress_to_vec(Image { pixels, width, pitch: width * channels, height, format })?)
+}
+
+/// A grey image as baseline JPEG of `quality` 1 to 100 percent.
+///
+/// # Errors
+/// Those of [`encode`].
+pub fn encode_grey(image: &GrayImage, quality: u8) -> Result<Vec<u8>, JpegError> {
+    encode(&image.data, Layout::Grey, (image.width, image.height), quality)
 }
 
 #[cfg(test)]

@@ -1,9 +1,9 @@
 //! The two serial lines: bytes in, stamped measurements out.
 
 use crate::config::Config;
-use crate::decode::{CompassDecoder, DecodeCounts, GnssDecoder, HeardAttitude, HeardEpoch};
-use crate::msg::{AttitudeSample, GnssEpoch, Stamped, WarmArrival};
-use crate::time::{GnssClock, MonoTime, Span, SteadyClock};
+use windhover_base::msg::{AttitudeSample, GnssEpoch, Stamped, WarmArrival};
+use windhover_base::time::{GnssClock, MonoTime, Span, SteadyClock};
+use windhover_decode::{CompassDecoder, DecodeCounts, GnssDecoder, HeardAttitude, HeardEpoch};
 
 /// Arrivals kept for a warm start: the jitter of a 5 Hz receiver over 10 s.
 const WARM_ARRIVALS: usize = 50;

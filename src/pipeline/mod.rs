@@ -13,20 +13,21 @@ pub use ticks::{TICK, Ticks};
 
 use std::sync::Arc;
 
-use crate::config::{Config, MarkerKind};
-use crate::detect::FrameDetector;
-use crate::estimate::{Estimator, EstimatorOutput, PaperEstimator};
-use crate::geo::{Geodetic, Tile};
-use crate::msg::{
+use crate::config::Config;
+use crate::pixels::{self, DecodedFrame, FrameFault};
+use lines::{CompassLine, GpsLine};
+use monitor::{Monitor, notice};
+use site::SiteFinder;
+use windhover_base::geo::{Geodetic, Tile};
+use windhover_base::msg::{
     AttitudeSample, Event, EventBody, FrameObservations, FramePayload, FramePrediction, GnssEpoch,
     MarkerDetection, MarkerId, NoticeKind, Output, Source, Stamped, TargetEstimate, TrackStatus, WarmFilter,
     WarmSite, WarmState,
 };
-use crate::pixels::{self, DecodedFrame, FrameFault};
-use crate::time::{MonoTime, Span};
-use lines::{CompassLine, GpsLine};
-use monitor::{Monitor, notice};
-use site::SiteFinder;
+use windhover_base::settings::MarkerKind;
+use windhover_base::time::{MonoTime, Span};
+use windhover_detect::FrameDetector;
+use windhover_estimate::{Estimator, EstimatorOutput, PaperEstimator};
 
 /// Events in, outputs out.
 pub struct Pipeline {
@@ -69,7 +70,7 @@ impl Pipeline {
             want_rgb: wants_rgb(config),
             gps: GpsLine::new(config),
             compass: CompassLine::new(config),
-            detector: FrameDetector::new(config),
+            detector: FrameDetector::new(&config.detector, &config.target, &config.camera.intrinsics),
             observations: FrameObservations::default(),
             prediction: FramePrediction::default(),
             finder: SiteFinder::new(terrain),
@@ -202,11 +203,12 @@ impl Pipeline {
         );
         out.push(notice(t, NoticeKind::DatumSet, Some(Source::Gps), words));
         out.push(Output::Datum(t, datum));
-        let mut joint = Estimator::new(&self.config, &settled.site);
+        let (rig, filter) = (self.config.rig(), self.config.filter());
+        let mut joint = Estimator::new(&rig, &filter, &settled.site);
         if let Some(warm) = self.warm.take().filter(|_| settled.continued) {
             joint.resume(warm);
         }
-        let paper = PaperEstimator::new(&self.config, &settled.site);
+        let paper = PaperEstimator::new(&rig, &filter, &settled.site);
         self.estimators = Some(Estimators { joint, paper, site: settled.warm });
     }
 

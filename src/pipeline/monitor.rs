@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 
 use crate::config::Config;
-use crate::msg::{
+use windhover_base::msg::{
     Disposition, FixKind, Health, Notice, NoticeKind, Output, PerSource, Source, SourceHealth,
     TargetEstimate, TargetHealth, TrackStatus,
 };
-use crate::time::{MonoTime, Span};
+use windhover_base::time::{MonoTime, Span};
 
 /// Health is told this often.
 const HEALTH_PERIOD: Span = Span::from_ns(1_000_000_000);

@@ -2,10 +2,11 @@
 
 use std::sync::Arc;
 
-use crate::config::{Config, Declination, GroundSource};
-use crate::estimate::Site;
-use crate::geo::{self, Geodetic, Ground, LocalFrame, Terrain, Tile};
-use crate::msg::{FixKind, GnssEpoch, WarmSite};
+use crate::config::Config;
+use windhover_base::geo::{self, Geodetic, Ground, LocalFrame, Terrain, Tile};
+use windhover_base::msg::{FixKind, GnssEpoch, WarmSite};
+use windhover_base::settings::{Declination, GroundSource};
+use windhover_estimate::Site;
 
 /// Fixes whose median height is the ground where the ground is where the aircraft took off.
 const TAKEOFF_FIXES: usize = 5;
@@ -164,8 +165,10 @@ mod tests {
         // Given a datum 10 km away, where the tangent plane stands 8 m above the ground.
         let text = include_str!("../../config/windhover.toml");
         let mut config = Config::parse(text).expect("the shipped configuration");
-        config.datum = Some(crate::config::Datum { lat_deg: 30.0, lon_deg: -85.5, height_m: 20.0 });
-        config.ground = crate::config::GroundConfig { elevation_msl_m: Some(33.0), ..config.ground };
+        config.datum =
+            Some(windhover_base::settings::Datum { lat_deg: 30.0, lon_deg: -85.5, height_m: 20.0 });
+        config.ground =
+            windhover_base::settings::GroundConfig { elevation_msl_m: Some(33.0), ..config.ground };
         let epoch = GnssEpoch {
             fix: FixKind::ThreeD,
             lat_deg: Some(30.07),

@@ -1,6 +1,6 @@
 //! When time passes: the instants at which the pipeline is told so, live and in replay alike.
 
-use crate::time::{MonoTime, Span};
+use windhover_base::time::{MonoTime, Span};
 
 /// Time between two ticks.
 pub const TICK: Span = Span::from_ns(100_000_000);

@@ -7,7 +7,7 @@ use zune_core::colorspace::ColorSpace;
 use zune_core::options::DecoderOptions;
 use zune_jpeg::JpegDecoder;
 
-use crate::msg::{FrameEncoding, FramePayload, GrayImage, RgbImage};
+use windhover_base::msg::{FrameEncoding, FramePayload, GrayImage, RgbImage};
 
 /// A frame in memory.
 #[derive(Clone, PartialEq, Debug, Default)]
@@ -216,7 +216,7 @@ fn yuv(y: u8, cb: u8, cr: u8) -> [u8; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::time::MonoTime;
+    use windhover_base::time::MonoTime;
 
     fn payload(encoding: FrameEncoding, width: u32, height: u32, stride: u32, data: Vec<u8>) -> FramePayload {
         let t_exposure = MonoTime::default();

@@ -5,6 +5,8 @@
 
 mod chart;
 mod geometry;
+pub mod intrinsics;
+pub mod montecarlo;
 mod scale;
 mod style;
 

@@ -1,6 +1,6 @@
 //! What several tests make up alike.
 
-use windhover::config::{Brightness, MarkerConfig, MarkerKind};
+use windhover_base::settings::{Brightness, MarkerConfig, MarkerKind};
 
 /// A disc half a metre above the ground and `ahead_m` before the rear axle: light, dark, or where neither is said,
 /// red.

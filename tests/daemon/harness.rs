@@ -16,8 +16,8 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use tempfile::TempDir;
 use windhover::io::capture::CaptureReader;
 use windhover::io::clock::HostClock;
-use windhover::msg::{Event, EventBody};
-use windhover::time::Span;
+use windhover_base::msg::{Event, EventBody};
+use windhover_base::time::Span;
 
 /// Longest a test waits for anything: what a machine with all its processors taken needs many times over.
 /// Nothing is asserted of how long things take.

@@ -3,13 +3,13 @@
 use std::path::Path;
 
 use rustix::process::Signal;
-use windhover::config::TagFamily;
-use windhover::detect::tag_pattern;
 use windhover::io::mcap_read::{McapReader, RawMessage};
 use windhover::io::proto::{host_time, windhover as wh};
 use windhover::io::records::topic;
 use windhover::io::store::index::{INDEX, Index};
-use windhover::time::Span;
+use windhover_base::msg::TagFamily;
+use windhover_base::time::Span;
+use windhover_detect::tag_pattern;
 
 use super::harness::{Bench, Feeder};
 

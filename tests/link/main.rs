@@ -13,7 +13,7 @@ use relay::{Radio, Relay};
 use team::{Keys, Payload, Station, any, card, loopback, payload_settings, record, station_settings, within};
 use windhover::io::link::keys::Role;
 use windhover::io::link::{Backlog, EarlyRecords, LinkEvent};
-use windhover::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 

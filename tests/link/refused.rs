@@ -6,7 +6,7 @@ use tokio::net::UdpSocket;
 use windhover::io::link::LinkEvent;
 use windhover::io::link::keys::Role;
 use windhover::io::link::tls::KeyFiles;
-use windhover::time::UtcTime;
+use windhover_base::time::UtcTime;
 
 use crate::team::{
     Keys, Log, MADE, Payload, Station, any, loopback, payload_settings, station_settings, within,

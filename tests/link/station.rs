@@ -10,7 +10,7 @@ use windhover::app::ground::{self, GroundSettings, mirror};
 use windhover::io::link::keys::Role;
 use windhover::io::proto::{timestamp, windhover as wh};
 use windhover::io::records::{Record, Schema};
-use windhover::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 use crate::team::{Keys, Payload, loopback, payload_settings, station_settings};
 

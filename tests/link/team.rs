@@ -15,7 +15,7 @@ use windhover::io::link::{
     StationHandle, StationLink, StationSettings,
 };
 use windhover::io::records::{Record, Schema};
-use windhover::time::{MonoTime, UtcTime};
+use windhover_base::time::{MonoTime, UtcTime};
 
 /// 2026-11-19T00:00:00Z: when the tests' certificates are made.
 pub const MADE: UtcTime = UtcTime::from_unix_ns(1_795_046_400_000_000_000);

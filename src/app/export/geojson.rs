@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use super::tracks::{self, Point};
 use super::{ExportError, Exported, write_error};
 use crate::io::mcap_read::McapReader;
-use crate::time::{Span, UtcTime};
+use windhover_base::time::{Span, UtcTime};
 
 /// Positions are written this far apart; the line has them all.
 const POINT_PERIOD: Span = Span::from_ns(1_000_000_000);

@@ -6,7 +6,7 @@ use std::path::Path;
 use super::tracks::{self, Point};
 use super::{ExportError, Exported, write_error};
 use crate::io::mcap_read::McapReader;
-use crate::time::UtcTime;
+use windhover_base::time::UtcTime;
 
 pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, ExportError> {
     let tracks = tracks::read(&mut reader);

@@ -8,7 +8,7 @@ use crate::io::mcap_read::McapReader;
 use crate::io::proto::windhover::{Ownship, TargetState};
 use crate::io::proto::{host_time, windhover::TrackStatus};
 use crate::io::records::topic;
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// One position of a track.
 #[derive(Clone, Copy, PartialEq, Debug)]

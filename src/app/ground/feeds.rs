@@ -125,7 +125,7 @@ pub fn nmea(vehicle: &Vehicle) -> String {
 mod tests {
     use super::*;
     use crate::io::proto::{timestamp, windhover as wh};
-    use crate::time::MonoTime;
+    use windhover_base::time::MonoTime;
 
     fn vehicle() -> Vehicle {
         let t = MonoTime::from_ns(1_795_046_445_250_000_000);

@@ -19,7 +19,7 @@ use zenoh::time::{NTP64, Timestamp, TimestampId};
 
 use super::history;
 use crate::io::link::Arrival;
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// Where a station listens when told nothing else.
 pub const LOOPBACK: &str = "tcp/127.0.0.1:7447";

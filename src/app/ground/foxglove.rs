@@ -27,7 +27,7 @@ use super::web::{query_token, same};
 use crate::io::link::{Arrival, Class, downlink_class};
 use crate::io::proto::link::Thumbnail;
 use crate::io::proto::{foxglove as fox, schema_of_package, timestamp, windhover as wh};
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// Names of the protocol that clients ask for.
 const PROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];

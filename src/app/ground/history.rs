@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::mirror::{RUN_FILE, messages};
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// A record out of the files.
 #[derive(Clone, PartialEq, Debug)]

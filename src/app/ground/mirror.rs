@@ -14,7 +14,7 @@ use mcap::{Compression, WriteOptions};
 use crate::io::link::{Arrival, Channel, RangeSet};
 use crate::io::mcap_read::{McapReader, RawMessage};
 use crate::io::proto::schema_of_package;
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// File in a flight's directory that tells which run it is of.
 pub(super) const RUN_FILE: &str = "run";

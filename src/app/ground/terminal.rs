@@ -6,7 +6,7 @@ use std::io::{self, Write};
 
 use crate::app::log::{Queue, QueueEnd, Stream, queue};
 use crate::io::clock::HostClock;
-use crate::time::Span;
+use windhover_base::time::Span;
 
 /// Begins a message whose lines stand for those of the last that began so.
 const STATUS: u8 = b'\r';

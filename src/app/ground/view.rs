@@ -6,10 +6,10 @@ use std::sync::Arc;
 use prost::Message as _;
 use serde_json::{Value, json};
 
-use crate::geo::euler_321;
 use crate::io::link::{Arrival, PayloadStatus};
 use crate::io::proto::{foxglove, host_time, link::Thumbnail, windhover as wh};
-use crate::time::{MonoTime, NS_PER_S};
+use windhover_base::geo::euler_321;
+use windhover_base::time::{MonoTime, NS_PER_S};
 
 /// Estimates kept for pages opened later: ten minutes at 15 Hz.
 const TRAIL: usize = 9_000;
@@ -318,7 +318,7 @@ impl Payload {
 /// UTC of a host time as `hhmmss.ss` and `ddmmyy`: host time is close to UTC where the payload's clock was
 /// set.
 pub fn nmea_time(t: MonoTime) -> (String, String) {
-    let civil = crate::time::UtcTime::from_unix_ns(t.ns()).civil();
+    let civil = windhover_base::time::UtcTime::from_unix_ns(t.ns()).civil();
     let hundredths = i64::from(civil.nanosecond) / (NS_PER_S / 100);
     (
         format!("{:02}{:02}{:02}.{hundredths:02}", civil.hour, civil.minute, civil.second),

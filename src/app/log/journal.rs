@@ -85,7 +85,7 @@ fn put(out: &mut Vec<u8>, name: &str, value: &str) {
 mod tests {
     use super::super::line::Value;
     use super::*;
-    use crate::time::MonoTime;
+    use windhover_base::time::MonoTime;
 
     #[test]
     fn fields_are_framed() {

@@ -13,7 +13,7 @@ use super::throttle;
 use crate::app::events::{self, OperatorEvent, TARGET};
 use crate::config::LogLevel;
 use crate::io::clock::HostClock;
-use crate::time::{MonoTime, UtcTime};
+use windhover_base::time::{MonoTime, UtcTime};
 
 /// The event's name of what libraries emit.
 const LIBRARY: &str = "library";

@@ -40,7 +40,7 @@ use self::throttle::Throttle;
 use super::events::{self, TARGET};
 use crate::config::{LogConfig, LogFormat, LogLevel};
 use crate::io::clock::HostClock;
-use crate::time::Span;
+use windhover_base::time::Span;
 
 /// Longest that the sinks get, twice, at the end to write what waits; one that takes longer is left behind. Together
 /// less than what tasks and card leave of the unit's `TimeoutStopSec`.
@@ -212,8 +212,8 @@ impl Log {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::msg::{Notice, NoticeKind};
-    use crate::time::MonoTime;
+    use windhover_base::msg::{Notice, NoticeKind};
+    use windhover_base::time::MonoTime;
 
     /// A writer whose text can be read.
     #[derive(Clone, Default)]
@@ -258,7 +258,7 @@ pub(super) mod tests {
                 events::notice(&Notice {
                     t: MonoTime::from_ns(1_795_014_245_501_000_000) + Span::from_s(f64::from(s)),
                     kind: NoticeKind::FrameUnusable,
-                    source: Some(crate::msg::Source::Camera),
+                    source: Some(windhover_base::msg::Source::Camera),
                     detail: "too short".into(),
                 });
             }

@@ -9,7 +9,7 @@ use std::time::Duration;
 use tracing_appender::non_blocking::{NonBlocking, NonBlockingBuilder, WorkerGuard};
 
 use crate::io::clock::HostClock;
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// Lines that wait to be written; one more is dropped and counted.
 const WAITING: usize = 512;
@@ -123,7 +123,7 @@ impl<W: Write> Write for Counted<W> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::time::Span;
+    use windhover_base::time::Span;
 
     #[test]
     fn a_pipe_that_nobody_reads_costs_its_own_lines_and_the_end_does_not_wait_for_it() {

@@ -11,7 +11,7 @@ use tracing_subscriber::layer::{Context, Layer};
 
 use crate::app::events::OperatorEvent;
 use crate::io::clock::HostClock;
-use crate::time::{MonoTime, Span};
+use windhover_base::time::{MonoTime, Span};
 
 /// What is throttled together: the same event about the same thing, for the same cause.
 #[derive(Clone, PartialEq, Eq, Hash, Debug)]

@@ -6,9 +6,9 @@ use super::page::{Section, figure, grid, paragraph, table};
 use super::{Context, cloud, line};
 use crate::app::flight::{Flight, Track};
 use crate::app::truth::Truth;
-use crate::geo::{Geodetic, LocalFrame, wrap_angle};
 use crate::io::proto::windhover as wh;
 use crate::plot::{Ink, Mark, thin};
+use windhover_base::geo::{Geodetic, LocalFrame, wrap_angle};
 
 /// The filter settles over this time; figures count from here, seconds.
 const SETTLING_S: f64 = 6.0;

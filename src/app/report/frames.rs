@@ -8,9 +8,9 @@ use crate::app::flight::{self, Flight};
 use crate::io::mcap_read::ReadError;
 use crate::io::proto::windhover as wh;
 use crate::jpeg::{self, Layout};
-use crate::msg::GrayImage;
 use crate::pixels::decode;
-use crate::time::MonoTime;
+use windhover_base::msg::GrayImage;
+use windhover_base::time::MonoTime;
 
 /// Frames shown.
 const SHOWN: usize = 6;

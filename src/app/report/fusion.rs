@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use super::page::{Section, figure, grid, paragraph, table};
 use super::{Context, cloud};
 use crate::io::proto::windhover as wh;
-use crate::msg::{Disposition, FusionSource};
 use crate::plot::{Ink, Mark};
+use windhover_base::msg::{Disposition, FusionSource};
 
 /// Sources in the order of the page, with the unit and the scale their innovations are shown in.
 const SOURCES: [(FusionSource, &str, f64); 6] = [

@@ -5,9 +5,9 @@ use nalgebra::Matrix2;
 use super::accuracy::{covariance, is_held};
 use super::page::{Section, figure};
 use super::{Context, cloud, line};
-use crate::geo::Geodetic;
 use crate::io::proto::windhover as wh;
 use crate::plot::{Chart, Ink, Mark, ellipse};
+use windhover_base::geo::Geodetic;
 
 /// Ellipses drawn along a path.
 const ELLIPSES: usize = 10;

@@ -15,9 +15,9 @@ use std::path::Path;
 
 use super::flight::Flight;
 use super::truth::Truth;
-use crate::geo::{Geodetic, LocalFrame};
 use crate::io::mcap_read::ReadError;
 use crate::plot::{Chart, Ink, Mark, thin};
+use windhover_base::geo::{Geodetic, LocalFrame};
 
 pub use accuracy::{Errors, error_text, errors_of};
 

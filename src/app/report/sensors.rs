@@ -4,7 +4,7 @@ use super::page::{Section, figure, grid, table};
 use super::{Context, cloud, single};
 use crate::io::proto::host_time;
 use crate::plot::{Ink, Mark};
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// One stream of messages: when each was true and when it was heard.
 pub(super) struct Stream {

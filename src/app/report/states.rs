@@ -7,9 +7,9 @@ use super::page::{Section, figure, grid};
 use super::{Context, cloud, line, single};
 use crate::app::flight::Track;
 use crate::app::truth::TruthRow;
-use crate::geo::{euler_321, wrap_angle};
 use crate::io::proto::windhover as wh;
 use crate::plot::{Ink, Mark};
+use windhover_base::geo::{euler_321, wrap_angle};
 
 /// One quantity of a target.
 struct Quantity {

@@ -212,8 +212,11 @@ fn troubles(context: &Context<'_>, pictures: &Pictures) -> Vec<String> {
             found.push(format!("{name} was lost {breaks} times after it had been found."));
         }
     }
-    let resets =
-        flight.notices.iter().filter(|n| n.name == crate::msg::NoticeKind::FilterReset.name()).count();
+    let resets = flight
+        .notices
+        .iter()
+        .filter(|n| n.name == windhover_base::msg::NoticeKind::FilterReset.name())
+        .count();
     if resets > 0 {
         found.push(format!("The filter started again {resets} times."));
     }

@@ -4,9 +4,9 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use super::target::{Board, Target, TargetArgs};
-use crate::calibrate::TagGrid;
 use crate::cli::{CliError, CliResult};
-use crate::detect::tag_pattern;
+use windhover_calibrate::TagGrid;
+use windhover_detect::tag_pattern;
 
 /// Draw a calibration target to print, as SVG in real size: a chessboard, or a grid of tags.
 ///

@@ -8,11 +8,12 @@ use serde_json::json;
 
 use crate::app::flight::Flight;
 use crate::app::{config_file, declination, recording};
-use crate::calibrate::boresight::{Boresight, Finding, boresight};
 use crate::cli::{CliError, CliResult};
-use crate::config::{Config, TagFamily};
-use crate::geo::Geodetic;
-use crate::msg::MarkerId;
+use crate::config::Config;
+use windhover_base::geo::Geodetic;
+use windhover_base::msg::MarkerId;
+use windhover_base::msg::TagFamily;
+use windhover_calibrate::boresight::{Boresight, Finding, boresight};
 
 /// Calibrate how camera and compass are mounted and timed, from flights over markers at rest.
 ///
@@ -86,7 +87,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     let declination = declination::of_flight(&config, first)?;
     let recordings: Vec<_> = flights.iter().map(recording::recording).collect();
     let surveyed = surveyed_markers(args, &config);
-    let found = boresight(&config, declination, &recordings, &surveyed).map_err(CliError::failed)?;
+    let found = boresight(&config.rig(), declination, &recordings, &surveyed).map_err(CliError::failed)?;
     if args.json {
         println!("{}", as_json(&found));
     } else {

@@ -6,13 +6,12 @@ use nalgebra::Vector2;
 use serde_json::json;
 
 use super::target::{Board, Target, TargetArgs, positive};
-use crate::calibrate::intrinsics::{Intrinsics, PARAMETERS, Wanted, calibrate};
-use crate::calibrate::{
-    PlaneView, WINDOW_PX, coverage_advice, coverage_svg, find_corners, per_view_svg, residuals_svg,
-};
 use crate::cli::{CliError, CliResult};
-use crate::msg::GrayImage;
 use crate::plot;
+use crate::plot::intrinsics::{coverage_advice, coverage_svg, per_view_svg, residuals_svg};
+use windhover_base::msg::GrayImage;
+use windhover_calibrate::intrinsics::{Intrinsics, PARAMETERS, Wanted, calibrate};
+use windhover_calibrate::{PlaneView, WINDOW_PX, find_corners};
 
 /// Calibrate the lens from photographs of a printed chessboard or grid of tags.
 ///

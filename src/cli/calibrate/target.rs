@@ -2,9 +2,9 @@
 
 use std::str::FromStr;
 
-use crate::calibrate::TagGrid;
 use crate::cli::CliError;
-use crate::config::TagFamily;
+use windhover_base::msg::TagFamily;
+use windhover_calibrate::TagGrid;
 
 /// The calibration target.
 #[derive(clap::Args, Clone, Copy, Debug)]

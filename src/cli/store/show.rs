@@ -8,7 +8,7 @@ use crate::io::store::inspect::{self, Dropout};
 use crate::io::store::summary::TopicStats;
 use crate::io::store::volume::Volume;
 use crate::io::store::wear;
-use crate::time::UtcTime;
+use windhover_base::time::UtcTime;
 
 /// Silences shorter than this are not worth a line.
 const GAP_SHOWN_NS: u64 = 1_000_000_000;

@@ -1,7 +1,7 @@
 //! Pixel formats by their V4L2 names, and which of those offered is taken.
 
-use crate::config::PixelFormat;
-use crate::msg::FrameEncoding;
+use windhover_base::msg::FrameEncoding;
+use windhover_base::settings::PixelFormat;
 
 /// A four-character code of V4L2.
 pub(super) type FourCc = [u8; 4];

@@ -4,7 +4,7 @@ mod format;
 mod recorded;
 mod v4l2;
 
-use crate::config::PixelFormat;
+use windhover_base::settings::PixelFormat;
 
 use super::clock::HostClock;
 use super::device::{Backoff, Report, Stop};

@@ -10,8 +10,8 @@ use super::CameraSettings;
 use crate::io::capture::CaptureReader;
 use crate::io::clock::HostClock;
 use crate::io::device::{Fault, FaultKind, NAP, NoteKind, Report, Stop};
-use crate::msg::{EventBody, FrameEncoding, FramePayload};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{EventBody, FrameEncoding, FramePayload};
+use windhover_base::time::{MonoTime, Span};
 
 /// A recorded frame and when it was delivered, both on the recording's own clock.
 struct Recorded {
@@ -165,7 +165,7 @@ mod tests {
     use std::cell::RefCell;
 
     use super::*;
-    use crate::config::PixelFormat;
+    use windhover_base::settings::PixelFormat;
 
     #[test]
     fn a_folder_plays_at_its_own_pace() {

@@ -16,8 +16,8 @@ use super::CameraSettings;
 use super::format::{self, FourCc};
 use crate::io::clock::HostClock;
 use crate::io::device::{Fault, FaultKind, NAP, NoteKind, Report, Stop};
-use crate::msg::{FrameEncoding, FramePayload};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{FrameEncoding, FramePayload};
+use windhover_base::time::{MonoTime, Span};
 
 /// Mapped buffers. One is being copied while the others fill: at 30 frames a second the driver can
 /// run on for a third of a second while this thread waits for a processor. A driver that has less memory gives

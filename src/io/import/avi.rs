@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::{Frames, ImportError};
-use crate::msg::{FrameEncoding, FramePayload};
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::{FrameEncoding, FramePayload};
+use windhover_base::time::{MonoTime, Span};
 
 /// Largest frame accepted, bytes.
 const FRAME_MAX: u32 = 1 << 28;

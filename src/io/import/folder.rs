@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::{Frames, ImportError, parse_time};
-use crate::msg::{FrameEncoding, FramePayload};
-use crate::time::MonoTime;
+use windhover_base::msg::{FrameEncoding, FramePayload};
+use windhover_base::time::MonoTime;
 
 /// Opens a folder with `times.csv` (`time_s,file`, with or without that header).
 pub(super) fn open(folder: &Path) -> Result<Frames, ImportError> {

@@ -11,8 +11,8 @@ pub use video::{VideoSource, open_video};
 
 use std::path::{Path, PathBuf};
 
-use crate::msg::FramePayload;
-use crate::time::{MonoTime, UtcTime};
+use windhover_base::msg::FramePayload;
+use windhover_base::time::{MonoTime, UtcTime};
 
 /// Why a recording could not be imported.
 #[derive(Debug, thiserror::Error)]

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::{ImportError, parse_time};
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// What a line of the log had on the wire, with its time. Lines without a time are told, by number,
 /// and left out; a log in which no line has one is an error.

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use super::{Frames, ImportError, avi, folder, y4m};
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// How a video is read.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use super::folder::grey;
 use super::{Frames, ImportError};
-use crate::msg::FramePayload;
-use crate::time::{MonoTime, Span};
+use windhover_base::msg::FramePayload;
+use windhover_base::time::{MonoTime, Span};
 
 /// Longest header line accepted.
 const HEADER_MAX: u64 = 4096;

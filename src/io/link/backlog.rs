@@ -157,7 +157,7 @@ impl Backlog for MemoryBacklog {
 mod tests {
     use super::*;
     use crate::io::records::Schema;
-    use crate::time::MonoTime;
+    use windhover_base::time::MonoTime;
 
     fn record(n: u32) -> Arc<Record> {
         Arc::new(Record {

@@ -15,7 +15,7 @@ use rcgen::{
 };
 use ring::rand::SecureRandom as _;
 
-use crate::time::{Civil, NS_PER_S, UtcTime};
+use windhover_base::time::{Civil, NS_PER_S, UtcTime};
 
 /// Domain under which every certificate carries its role and name.
 const DOMAIN: &str = "windhover";

@@ -103,7 +103,7 @@ impl LiveQueue {
 mod tests {
     use super::*;
     use crate::io::records::Schema;
-    use crate::time::MonoTime;
+    use windhover_base::time::MonoTime;
 
     fn push(queue: &mut LiveQueue, number: u32, topic: &'static str) {
         let record = Record {

@@ -15,7 +15,7 @@ use crate::io::proto::{
     link::{self as pb, to_payload, to_station},
     schema_of_package,
 };
-use crate::time::{MonoTime, Span};
+use windhover_base::time::{MonoTime, Span};
 
 /// Longest a greeting may take.
 const GREETING: Duration = Duration::from_secs(20);

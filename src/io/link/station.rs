@@ -18,7 +18,7 @@ use super::ranges::RangeSet;
 use super::receive;
 use super::tls::KeyFiles;
 use crate::io::proto::link::Thumbnail;
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// What a station's side of the link is made of.
 #[derive(Clone, Debug)]

@@ -5,8 +5,8 @@ use prost::Message as _;
 use crate::io::proto::link::Thumbnail;
 use crate::io::records;
 use crate::jpeg::{self, Layout};
-use crate::msg::{FeatureTrack, FramePayload, GrayImage, MarkerDetection};
 use crate::pixels;
+use windhover_base::msg::{FeatureTrack, FramePayload, GrayImage, MarkerDetection};
 
 /// JPEG quality: a thumbnail of 320 × 256 takes about 8 KB.
 const QUALITY: u8 = 60;
@@ -66,8 +66,8 @@ impl Picture {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::msg::FrameEncoding;
-    use crate::time::MonoTime;
+    use windhover_base::msg::FrameEncoding;
+    use windhover_base::time::MonoTime;
 
     #[test]
     fn a_thumbnail_shows_the_mean_and_keeps_the_size_of_the_frame() {

@@ -11,7 +11,7 @@ use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKey
 use rustls::server::WebPkiClientVerifier;
 
 use super::keys::{KeyError, Role, expiry_of, peer_of, read_private, serial_of, serials_of_list};
-use crate::time::UtcTime;
+use windhover_base::time::UtcTime;
 
 /// Protocol name in the TLS handshake; the number is the major version of the message format.
 const ALPN: &[u8] = b"windhover/1";

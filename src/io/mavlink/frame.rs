@@ -2,7 +2,7 @@
 //!
 //! Source: <https://mavlink.io/en/guide/serialization.html>, <https://mavlink.io/en/guide/message_signing.html>.
 
-use crate::time::UtcTime;
+use windhover_base::time::UtcTime;
 
 /// First byte of a MAVLink 2 frame.
 pub const MAGIC: u8 = 0xfd;

@@ -2,8 +2,8 @@
 //!
 //! Fields stand in the order of their sizes, as the wire format wants; source: MAVLink's `common.xml`.
 
-use crate::msg::{TargetState, TrackStatus};
-use crate::time::MonoTime;
+use windhover_base::msg::{TargetState, TrackStatus};
+use windhover_base::time::MonoTime;
 
 use super::frame::Kind;
 

@@ -11,10 +11,10 @@ use std::net::{SocketAddr, ToSocketAddrs as _, UdpSocket};
 use std::path::{Path, PathBuf};
 
 use crate::config::Config;
-use crate::geo::Geodetic;
 use crate::io::link::keys::{KeyError, read_private};
-use crate::msg::{Output, TargetEstimate, TrackStatus};
-use crate::time::{MonoTime, Span, UtcTime};
+use windhover_base::geo::Geodetic;
+use windhover_base::msg::{Output, TargetEstimate, TrackStatus};
+use windhover_base::time::{MonoTime, Span, UtcTime};
 
 use frame::{Refused, Sender, SigningKey};
 use messages::Vehicle;

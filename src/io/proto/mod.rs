@@ -20,7 +20,7 @@ pub mod link {
 use prost::Message as _;
 use prost_types::{FileDescriptorSet, Timestamp};
 
-use crate::time::{MonoTime, NS_PER_S};
+use windhover_base::time::{MonoTime, NS_PER_S};
 
 /// Every schema of the program as one descriptor set.
 const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));

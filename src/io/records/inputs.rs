@@ -4,8 +4,8 @@ use prost::Message as _;
 
 use super::{Record, Schema, topic, warm};
 use crate::io::proto::{foxglove, timestamp, windhover};
-use crate::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
-use crate::time::MonoTime;
+use windhover_base::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
+use windhover_base::time::MonoTime;
 
 /// Frame of reference of images.
 const CAMERA_FRAME: &str = "camera";

@@ -12,7 +12,7 @@ pub use schema::Schema;
 
 use std::borrow::Cow;
 
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// Channel metadata key that says where a frame's number is: with value [`IN_SEQUENCE`] it is the
 /// message's sequence number. Frames that were not kept leave a gap then, and a replay numbers the rest

@@ -8,13 +8,13 @@ use prost_types::Timestamp;
 
 use super::{Record, Schema, topic};
 use crate::config::Config;
-use crate::geo::rot_z;
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
-use crate::msg::{
+use windhover_base::geo::rot_z;
+use windhover_base::msg::{
     AttitudeSample, FeatureTrack, FixKind, FusionResult, GnssEpoch, Health, MarkerDetection, MarkerId,
     Notice, NoticeKind, Output, Ownship, SourceHealth, Stamped, TargetEstimate, TrackStatus,
 };
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// What only a daemon knows of itself (card, link, computer), by name.
 #[derive(Clone, Default, PartialEq, Debug)]

@@ -1,4 +1,4 @@
-//! Topic names. Those of what sources deliver are in the table of sources ([`crate::msg::Source`]).
+//! Topic names. Those of what sources deliver are in the table of sources ([`windhover_base::msg::Source`]).
 
 /// Losses, arrivals and departures of devices.
 pub const SOURCE_EVENT: &str = "/source/event";

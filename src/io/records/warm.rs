@@ -1,8 +1,8 @@
 //! A warm state as a message, exact to the last bit.
 
 use crate::io::proto::{timestamp, windhover};
-use crate::msg::{WARM_STATES, WarmArrival, WarmFilter, WarmSite, WarmState};
-use crate::time::MonoTime;
+use windhover_base::msg::{WARM_STATES, WarmArrival, WarmFilter, WarmSite, WarmState};
+use windhover_base::time::MonoTime;
 
 /// A warm state as a message without origin.
 pub fn message(t: MonoTime, state: &WarmState) -> windhover::WarmState {

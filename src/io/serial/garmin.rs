@@ -4,8 +4,8 @@
 //! sentence means accepted; an echo with other values means refused.
 
 use super::GARMIN_ANSWER;
-use crate::decode::{Sentence, framed};
-use crate::time::{MonoTime, Span};
+use windhover_base::time::{MonoTime, Span};
+use windhover_decode::{Sentence, framed};
 
 /// What to do now.
 #[derive(Clone, PartialEq, Eq, Debug)]

@@ -12,7 +12,7 @@ use super::garmin::{bodies, sentence};
 use super::{IoKind, READ_BYTES, SerialSettings, unplugged};
 use crate::io::clock::HostClock;
 use crate::io::device::{Fault, NoteKind, Report, Stop};
-use crate::time::Span;
+use windhover_base::time::Span;
 
 /// Speeds a receiver may speak and their codes in PGRMC, factory settings first.
 const SPEEDS: [(u32, u8); 4] = [(19_200, 5), (4_800, 3), (38_400, 8), (9_600, 4)];

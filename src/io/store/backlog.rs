@@ -6,7 +6,7 @@ use super::handle::StoreHandle;
 use super::index::QueuedRecord;
 use crate::io::link::{Backlog, Extent, Found, Unread};
 use crate::io::records::{Record, Schema};
-use crate::time::MonoTime;
+use windhover_base::time::MonoTime;
 
 /// What a record takes beside its message.
 const OVERHEAD: usize = 160;

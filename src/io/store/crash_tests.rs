@@ -20,7 +20,7 @@ use super::record::{ChannelDef, RawRecord, Weight};
 use super::segment::Head;
 use super::volume::Volume;
 use crate::io::mcap_read::McapReader;
-use crate::time::UtcTime;
+use windhover_base::time::UtcTime;
 
 const SECOND_NS: u64 = 1_000_000_000;
 

@@ -10,8 +10,8 @@ use super::queue::{Entry, Popped, Queue};
 use super::record::{ChannelDef, RawRecord, STATE_TOPIC, Weight};
 use super::shared::Shared;
 use crate::io::records::{self, Record, Schema};
-use crate::msg::{Event, EventBody, Source};
-use crate::time::MonoTime;
+use windhover_base::msg::{Event, EventBody, Source};
+use windhover_base::time::MonoTime;
 
 /// What waits to be encoded.
 #[derive(Debug)]

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::scan::SegmentFile;
 use super::summary::TopicStats;
 use super::volume::{StoreError, StoreResult, Volume};
-use crate::time::UtcTime;
+use windhover_base::time::UtcTime;
 
 /// Directory of all flights, under the store's path.
 pub const FLIGHTS: &str = "FLIGHTS";

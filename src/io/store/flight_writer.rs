@@ -8,7 +8,7 @@ use super::record::{Definitions, RawRecord};
 use super::segment::{Head, SegmentWriter};
 use super::summary::TopicStats;
 use super::volume::{StoreResult, Volume};
-use crate::time::UtcTime;
+use windhover_base::time::UtcTime;
 
 /// File that counts the runs of the daemon on this card.
 const SESSION_FILE: &str = "session";

@@ -9,7 +9,7 @@ use image::{ExtendedColorType, ImageEncoder};
 use super::format::Compression;
 use crate::config::{FramePolicy, StoreConfig};
 use crate::jpeg::{self, Layout};
-use crate::msg::{FrameEncoding, FramePayload};
+use windhover_base::msg::{FrameEncoding, FramePayload};
 
 /// Grey outside the region that is kept.
 const BLANK: u8 = 128;
@@ -203,7 +203,7 @@ fn png(frame: &FramePayload) -> Option<(FrameEncoding, Vec<u8>)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::time::MonoTime;
+    use windhover_base::time::MonoTime;
 
     fn frame(encoding: FrameEncoding, width: u32, height: u32, stride: u32, data: Vec<u8>) -> FramePayload {
         let t_exposure = MonoTime::from_ns(1);

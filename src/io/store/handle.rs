@@ -20,8 +20,8 @@ use super::volume::Volume;
 use crate::config::{Config, StoreConfig};
 use crate::io::clock::HostClock;
 use crate::io::records::{Record, topic};
-use crate::msg::{Event, EventBody, Source, WarmState};
-use crate::time::UtcTime;
+use windhover_base::msg::{Event, EventBody, Source, WarmState};
+use windhover_base::time::UtcTime;
 
 /// Dates before this are a receiver's error (a week number that rolled over, a clock without a
 /// battery): the program is younger. 2026-01-01.

@@ -13,8 +13,8 @@ use crate::config::{FramePolicy, StoreConfig};
 use crate::io::capture::CaptureReader;
 use crate::io::clock::HostClock;
 use crate::io::records::{Record, Schema, topic};
-use crate::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
-use crate::time::{Span, UtcTime};
+use windhover_base::msg::{Event, EventBody, FrameEncoding, FramePayload, Source};
+use windhover_base::time::{Span, UtcTime};
 
 fn gps(clock: &HostClock, seq: u64) -> Event {
     Event {

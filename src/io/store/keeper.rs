@@ -20,7 +20,7 @@ use super::status::{Recording, StoreNotice};
 use super::volume::{StoreResult, Volume};
 use crate::config::StoreConfig;
 use crate::io::clock::HostClock;
-use crate::time::{MonoTime, Span};
+use windhover_base::time::{MonoTime, Span};
 
 /// What the keeper is told.
 #[derive(Debug)]

@@ -22,7 +22,7 @@ use super::status::{Durations, Recording, StoreNotice};
 use super::volume::{StoreError, StoreResult, Volume, device_of};
 use crate::config::StoreConfig;
 use crate::io::clock::HostClock;
-use crate::time::{MonoTime, Span};
+use windhover_base::time::{MonoTime, Span};
 
 /// How often everything is made durable.
 const COMMIT_EVERY: Span = Span::from_ns(1_000_000_000);

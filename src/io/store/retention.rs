@@ -5,7 +5,7 @@ use std::path::Path;
 use super::flight::{self, FLIGHTS, FlightInfo};
 use super::volume::{StoreResult, Volume};
 use crate::config::StoreConfig;
-use crate::time::UtcTime;
+use windhover_base::time::UtcTime;
 
 /// Orders flights by age: by run of the daemon, which counts up whatever the clock says; by name
 /// where the run is not known.
@@ -16,7 +16,7 @@ pub fn age_order(root: &Path, name: &str) -> (u32, String) {
 /// Start of a flight, from its name; `None` for `boot-N`.
 pub fn start_of(name: &str) -> Option<UtcTime> {
     let field = |from: usize, to: usize| name.get(from..to)?.parse::<u32>().ok();
-    UtcTime::from_civil(crate::time::Civil {
+    UtcTime::from_civil(windhover_base::time::Civil {
         year: i32::try_from(field(0, 4)?).ok()?,
         month: field(4, 6)? as u8,
         day: field(6, 8)? as u8,

@@ -7,7 +7,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError, RwLock};
 use super::frames::Region;
 use super::index::Index;
 use super::status::{StoreNotice, StoreStatus};
-use crate::time::UtcTime;
+use windhover_base::time::UtcTime;
 
 /// What the store's threads and its handles share.
 #[derive(Debug)]

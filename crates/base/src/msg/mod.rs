@@ -1,0 +1,29 @@
+//! What flows: events in, measurements between, estimates out. Values only.
+
+mod estimate;
+mod event;
+mod family;
+mod health;
+mod image;
+mod measure;
+mod notice;
+mod output;
+mod predict;
+mod source;
+mod warm;
+
+pub use estimate::{
+    Disposition, FusionResult, FusionSource, Ownship, TargetEstimate, TargetState, TrackStatus,
+};
+pub use event::{Event, EventBody, FrameEncoding, FramePayload};
+pub use family::TagFamily;
+pub use health::{Health, SourceHealth, TargetHealth};
+pub use image::{GrayImage, ImageView, RgbImage};
+pub use measure::{
+    AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, MarkerDetection, MarkerId, Stamped,
+};
+pub use notice::{Notice, NoticeKind};
+pub use output::Output;
+pub use predict::{FramePrediction, MarkerPrediction};
+pub use source::{Delivery, PerSource, Source};
+pub use warm::{WARM_STATES, WarmArrival, WarmFilter, WarmSite, WarmState};

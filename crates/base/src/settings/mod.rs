@@ -1,0 +1,19 @@
+//! Settings of the core: sections of the configuration as values, with their defaults.
+//!
+//! Angles are degrees here, as people write them; each user converts where it uses them. Checks of
+//! ranges are made where the whole configuration is read.
+
+mod estimator;
+mod montecarlo;
+mod rig;
+mod sensors;
+mod target;
+
+pub use estimator::{DetectorConfig, EstimatorConfig};
+pub use montecarlo::{Distribution, MonteCarloConfig};
+pub use rig::Rig;
+pub use sensors::{
+    CameraConfig, CameraMount, CompassConfig, CompassFormat, Datum, Declination, GpsConfig, GroundConfig,
+    GroundSource, PixelFormat,
+};
+pub use target::{Brightness, MarkerConfig, MarkerKind, TargetConfig, TargetModel};

@@ -1,0 +1,22 @@
+//! Calibration, and what accuracy to expect of it: the camera's intrinsics from boards, mounting
+//! angles from flights, the paper's Monte Carlo analysis.
+
+#![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
+
+pub mod boresight;
+mod boresight_filter;
+mod chessboard;
+#[cfg(test)]
+mod drawn_board;
+mod grid;
+pub mod intrinsics;
+mod least_squares;
+pub mod montecarlo;
+mod saddle;
+mod subpixel;
+mod tag_grid;
+mod zhang;
+
+pub use chessboard::{BoardError, Corners, WINDOW_PX, find_corners};
+pub use tag_grid::{TagGrid, TagGridError};
+pub use zhang::{PlanePose, PlaneView};

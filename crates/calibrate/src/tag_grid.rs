@@ -1,0 +1,211 @@
+//! A grid of tags as calibration target: which corner seen is which point of the sheet.
+
+use nalgebra::Vector2;
+
+use super::zhang::{PlaneView, homography};
+use windhover_base::msg::TagFamily;
+use windhover_base::msg::{ImageView, MarkerDetection, MarkerId};
+use windhover_detect::TagDetector;
+
+/// Smallest edge of a tag that is used, pixels: corners of smaller ones are too rough.
+const LEAST_PX: f64 = 14.0;
+/// Fewest tags with which an image is used: fewer tell little of the lens.
+const FEWEST: usize = 3;
+
+/// Tags numbered row by row from 0, all upright, a gap between neighbours.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct TagGrid {
+    /// Family of the tags.
+    pub family: TagFamily,
+    /// Tags in a row.
+    pub columns: usize,
+    /// Rows.
+    pub rows: usize,
+    /// Edge of a tag's border, the square that is configured elsewhere too, metres.
+    pub tag_m: f64,
+    /// From a tag's border to the next one's, metres.
+    pub gap_m: f64,
+}
+
+/// Why an image gave no grid.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, thiserror::Error)]
+pub enum TagGridError {
+    /// No tag, or too few.
+    #[error("{found} of the grid's {wanted} tags are seen, at least {FEWEST} are needed")]
+    TooFew {
+        /// Tags of the grid seen.
+        found: usize,
+        /// Tags of the grid.
+        wanted: usize,
+    },
+    /// The tags do not lie as the grid says.
+    #[error("the tags seen do not lie in a grid of {columns}x{rows}: is --board right?")]
+    OtherGrid {
+        /// Columns asked for.
+        columns: usize,
+        /// Rows asked for.
+        rows: usize,
+    },
+}
+
+impl TagGrid {
+    /// The corners of every tag seen, with their places on the sheet (x right, y down, origin at the
+    /// first corner of the tag at top left). A part of the grid will do.
+    ///
+    /// Numbers may count from the top row down or, as Kalibr prints them, from the bottom row up:
+    /// whichever the image agrees with is taken.
+    pub fn find(&self, image: ImageView<'_>) -> Result<PlaneView, TagGridError> {
+        let mut seen = Vec::new();
+        TagDetector::new(&[self.family], LEAST_PX, 1).detect(image, &mut seen);
+        let wanted = self.columns * self.rows;
+        let tags: Vec<(usize, [Vector2<f64>; 4])> = seen.iter().filter_map(|m| self.tag_of(m)).collect();
+        let mut numbers: Vec<usize> = tags.iter().map(|t| t.0).collect();
+        numbers.sort_unstable();
+        numbers.dedup();
+        if numbers.len() < FEWEST || numbers.len() < tags.len() {
+            return Err(TagGridError::TooFew { found: numbers.len(), wanted });
+        }
+        let other = TagGridError::OtherGrid { columns: self.columns, rows: self.rows };
+        let ways = [false, true].map(|from_below| self.view(&tags, from_below));
+        let misfits = ways.each_ref().map(misfit_px);
+        let best = usize::from(misfits[1] < misfits[0]);
+        // Half a tag aside is another place on the sheet; distortion of a lens stays far below.
+        let size = seen.iter().map(|m| m.size_px).fold(f64::INFINITY, f64::min);
+        if !(misfits[best] < 0.25 * size) {
+            return Err(other);
+        }
+        let [down, up] = ways;
+        Ok(if best == 0 { down } else { up })
+    }
+
+    fn tag_of(&self, seen: &MarkerDetection) -> Option<(usize, [Vector2<f64>; 4])> {
+        let MarkerId::Tag { family, id } = seen.marker else { return None };
+        let of_grid = family == self.family && (id as usize) < self.columns * self.rows;
+        of_grid.then_some((id as usize, seen.corners_px?))
+    }
+
+    fn view(&self, tags: &[(usize, [Vector2<f64>; 4])], from_below: bool) -> PlaneView {
+        let pitch = self.tag_m + self.gap_m;
+        let mut view = PlaneView { plane_m: Vec::new(), px: Vec::new() };
+        for (number, corners) in tags {
+            let (column, row) = (number % self.columns, number / self.columns);
+            let row = if from_below { self.rows - 1 - row } else { row };
+            let origin = Vector2::new(column as f64, row as f64) * pitch;
+            // Top-left, top-right, bottom-right, bottom-left, as detections list them.
+            let places = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)];
+            view.plane_m.extend(places.map(|(x, y)| origin + Vector2::new(x, y) * self.tag_m));
+            view.px.extend(corners);
+        }
+        view
+    }
+}
+
+/// Root of the mean squared distance to where the best homography puts the points, pixels.
+fn misfit_px(view: &PlaneView) -> f64 {
+    let Some(h) = homography(view) else { return f64::INFINITY };
+    let squared = view.plane_m.iter().zip(&view.px).map(|(p, px)| {
+        let at = h * p.push(1.0);
+        (at.xy() / at.z - px).norm_squared()
+    });
+    (squared.sum::<f64>() / view.px.len().max(1) as f64).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::LazyLock;
+
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::intrinsics::{Wanted, calibrate};
+    use windhover_base::geo::{CameraModel, ned_from_body_321};
+    use windhover_base::msg::GrayImage;
+    use windhover_detect::{TagPattern, tag_pattern};
+
+    const GRID: TagGrid =
+        TagGrid { family: TagFamily::Tag36h11, columns: 5, rows: 4, tag_m: 0.04, gap_m: 0.012 };
+
+    static PATTERNS: LazyLock<Vec<TagPattern>> =
+        LazyLock::new(|| (0..20).map(|id| tag_pattern(GRID.family, id)).collect());
+
+    fn camera() -> CameraModel {
+        let distortion = [-0.2, 0.05, 0.0005, -0.0005, 0.0];
+        CameraModel { fx: 640.0, fy: 636.0, cx: 324.0, cy: 238.0, distortion, skew: 0.0 }
+    }
+
+    /// Whether the sheet is dark at a point; numbers count from the bottom row up with `from_below`.
+    fn is_dark(at: Vector2<f64>, from_below: bool) -> bool {
+        let pitch = GRID.tag_m + GRID.gap_m;
+        let (c, r) = ((at.x / pitch).floor(), (at.y / pitch).floor());
+        if !(0.0..GRID.columns as f64).contains(&c) || !(0.0..GRID.rows as f64).contains(&r) {
+            return false;
+        }
+        let row = if from_below { GRID.rows - 1 - r as usize } else { r as usize };
+        let pattern = &PATTERNS[row * GRID.columns + c as usize];
+        let inside = (at - Vector2::new(c, r) * pitch) / GRID.tag_m * pattern.border as f64;
+        let pad = (pattern.side() - pattern.border) as f64 / 2.0;
+        let cell = inside.add_scalar(pad);
+        let reach = 0.0..pattern.side() as f64;
+        let on_print = reach.contains(&cell.x) && reach.contains(&cell.y);
+        on_print && !pattern.white(cell.x as usize, cell.y as usize)
+    }
+
+    fn photograph(yaw: f64, pitch: f64, roll: f64, shift: Vector2<f64>, from_below: bool) -> GrayImage {
+        let camera = camera();
+        let rotation = ned_from_body_321(yaw, pitch, roll);
+        let middle = Vector3::new(0.124, 0.098, 0.0);
+        let translation = Vector3::new(shift.x, shift.y, 0.44) - rotation * middle;
+        let mut image = GrayImage::new(640, 480);
+        for v in 0..480 {
+            for u in 0..640 {
+                let mut light = 0.0;
+                for k in 0..9 {
+                    let aside = |n: usize| 0.5 * (n as f64 - 1.0);
+                    let px = Vector2::new(u as f64 + aside(k % 3), v as f64 + aside(k / 3));
+                    let m = camera.normalised(px).expect("inside the lens");
+                    let ray = rotation.inverse() * m.push(1.0);
+                    let origin = rotation.inverse() * -translation;
+                    let at = origin - ray * (origin.z / ray.z);
+                    light += if is_dark(at.xy(), from_below) { 30.0 } else { 220.0 };
+                }
+                image.data[v * 640 + u] = (light / 9.0) as u8;
+            }
+        }
+        image
+    }
+
+    #[test]
+    fn a_grid_calibrates_the_camera_whichever_way_it_is_numbered_and_only_partly_seen() {
+        // Given photographs of both kinds of print, one with the sheet partly outside.
+        let photos = [
+            photograph(0.1, 0.5, 0.0, Vector2::zeros(), false),
+            photograph(1.6, -0.5, 0.1, Vector2::zeros(), false),
+            photograph(-0.4, 0.1, 0.5, Vector2::new(0.02, 0.0), true),
+            photograph(3.0, 0.0, -0.5, Vector2::zeros(), true),
+            photograph(0.2, 0.4, 0.4, Vector2::new(0.15, 0.08), true),
+        ];
+        // When the camera is calibrated with them.
+        let views: Vec<PlaneView> = photos.iter().map(|p| GRID.find(p.view()).expect("tags")).collect();
+        let found =
+            calibrate(&views, 640.0, 480.0, Wanted { k3: false, skew: false }).expect("tilted enough");
+        // Then it is found within its own sigmas.
+        assert!(views[4].px.len() < views[0].px.len(), "the last is partly outside");
+        let truth = camera();
+        let (c, s) = (&found.camera, &found.sigma);
+        for (k, (a, b)) in
+            [(c.fx, truth.fx), (c.fy, truth.fy), (c.cx, truth.cx), (c.cy, truth.cy)].into_iter().enumerate()
+        {
+            assert!((a - b).abs() < 4.0 * s[k] && s[k] < 3.0, "{k}: {a} ± {}, truly {b}", s[k]);
+        }
+        assert!(found.rms_px < 0.15, "{}", found.rms_px);
+    }
+
+    #[test]
+    fn other_boards_and_empty_images_are_refused_with_the_reason() {
+        let blank = GrayImage::new(320, 240);
+        assert_eq!(GRID.find(blank.view()), Err(TagGridError::TooFew { found: 0, wanted: 20 }));
+        let photo = photograph(0.1, 0.3, 0.0, Vector2::zeros(), false);
+        let other = TagGrid { columns: 4, rows: 5, ..GRID };
+        assert_eq!(other.find(photo.view()), Err(TagGridError::OtherGrid { columns: 4, rows: 5 }));
+    }
+}

@@ -1,0 +1,222 @@
+//! The order of sentences in a receiver's burst, learnt from the stream: which sentence ends a
+//! cycle, and which ones lead it although they carry no time.
+
+use super::frame::LineSpan;
+use super::report::Kind;
+use windhover_base::time::Span;
+
+/// Bytes of an address that tell sentences apart.
+type Address = [u8; 6];
+/// Sentence types remembered; no receiver sends more.
+const ADDRESSES_MAX: usize = 48;
+/// Sentences remembered since the last one that carried a time.
+const SINCE_MAX: usize = 48;
+/// A silence shorter than this tells nothing.
+const SILENCE_MIN: Span = Span::from_ns(20_000_000);
+/// How sure the votes get.
+const VOTES_MAX: i8 = 8;
+/// Votes after which a sentence is taken to lead its burst.
+const VOTES_LEADING: i8 = 2;
+
+/// Which sentences come before the first one with a time in a burst.
+///
+/// A sentence without time between two of different time belongs to the burst it is nearer to: the
+/// longer silence lies between the bursts. Single silences lie (the host stalls), so each one is a
+/// vote only; without votes, as in files, sentences follow the time they belong to.
+#[derive(Clone, Debug, Default)]
+pub(super) struct BurstOrder {
+    votes: Vec<(Address, i8)>,
+    since: Vec<Heard>,
+    last: Option<LineSpan>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Heard {
+    address: Address,
+    silence_before: Span,
+    span: LineSpan,
+}
+
+fn key(address: &str) -> Address {
+    let mut key = Address::default();
+    for (to, from) in key.iter_mut().zip(address.bytes()) {
+        *to = from;
+    }
+    key
+}
+
+impl BurstOrder {
+    /// A sound sentence, of whatever kind, in the order they come.
+    pub(super) fn heard(&mut self, address: &str, span: LineSpan) {
+        let silence_before = self.last.map_or(Span::ZERO, |last| span.t_first - last.t_last);
+        if self.since.len() == SINCE_MAX {
+            self.since.remove(0);
+        }
+        self.since.push(Heard { address: key(address), silence_before, span });
+        self.last = Some(span);
+    }
+
+    /// The sentence just heard is of the open epoch's time: all before it was of this burst.
+    pub(super) fn same_burst(&mut self) {
+        self.since.clear();
+    }
+
+    /// The sentence just heard opens an epoch; gives where its burst began.
+    pub(super) fn new_burst(&mut self) -> LineSpan {
+        self.vote();
+        let count = self.since.len();
+        let leaders = self.since[..count.saturating_sub(1)]
+            .iter()
+            .rev()
+            .take_while(|heard| self.votes_of(heard.address) >= VOTES_LEADING)
+            .count();
+        let first = self.since.get(count.saturating_sub(1 + leaders)).map(|heard| heard.span);
+        self.since.clear();
+        first.or(self.last).unwrap_or_default()
+    }
+
+    /// Whether this sentence comes before the one that tells its time.
+    pub(super) fn leads(&self, address: &str) -> bool {
+        self.votes_of(key(address)) >= VOTES_LEADING
+    }
+
+    fn votes_of(&self, address: Address) -> i8 {
+        self.votes.iter().find(|(known, _)| *known == address).map_or(0, |(_, votes)| *votes)
+    }
+
+    fn vote(&mut self) {
+        let longest = self.since.iter().enumerate().max_by_key(|(_, heard)| heard.silence_before);
+        let Some((gap, longest)) = longest.map(|(index, heard)| (index, heard.silence_before)) else {
+            return;
+        };
+        let others = self.since.iter().enumerate().filter(|(index, _)| *index != gap);
+        let second = others.map(|(_, heard)| heard.silence_before).max().unwrap_or(Span::ZERO);
+        if longest < SILENCE_MIN || longest.ns() < 2 * second.ns() {
+            return;
+        }
+        for (index, heard) in self.since.iter().enumerate() {
+            let vote = if index < gap { -1 } else { 1 };
+            let room = self.votes.len() < ADDRESSES_MAX;
+            match self.votes.iter_mut().find(|(known, _)| *known == heard.address) {
+                Some((_, votes)) => *votes = (*votes + vote).clamp(-VOTES_MAX, VOTES_MAX),
+                None if room => self.votes.push((heard.address, vote)),
+                None => {}
+            }
+        }
+    }
+}
+
+/// Cycles of the same sentences seen before their end is believed.
+const CYCLES_FIRST: u32 = 3;
+/// Most cycles asked for where the belief was wrong before.
+const CYCLES_MAX: u32 = 64;
+
+/// The sentences of a cycle, learnt, so that an epoch can be given out with its last sentence and
+/// not only when the next one begins.
+#[derive(Clone, Debug)]
+pub(super) struct Cycle {
+    expected: Vec<Kind>,
+    seen: u32,
+    needed: u32,
+}
+
+impl Default for Cycle {
+    fn default() -> Self {
+        Self { expected: Vec::new(), seen: 0, needed: CYCLES_FIRST }
+    }
+}
+
+impl Cycle {
+    /// An epoch ended because the next began: these were its sentences.
+    pub(super) fn ended(&mut self, kinds: &[Kind]) {
+        if kinds == self.expected {
+            self.seen = self.seen.saturating_add(1);
+        } else if !is_subsequence(kinds, &self.expected) {
+            self.expected = kinds.to_vec();
+            self.seen = 1;
+        }
+    }
+
+    /// A sentence came after the epoch had been given out: be slower to believe.
+    pub(super) fn was_longer(&mut self) {
+        self.seen = 0;
+        self.expected.clear();
+        self.needed = (self.needed * 2).min(CYCLES_MAX);
+    }
+
+    /// Whether these are all the sentences to be expected (some may have been lost before the last).
+    pub(super) fn is_complete(&self, kinds: &[Kind]) -> bool {
+        let Some(last) = self.expected.last() else {
+            return false;
+        };
+        let count = |list: &[Kind]| list.iter().filter(|kind| *kind == last).count();
+        self.seen >= self.needed
+            && kinds.last() == Some(last)
+            && count(kinds) == count(&self.expected)
+            && is_subsequence(kinds, &self.expected)
+    }
+}
+
+fn is_subsequence(part: &[Kind], whole: &[Kind]) -> bool {
+    let mut whole = whole.iter();
+    part.iter().all(|kind| whole.any(|other| other == kind))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use windhover_base::time::MonoTime;
+
+    fn span(ms: i64) -> LineSpan {
+        let t = MonoTime::from_ns(ms * 1_000_000);
+        LineSpan { t_first: t, t_last: t + Span::from_ms(5.0), ..LineSpan::default() }
+    }
+
+    #[test]
+    fn sentences_near_the_next_time_lead_it() {
+        // Given bursts of VTG, RMC, GSV with silence after GSV
+        let mut order = BurstOrder::default();
+        let mut begins = Vec::new();
+        for burst in 0..4 {
+            let t = burst * 200;
+            order.heard("GPVTG", span(t));
+            order.heard("GPRMC", span(t + 10));
+            begins.push(order.new_burst().t_first.ns() / 1_000_000);
+            order.heard("GPGSV", span(t + 20));
+        }
+        // Then VTG is known to lead after two silences, and the burst begins with it
+        assert!(order.leads("GPVTG") && !order.leads("GPGSV"));
+        assert_eq!(begins, [10, 210, 400, 600]);
+    }
+
+    #[test]
+    fn one_stall_of_the_host_changes_nothing() {
+        let mut order = BurstOrder::default();
+        for burst in 0..6 {
+            let t = burst * 200;
+            let stall = if burst == 4 { 170 } else { 0 };
+            order.heard("GPRMC", span(t));
+            order.new_burst();
+            order.heard("PGRMV", span(t + 10 + stall));
+        }
+        assert!(!order.leads("PGRMV"));
+    }
+
+    #[test]
+    fn a_cycle_is_believed_after_three_and_doubted_after_an_error() {
+        let kinds = [Kind::Rmc, Kind::Gga, Kind::Pgrmv];
+        let mut cycle = Cycle::default();
+        for _ in 0..3 {
+            assert!(!cycle.is_complete(&kinds));
+            cycle.ended(&kinds);
+        }
+        assert!(cycle.is_complete(&kinds));
+        assert!(cycle.is_complete(&[Kind::Rmc, Kind::Pgrmv]), "GGA was lost");
+        assert!(!cycle.is_complete(&[Kind::Rmc, Kind::Gga]));
+        cycle.was_longer();
+        (0..5).for_each(|_| cycle.ended(&kinds));
+        assert!(!cycle.is_complete(&kinds));
+        cycle.ended(&kinds);
+        assert!(cycle.is_complete(&kinds));
+    }
+}

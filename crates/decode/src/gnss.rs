@@ -1,0 +1,342 @@
+//! GPS bytes to epochs: every epoch of one UTC time only, given out as soon as it is safe.
+
+use super::burst::{BurstOrder, Cycle};
+use super::counts::{DecodeCounts, Refusal};
+use super::epoch::{Calendar, Draft};
+use super::frame::{Line, LineFramer, LineSpan, LineStart};
+use super::report::{Kind, Report};
+use super::sentence::Sentence;
+use super::{garmin, standard};
+use windhover_base::msg::GnssEpoch;
+use windhover_base::time::{MonoTime, Span};
+
+/// An epoch and when its burst was heard.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct HeardEpoch {
+    /// What the receiver said of one instant.
+    pub epoch: GnssEpoch,
+    /// When the read returned that held the first byte of its burst.
+    pub t_first_byte: MonoTime,
+    /// Bytes of that read from the burst's first byte to the end of the read. The first byte began
+    /// no later than `t_first_byte` less the transmission time of these.
+    pub bytes_before_end: usize,
+    /// When the read returned that held the last byte of its last sentence.
+    pub t_last_byte: MonoTime,
+    /// Whether it came in a burst of its own, so that its arrival tells the time of its validity.
+    /// Not so for the GLL of some receivers, which gives another instant within the burst.
+    pub opens_burst: bool,
+}
+
+/// Silence after which an open epoch is given out, before the receiver's period is known.
+const QUIET_FIRST: Span = Span::from_ns(300_000_000);
+/// Bounds of that silence once it is: half the period.
+const QUIET_BOUNDS_NS: (i64, i64) = (60_000_000, 500_000_000);
+/// Sentences kept that lead a burst whose time is still to come.
+const LEADING_MAX: usize = 8;
+
+/// Puts epochs together from the bytes of a GPS receiver.
+///
+/// Sentences that carry no time (GSA, VTG, PGRME, PGRMV) go to the epoch of the burst they are in.
+/// An epoch is given out with the last sentence of the receiver's cycle once that is known, else
+/// when the next epoch begins, or by [`GnssDecoder::tick`] after silence.
+#[derive(Clone, Debug)]
+pub struct GnssDecoder {
+    framer: LineFramer,
+    counts: DecodeCounts,
+    assembler: Assembler,
+}
+
+#[derive(Clone, Debug)]
+struct Assembler {
+    /// Wait for the next epoch's begin instead of the learnt end of the cycle.
+    patient: bool,
+    order: BurstOrder,
+    cycle: Cycle,
+    calendar: Calendar,
+    draft: Option<Draft>,
+    /// A GLL of another time than the burst it came in.
+    aside: Option<Draft>,
+    /// Sentences without time that lead the burst to come.
+    leading: Vec<(Report, LineSpan)>,
+    /// The epoch just given out.
+    done: Option<(Option<i64>, Vec<Kind>)>,
+    last_begin: Option<MonoTime>,
+    period: Option<Span>,
+}
+
+impl Default for GnssDecoder {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl GnssDecoder {
+    /// A decoder that gives each epoch out as early as is safe.
+    pub fn new() -> Self {
+        Self::with_patience(false)
+    }
+
+    /// A decoder for recordings without arrival times, that gives each epoch out only when the next
+    /// one begins and so misses no sentence of it.
+    pub fn patient() -> Self {
+        Self::with_patience(true)
+    }
+
+    fn with_patience(patient: bool) -> Self {
+        Self {
+            framer: LineFramer::new(LineStart::Dollar),
+            counts: DecodeCounts::default(),
+            assembler: Assembler {
+                patient,
+                order: BurstOrder::default(),
+                cycle: Cycle::default(),
+                calendar: Calendar::default(),
+                draft: None,
+                aside: None,
+                leading: Vec::new(),
+                done: None,
+                last_begin: None,
+                period: None,
+            },
+        }
+    }
+
+    /// Takes the bytes one read returned at `t_recv`; appends the epochs they complete to `out`.
+    pub fn push(&mut self, bytes: &[u8], t_recv: MonoTime, out: &mut Vec<HeardEpoch>) {
+        let assembler = &mut self.assembler;
+        self.framer.push(bytes, t_recv, &mut self.counts, |line, counts| {
+            assembler.line(&line, counts, out);
+        });
+    }
+
+    /// Time passed: gives out an open epoch the receiver has fallen silent after.
+    pub fn tick(&mut self, now: MonoTime, out: &mut Vec<HeardEpoch>) {
+        self.assembler.tick(now, out);
+    }
+
+    /// The stream has ended: gives out what is open.
+    pub fn flush(&mut self, out: &mut Vec<HeardEpoch>) {
+        self.assembler.close(out);
+        self.assembler.close_aside(None, out);
+    }
+
+    /// What was made of the bytes so far.
+    pub const fn counts(&self) -> &DecodeCounts {
+        &self.counts
+    }
+}
+
+impl Assembler {
+    fn line(&mut self, line: &Line<'_>, counts: &mut DecodeCounts, out: &mut Vec<HeardEpoch>) {
+        let sentence = match Sentence::of_line(line.text) {
+            Ok(sentence) => sentence,
+            Err(why) => return counts.refuse(why),
+        };
+        self.order.heard(sentence.address(), line.span);
+        let read = if sentence.address().starts_with("PGRM") {
+            garmin::read(&sentence)
+        } else {
+            standard::read(&sentence)
+        };
+        let placed = match read {
+            Ok(None) => return counts.ignored += 1,
+            Err(why) => Err(why),
+            Ok(Some(report)) => self.place(report, sentence.address(), line.span, out),
+        };
+        match placed {
+            Ok(()) => counts.used += 1,
+            Err(why) => counts.refuse(why),
+        }
+    }
+
+    fn place(
+        &mut self,
+        report: Report,
+        address: &str,
+        span: LineSpan,
+        out: &mut Vec<HeardEpoch>,
+    ) -> Result<(), Refusal> {
+        if let Some(time) = report.time_of_day_ns {
+            self.place_timed(&report, time, span, out)
+        } else if report.kind.tells_time() {
+            self.place_time_missing(&report, span, out)
+        } else if self.order.leads(address) {
+            self.leading.retain(|(other, _)| other.kind != report.kind);
+            if self.leading.len() < LEADING_MAX {
+                self.leading.push((report, span));
+            }
+            Ok(())
+        } else {
+            self.place_untimed(&report, span, out)
+        }
+    }
+
+    /// A sentence with its time.
+    fn place_timed(
+        &mut self,
+        report: &Report,
+        time: i64,
+        span: LineSpan,
+        out: &mut Vec<HeardEpoch>,
+    ) -> Result<(), Refusal> {
+        let open = self.draft.as_ref();
+        if open.is_some_and(|draft| draft.time_of_day_ns == Some(time) || draft.awaits(report.kind)) {
+            self.order.same_burst();
+            self.merge(report, span, out);
+            return Ok(());
+        }
+        if self.draft.is_none() && self.done.as_ref().is_some_and(|(done, _)| *done == Some(time)) {
+            self.order.same_burst();
+            self.cycle.was_longer();
+            return Err(Refusal::AfterItsEpoch);
+        }
+        let main_before = open.is_some_and(Draft::has_main) || self.done_has_main();
+        if report.kind == Kind::Gll && main_before {
+            self.close_aside(None, out);
+            let mut aside = Draft::new(span, false);
+            aside.merge(report, span);
+            self.aside = Some(aside);
+            return Ok(());
+        }
+        self.close(out);
+        self.open(time, out);
+        self.merge(report, span, out);
+        Ok(())
+    }
+
+    /// A sentence whose field for the time is empty: the receiver does not know it yet.
+    fn place_time_missing(
+        &mut self,
+        report: &Report,
+        span: LineSpan,
+        out: &mut Vec<HeardEpoch>,
+    ) -> Result<(), Refusal> {
+        match (&self.draft, &self.done) {
+            (Some(draft), _) if !draft.kinds.contains(&report.kind) => {}
+            (None, Some((_, kinds))) if !kinds.contains(&report.kind) => {
+                self.cycle.was_longer();
+                return Err(Refusal::AfterItsEpoch);
+            }
+            _ => {
+                self.close(out);
+                self.close_aside(None, out);
+                let begin = self.order.new_burst();
+                self.draft = Some(Draft::new(begin, true));
+            }
+        }
+        self.merge(report, span, out);
+        Ok(())
+    }
+
+    /// A sentence that has no time by its nature.
+    fn place_untimed(
+        &mut self,
+        report: &Report,
+        span: LineSpan,
+        out: &mut Vec<HeardEpoch>,
+    ) -> Result<(), Refusal> {
+        if let Some(draft) = &self.draft {
+            let one_of_several = report.kind == Kind::Gsa && draft.kinds.last() == Some(&Kind::Gsa);
+            if draft.kinds.contains(&report.kind) && !one_of_several {
+                // The burst of this sentence has lost the ones that told its time.
+                self.close(out);
+                self.done = None;
+                return Err(Refusal::NoTime);
+            }
+            self.merge(report, span, out);
+            return Ok(());
+        }
+        match self.done.take() {
+            Some((_, kinds)) if kinds.contains(&report.kind) => Err(Refusal::NoTime),
+            Some(done) => {
+                self.done = Some(done);
+                self.cycle.was_longer();
+                Err(Refusal::AfterItsEpoch)
+            }
+            None => Err(Refusal::NoTime),
+        }
+    }
+
+    fn merge(&mut self, report: &Report, span: LineSpan, out: &mut Vec<HeardEpoch>) {
+        let Some(draft) = &mut self.draft else {
+            return;
+        };
+        draft.merge(report, span);
+        if !self.patient && self.cycle.is_complete(&draft.kinds) {
+            self.give_out(out);
+        }
+    }
+
+    /// Opens the epoch of a new time, with the GLL that came before it and what led its burst.
+    fn open(&mut self, time: i64, out: &mut Vec<HeardEpoch>) {
+        self.close_aside(Some(time), out);
+        let begin = self.order.new_burst();
+        if let Some(last) = self.last_begin.replace(begin.t_first) {
+            let period = begin.t_first - last;
+            let smoothed = |known: Span| Span::from_ns(known.ns() + (period.ns() - known.ns()) / 8);
+            self.period = Some(self.period.map_or(period, smoothed));
+        }
+        let mut draft = Draft::new(begin, true);
+        if let Some(aside) = self.aside.take() {
+            draft = aside;
+            draft.begin = begin;
+            draft.opens_burst = true;
+        }
+        for (report, span) in self.leading.drain(..) {
+            draft.merge(&report, span);
+        }
+        self.draft = Some(draft);
+    }
+
+    /// The open epoch ends because another begins.
+    fn close(&mut self, out: &mut Vec<HeardEpoch>) {
+        if let Some(draft) = &self.draft {
+            self.cycle.ended(&draft.kinds);
+            self.give_out(out);
+        }
+    }
+
+    /// Gives out the GLL that stood aside, unless it is of the time that now begins.
+    fn close_aside(&mut self, time: Option<i64>, out: &mut Vec<HeardEpoch>) {
+        if let Some(aside) = self.aside.take_if(|aside| time.is_none() || aside.time_of_day_ns != time) {
+            out.push(heard(&aside, &mut self.calendar));
+        }
+    }
+
+    fn give_out(&mut self, out: &mut Vec<HeardEpoch>) {
+        if let Some(draft) = self.draft.take() {
+            out.push(heard(&draft, &mut self.calendar));
+            self.done = Some((draft.time_of_day_ns, draft.kinds));
+        }
+    }
+
+    fn tick(&mut self, now: MonoTime, out: &mut Vec<HeardEpoch>) {
+        let (low, high) = QUIET_BOUNDS_NS;
+        let quiet = self.period.map_or(QUIET_FIRST, |p| Span::from_ns((p.ns() / 2).clamp(low, high)));
+        if self.draft.as_ref().is_some_and(|draft| now - draft.end.t_last >= quiet) {
+            self.close(out);
+        }
+    }
+
+    fn done_has_main(&self) -> bool {
+        let main = |kind: &Kind| matches!(kind, Kind::Rmc | Kind::Gga | Kind::Gns);
+        self.draft.is_none() && self.done.as_ref().is_some_and(|(_, kinds)| kinds.iter().any(main))
+    }
+}
+
+impl Draft {
+    /// Whether it has no time yet and a sentence of this kind may give it one.
+    fn awaits(&self, kind: Kind) -> bool {
+        self.time_of_day_ns.is_none() && !self.kinds.contains(&kind)
+    }
+}
+
+fn heard(draft: &Draft, calendar: &mut Calendar) -> HeardEpoch {
+    HeardEpoch {
+        epoch: draft.finish(calendar),
+        t_first_byte: draft.begin.t_first,
+        bytes_before_end: draft.begin.first_read_bytes,
+        t_last_byte: draft.end.t_last,
+        opens_burst: draft.opens_burst,
+    }
+}

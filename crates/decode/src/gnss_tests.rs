@@ -1,0 +1,257 @@
+//! Bursts as receivers send them, and what must come of them.
+
+use proptest::prelude::*;
+
+use super::gnss::{GnssDecoder, HeardEpoch};
+use super::sentence::framed;
+use super::{DecodeCounts, Refusal};
+use windhover_base::msg::FixKind;
+use windhover_base::time::{MonoTime, Span};
+
+/// One line on the wire.
+fn line(body: &str) -> String {
+    framed(body) + "\r\n"
+}
+
+fn rmc(time: &str, lat: &str) -> String {
+    line(&format!("GPRMC,{time},A,{lat},N,08530.00000,W,010.0,090.0,010226,003.4,W,D"))
+}
+
+fn gga(time: &str, lat: &str, alt: &str) -> String {
+    line(&format!("GPGGA,{time},{lat},N,08530.00000,W,2,09,0.9,{alt},M,-27.0,M,,"))
+}
+
+fn gll(time: &str, lat: &str) -> String {
+    line(&format!("GPGLL,{lat},N,08530.00000,W,{time},A"))
+}
+
+/// A Garmin burst: RMC, GGA, GSA, PGRME, PGRMV with the second's number in altitude, error, speed.
+fn garmin(second: u32) -> String {
+    let (time, value) = (format!("1011{second:02}"), format!("{second}.5"));
+    rmc(&time, "3030.00000")
+        + &gga(&time, "3030.00000", &value)
+        + &line("GPGSA,A,3,02,04,05,09,,,,,,,,,1.6,0.9,1.3")
+        + &line(&format!("PGRME,{value},M,4.1,M,4.9,M"))
+        + &line(&format!("PGRMV,{value},-1.0,0.5"))
+}
+
+fn decode(mut decoder: GnssDecoder, text: &str) -> (Vec<HeardEpoch>, DecodeCounts) {
+    let mut out = Vec::new();
+    decoder.push(text.as_bytes(), MonoTime::default(), &mut out);
+    decoder.flush(&mut out);
+    (out, decoder.counts().clone())
+}
+
+fn seconds(epochs: &[HeardEpoch]) -> Vec<Option<i64>> {
+    epochs.iter().map(|e| e.epoch.time_of_day_ns.map(|ns| ns / 1_000_000_000 % 60)).collect()
+}
+
+#[test]
+fn an_epoch_holds_its_own_second_only() {
+    let text: String = (1..=6).map(garmin).collect();
+    for decoder in [GnssDecoder::new(), GnssDecoder::patient()] {
+        let (epochs, counts) = decode(decoder, &text);
+        assert_eq!(epochs.len(), 6, "{counts}");
+        for (index, heard) in epochs.iter().enumerate() {
+            let (epoch, value) = (heard.epoch, index as f64 + 1.5);
+            assert_eq!(
+                (epoch.fix, epoch.alt_msl_m, epoch.hpe_m),
+                (FixKind::ThreeD, Some(value), Some(value))
+            );
+            let velocity = epoch.vel_ned_mps.expect("PGRMV tells it");
+            assert_eq!((velocity.x, velocity.y, velocity.z), (-1.0, value, -0.5));
+            assert!(epoch.vel_has_down && heard.opens_burst);
+        }
+        assert_eq!(epochs[0].epoch.utc.expect("dated").to_string(), "2026-02-01T10:11:01.000Z");
+    }
+}
+
+#[test]
+fn the_last_sentence_of_a_known_cycle_gives_the_epoch_out() {
+    // Given a receiver whose bursts were seen to end with PGRMV
+    let (mut decoder, mut out) = (GnssDecoder::new(), Vec::new());
+    for second in 1..=4 {
+        decoder.push(garmin(second).as_bytes(), MonoTime::from_ns(i64::from(second) * 200_000_000), &mut out);
+    }
+    // When the fifth burst is whole, or lacks a sentence before the last
+    out.clear();
+    decoder.push(garmin(5).as_bytes(), MonoTime::from_ns(1_000_000_000), &mut out);
+    // Then its epoch is out with it
+    assert_eq!(seconds(&out), [Some(5)]);
+    let damaged = garmin(6).replace("$GPGGA", "$GPGGB");
+    decoder.push(damaged.as_bytes(), MonoTime::from_ns(1_200_000_000), &mut out);
+    assert_eq!(seconds(&out), [Some(5), Some(6)]);
+    assert_eq!(out[1].epoch.alt_msl_m, None);
+    assert_eq!(decoder.counts().refused(Refusal::BadChecksum), 1);
+}
+
+#[test]
+fn silence_gives_an_open_epoch_out() {
+    let (mut decoder, mut out) = (GnssDecoder::new(), Vec::new());
+    decoder.push(garmin(1).as_bytes(), MonoTime::default(), &mut out);
+    decoder.tick(MonoTime::default() + Span::from_ms(100.0), &mut out);
+    assert!(out.is_empty());
+    decoder.tick(MonoTime::default() + Span::from_ms(301.0), &mut out);
+    assert_eq!(seconds(&out), [Some(1)]);
+}
+
+#[test]
+fn a_gll_of_the_next_second_stays_apart() {
+    // Given the order of an old Garmin, whose GLL in the burst of one second is of the next
+    let burst = |second: u32| {
+        let time = format!("2253{second:02}");
+        rmc(&time, "3030.00000")
+            + &gga(&time, "3030.00000", "14.7")
+            + &line("GPGSA,A,3,01,,,,13,20,22,,,,28,,3.1,2.1,2.0")
+            + &gll(&format!("2253{:02}", second + 1), "3031.00000")
+            + &line("PGRME,9.1,M,15.0,M,12.0,M")
+    };
+    let text: String = (0..4).map(|n| burst(8 + 2 * n)).collect();
+    let (epochs, counts) = decode(GnssDecoder::new(), &text);
+    // Then each is an epoch of its own and the errors go with the burst, not with the GLL
+    assert_eq!(seconds(&epochs), [8, 9, 10, 11, 12, 13, 14, 15].map(Some), "{counts}");
+    for pair in epochs.chunks(2) {
+        let (main, gll) = (&pair[0], &pair[1]);
+        assert_eq!((main.epoch.lat_deg, main.epoch.hpe_m), (Some(30.5), Some(9.1)));
+        assert!((gll.epoch.lat_deg.expect("given") - (30.0 + 31.0 / 60.0)).abs() < 1e-12);
+        assert_eq!((gll.epoch.alt_msl_m, gll.epoch.hpe_m), (None, None));
+        assert!(main.opens_burst && !gll.opens_burst);
+    }
+}
+
+#[test]
+fn a_cycle_that_begins_with_gll_is_one_epoch() {
+    let burst = |second: u32| {
+        let time = format!("2253{second:02}");
+        gll(&time, "3030.00000") + &gga(&time, "3030.00000", "14.7") + &rmc(&time, "3030.00000")
+    };
+    let text: String = (1..=6).map(burst).collect();
+    let (epochs, counts) = decode(GnssDecoder::new(), &text);
+    assert_eq!(seconds(&epochs), [1, 2, 3, 4, 5, 6].map(Some), "{counts}");
+    assert!(epochs.iter().all(|heard| heard.opens_burst && heard.epoch.alt_msl_m == Some(14.7)));
+}
+
+#[test]
+fn what_lost_its_time_goes_to_no_epoch() {
+    // Given a burst whose RMC and GGA were damaged
+    let text = garmin(1) + &garmin(2).replace("GPRMC", "GPRMX").replace("GPGGA", "GPGGX") + &garmin(3);
+    let (epochs, counts) = decode(GnssDecoder::new(), &text);
+    // Then its errors and velocity are neither the second before's nor after's
+    assert_eq!(seconds(&epochs), [Some(1), Some(3)]);
+    assert_eq!((epochs[0].epoch.hpe_m, epochs[1].epoch.hpe_m), (Some(1.5), Some(3.5)));
+    assert_eq!(counts.refused(Refusal::NoTime), 3);
+}
+
+#[test]
+fn midnight_leap_second_and_missing_date() {
+    let undated = |time: &str| gga(time, "3030.00000", "10.0");
+    let eve = line("GPRMC,235959.5,A,3030.00000,N,08530.00000,W,0.0,,311216,,,A");
+    let text = undated("235958.5")
+        + &eve
+        + &undated("235959.5")
+        + &undated("235960.0")
+        + &undated("235960.5")
+        + &undated("000000.0");
+    let (epochs, _) = decode(GnssDecoder::patient(), &text);
+    let utc: Vec<String> =
+        epochs.iter().map(|e| e.epoch.utc.map_or_else(|| "none".to_owned(), |utc| utc.to_string())).collect();
+    let day = "2017-01-01T00:00:00";
+    let expected = [
+        "none".to_owned(),
+        "2016-12-31T23:59:59.500Z".to_owned(),
+        format!("{day}.000Z"),
+        format!("{day}.500Z"),
+        format!("{day}.000Z"),
+    ];
+    assert_eq!(utc, expected);
+    assert_eq!(epochs[2].epoch.time_of_day_ns, Some(86_400_000_000_000));
+}
+
+#[test]
+fn a_receiver_without_time_or_fix_is_heard() {
+    let burst =
+        line("GPRMC,,V,,,,,,,260810,1.0,E,N") + &line("GPGGA,,,,,,0,00,,,M,,M,,") + &line("PGRME,,M,,M,,M");
+    let (epochs, _) = decode(GnssDecoder::new(), &burst.repeat(5));
+    assert_eq!(epochs.len(), 5);
+    assert!(epochs.iter().all(|heard| heard.epoch.fix == FixKind::None && heard.epoch.utc.is_none()));
+}
+
+#[test]
+fn a_void_sentence_voids_its_epoch() {
+    let void = line("GPRMC,101101,V,3030.00000,N,08530.00000,W,010.0,090.0,010226,003.4,W,N");
+    let text = gga("101101", "3030.00000", "10.0") + &void;
+    let (epochs, counts) = decode(GnssDecoder::patient(), &text);
+    assert_eq!(epochs.len(), 1, "{counts}");
+    assert_eq!(
+        (epochs[0].epoch.fix, epochs[0].epoch.lat_deg, epochs[0].epoch.sats),
+        (FixKind::None, None, Some(9))
+    );
+}
+
+#[test]
+fn a_fix_of_no_satellites_needs_another_witness() {
+    let empty = line("GPGGA,101101,3030.00000,N,08530.00000,W,1,00,3.3,10.0,M,-27.0,M,,");
+    let fix = |text: &str| decode(GnssDecoder::patient(), text).0[0].epoch.fix;
+    assert_eq!(fix(&empty), FixKind::None);
+    assert_eq!(fix(&(rmc("101101", "3030.00000") + &empty)), FixKind::ThreeD);
+}
+
+#[test]
+fn velocity_without_garmin_is_of_speed_and_course() {
+    let (epochs, _) = decode(GnssDecoder::patient(), &rmc("101101", "3030.00000"));
+    let velocity = epochs[0].epoch.vel_ned_mps.expect("speed and course are given");
+    assert!(velocity.x.abs() < 1e-9 && (velocity.y - 5.144_444).abs() < 1e-5 && velocity.z == 0.0);
+    assert!(!epochs[0].epoch.vel_has_down);
+    let slow = line("GPRMC,101101,A,3030.00000,N,08530.00000,W,0.048,,010226,,,A");
+    let (epochs, _) = decode(GnssDecoder::patient(), &slow);
+    assert_eq!(epochs[0].epoch.vel_ned_mps, None, "a speed without a direction");
+}
+
+proptest! {
+    #[test]
+    fn any_bytes_are_survived(bytes in prop::collection::vec(any::<u8>(), 0..4_000)) {
+        let (mut decoder, mut out) = (GnssDecoder::new(), Vec::new());
+        decoder.push(&bytes, MonoTime::default(), &mut out);
+        decoder.flush(&mut out);
+        prop_assert!(out.is_empty(), "noise is not a fix");
+    }
+
+    #[test]
+    fn sound_frames_of_any_fields_are_survived(
+        bodies in prop::collection::vec(
+            "(GP(RMC|GGA|GLL|GSA|VTG|ZDA|GNS)|PGRM(E|V|F))(,[-.0-9A-Z]{0,7}){0,18}", 0..40),
+    ) {
+        let text: String = bodies.iter().map(|body| line(body)).collect();
+        let (epochs, _) = decode(GnssDecoder::new(), &text);
+        for heard in epochs {
+            let epoch = heard.epoch;
+            prop_assert!(epoch.lat_deg.is_none_or(|lat| (-90.0..=90.0).contains(&lat)));
+            prop_assert!(epoch.lon_deg.is_none_or(|lon| (-180.0..=180.0).contains(&lon)));
+            prop_assert!(epoch.alt_msl_m.is_none_or(f64::is_finite));
+        }
+    }
+
+    #[test]
+    fn where_reads_cut_the_stream_changes_nothing(
+        cuts in prop::collection::vec(1usize..40, 1..60),
+        damage in prop::collection::vec((0usize..1_500, any::<u8>()), 0..6),
+    ) {
+        let mut bytes: Vec<u8> = (1..=6).flat_map(|second| garmin(second).into_bytes()).collect();
+        for (at, byte) in damage {
+            let at = at % bytes.len();
+            bytes[at] = byte;
+        }
+        let (mut whole, mut at_once) = (GnssDecoder::new(), Vec::new());
+        whole.push(&bytes, MonoTime::default(), &mut at_once);
+        let (mut cut, mut in_pieces) = (GnssDecoder::new(), Vec::new());
+        let (mut rest, mut sizes) = (&bytes[..], cuts.iter().cycle());
+        while !rest.is_empty() {
+            let (read, after) = rest.split_at((*sizes.next().expect("endless")).min(rest.len()));
+            cut.push(read, MonoTime::default(), &mut in_pieces);
+            rest = after;
+        }
+        let epochs = |heard: &[HeardEpoch]| heard.iter().map(|h| h.epoch).collect::<Vec<_>>();
+        prop_assert_eq!(epochs(&at_once), epochs(&in_pieces));
+        prop_assert_eq!(whole.counts(), cut.counts());
+    }
+}

@@ -1,0 +1,186 @@
+//! What one sentence says of a fix, whatever sentence it was.
+
+use nalgebra::Vector3;
+
+use super::counts::Refusal;
+use super::sentence::number;
+use windhover_base::msg::FixKind;
+use windhover_base::time::{NS_PER_S, days_in_month};
+
+/// Sentences an epoch is made of.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub(super) enum Kind {
+    Gga,
+    Gns,
+    Rmc,
+    Gll,
+    Pgrmf,
+    Gsa,
+    Vtg,
+    Zda,
+    Pgrme,
+    Pgrmv,
+}
+
+impl Kind {
+    /// Whether the sentence has a field for the time, filled or not.
+    pub(super) const fn tells_time(self) -> bool {
+        matches!(self, Self::Gga | Self::Gns | Self::Rmc | Self::Gll | Self::Pgrmf | Self::Zda)
+    }
+}
+
+/// A calendar date.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) struct Date {
+    pub year: i32,
+    pub month: u8,
+    pub day: u8,
+}
+
+impl Date {
+    /// Checked; `None` where there is no such day.
+    pub(super) fn new(year: i32, month: u8, day: u8) -> Option<Self> {
+        let real = (1..=12).contains(&month) && day >= 1 && day <= days_in_month(year, month);
+        real.then_some(Self { year, month, day })
+    }
+
+    /// `ddmmyy` as RMC and PGRMF give it; years 83 to 99 are of the last century, since NMEA 0183
+    /// is of 1983. `None` where empty or no day.
+    pub(super) fn of_ddmmyy(text: &str) -> Option<Self> {
+        if text.len() != 6 || !text.bytes().all(|byte| byte.is_ascii_digit()) {
+            return None;
+        }
+        let two = |from: usize| text[from..from + 2].parse::<u8>().ok();
+        let year = i32::from(two(4)?);
+        Self::new(if year >= 83 { 1900 + year } else { 2000 + year }, two(2)?, two(0)?)
+    }
+}
+
+/// What one sentence says. Positions and motion are left out where the sentence calls them void.
+#[derive(Clone, PartialEq, Debug)]
+pub(super) struct Report {
+    /// Which sentence.
+    pub kind: Kind,
+    /// Nanoseconds since UTC midnight; from 86 400 s on during a leap second.
+    pub time_of_day_ns: Option<i64>,
+    pub date: Option<Date>,
+    /// Whether the sentence calls its fix valid.
+    pub valid: Option<bool>,
+    /// Kind of fix where the sentence tells it.
+    pub fix: Option<FixKind>,
+    /// Latitude and longitude, degrees.
+    pub position_deg: Option<(f64, f64)>,
+    pub alt_msl_m: Option<f64>,
+    pub geoid_m: Option<f64>,
+    pub speed_mps: Option<f64>,
+    pub course_deg: Option<f64>,
+    pub vel_ned_mps: Option<Vector3<f64>>,
+    pub hpe_m: Option<f64>,
+    pub vpe_m: Option<f64>,
+    /// Satellites used, as a count.
+    pub sats: Option<u32>,
+    /// Satellites used, as GSA lists them; GSA comes once for each constellation.
+    pub sats_listed: Option<u32>,
+    pub hdop: Option<f64>,
+}
+
+impl Report {
+    pub(super) const fn new(kind: Kind) -> Self {
+        Self {
+            kind,
+            time_of_day_ns: None,
+            date: None,
+            valid: None,
+            fix: None,
+            position_deg: None,
+            alt_msl_m: None,
+            geoid_m: None,
+            speed_mps: None,
+            course_deg: None,
+            vel_ned_mps: None,
+            hpe_m: None,
+            vpe_m: None,
+            sats: None,
+            sats_listed: None,
+            hdop: None,
+        }
+    }
+}
+
+/// Time of day from `hhmmss[.fraction]`, nanoseconds; second 60 only in the day's last minute.
+pub(super) fn time_of_day_ns(text: &str) -> Result<Option<i64>, Refusal> {
+    if text.is_empty() {
+        return Ok(None);
+    }
+    let (whole, fraction) = text.split_once('.').unwrap_or((text, ""));
+    let digits = |part: &str| part.bytes().all(|byte| byte.is_ascii_digit());
+    if whole.len() != 6 || !digits(whole) || !digits(fraction) || fraction.len() > 9 {
+        return Err(Refusal::Malformed);
+    }
+    let two = |from: usize| whole[from..from + 2].parse::<i64>().map_err(|_| Refusal::Malformed);
+    let (hour, minute, second) = (two(0)?, two(2)?, two(4)?);
+    let leap = (hour, minute, second) == (23, 59, 60);
+    if hour > 23 || minute > 59 || (second > 59 && !leap) {
+        return Err(Refusal::OutOfRange);
+    }
+    let fraction_ns: i64 = format!("{fraction:0<9}").parse().map_err(|_| Refusal::Malformed)?;
+    Ok(Some((hour * 3600 + minute * 60 + second) * NS_PER_S + fraction_ns))
+}
+
+/// Degrees from `dddmm.mmmm` and its hemisphere letter; `None` where both are empty.
+pub(super) fn angle_deg(
+    text: &str,
+    letter: &str,
+    positive: &str,
+    negative: &str,
+) -> Result<Option<f64>, Refusal> {
+    let limit = if positive == "N" { 90.0 } else { 180.0 };
+    let Some(value) = number(text, 0.0, limit * 100.0)? else {
+        return Ok(None);
+    };
+    let degrees = (value / 100.0).trunc();
+    let minutes = value - degrees * 100.0;
+    let angle = degrees + minutes / 60.0;
+    if minutes >= 60.0 || angle > limit {
+        return Err(Refusal::OutOfRange);
+    }
+    match letter {
+        l if l == positive => Ok(Some(angle)),
+        l if l == negative => Ok(Some(-angle)),
+        _ => Err(Refusal::Malformed),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_of_day_to_the_nanosecond() {
+        assert_eq!(time_of_day_ns("000001.2"), Ok(Some(1_200_000_000)));
+        assert_eq!(time_of_day_ns("235960.5"), Ok(Some(86_400_500_000_000)));
+        assert_eq!(time_of_day_ns(""), Ok(None));
+        assert_eq!(time_of_day_ns("115960"), Err(Refusal::OutOfRange));
+        assert_eq!(time_of_day_ns("240000"), Err(Refusal::OutOfRange));
+        assert_eq!(time_of_day_ns("1234567"), Err(Refusal::Malformed));
+        assert_eq!(time_of_day_ns("12-456"), Err(Refusal::Malformed));
+    }
+
+    #[test]
+    fn angles_are_degrees_and_minutes() {
+        assert_eq!(angle_deg("4530.000", "S", "N", "S"), Ok(Some(-45.5)));
+        assert_eq!(angle_deg("09900.000", "W", "E", "W"), Ok(Some(-99.0)));
+        assert_eq!(angle_deg("9912.0", "N", "N", "S"), Err(Refusal::OutOfRange));
+        assert_eq!(angle_deg("4560.0", "N", "N", "S"), Err(Refusal::OutOfRange));
+        assert_eq!(angle_deg("4530.0", "", "N", "S"), Err(Refusal::Malformed));
+        assert_eq!(angle_deg("", "", "N", "S"), Ok(None));
+    }
+
+    #[test]
+    fn dates_are_days_that_exist() {
+        assert_eq!(Date::of_ddmmyy("290224"), Date::new(2024, 2, 29));
+        assert!(Date::of_ddmmyy("290223").is_none());
+        assert!(Date::of_ddmmyy("000000").is_none());
+        assert_eq!(Date::of_ddmmyy("060183").map(|date| date.year), Some(1983));
+    }
+}

@@ -1,0 +1,262 @@
+//! Dark pixels: thresholds from the local range of 4×4 tiles, one bit a pixel.
+
+use super::simd::{Simd, TILE};
+use windhover_base::msg::ImageView;
+
+/// One bit a pixel, lowest first; set where the pixel is dark. Bits past the width are zero.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Bitmap {
+    pub width: usize,
+    pub height: usize,
+    words: Vec<u64>,
+}
+
+impl Bitmap {
+    /// From one truth value a pixel.
+    #[cfg(test)]
+    pub fn from_pixels(width: usize, height: usize, dark: &[bool]) -> Self {
+        let per_row = width.div_ceil(64);
+        let mut words = vec![0; per_row * height];
+        for (i, _) in dark.iter().enumerate().filter(|(_, d)| **d) {
+            words[i / width * per_row + i % width / 64] |= 1 << (i % width % 64);
+        }
+        Self { width, height, words }
+    }
+
+    /// The words of a row.
+    pub fn row(&self, v: usize) -> &[u64] {
+        let per_row = self.width.div_ceil(64);
+        &self.words[v * per_row..(v + 1) * per_row]
+    }
+}
+
+/// Least range over maximum, of 256, that counts as contrast: ink is a fifth to a tenth as light as paper, and
+/// blur and haze take some of that away, while most ground varies less.
+const LEAST_RELATIVE: u8 = 70;
+
+/// Where more of the image than `BUSY_SHARE` has that contrast, only what has most is looked at, but all that
+/// has this much: a tag that is read keeps it, and coarse gravel does not cost more than grass.
+const ENOUGH_RELATIVE: u8 = 160;
+const BUSY_SHARE: f32 = 0.3;
+
+/// Tiles on a side of the blocks whose light is compared, and by what factor it differs among a block and its
+/// neighbours where a shadow ends.
+const BLOCK: usize = 8;
+const LIGHT_STEP: f32 = 1.5;
+
+/// Thresholds an image against its surroundings, 12×12 pixels around each tile.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Binariser {
+    low: Vec<u8>,
+    high: Vec<u8>,
+    wide_low: Vec<u8>,
+    wide_high: Vec<u8>,
+    scratch: Vec<u8>,
+    /// Range over maximum around every tile, of 256; nought below the gate.
+    relative: Vec<u8>,
+    /// The least of these that counts in this image.
+    least_relative: u8,
+    thresholds: Vec<u8>,
+    tiles: (usize, usize),
+    /// Mean of the local maxima of each block of tiles.
+    lights: Vec<f32>,
+}
+
+/// Where dark pixels are looked for.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Where {
+    Everywhere,
+    /// Where light and shade are near each other.
+    LightChanges,
+}
+
+impl Binariser {
+    /// Measures the range around every tile of an image. Only ranges of at least `gate` count.
+    pub fn measure(&mut self, image: ImageView<'_>, gate: u8, simd: Simd) {
+        let (across, down) = (image.width.div_ceil(TILE), image.height.div_ceil(TILE));
+        self.tiles = (across, down);
+        let Self { low, high, wide_low, wide_high, relative, .. } = self;
+        for buffer in [low, high, wide_low, wide_high, relative] {
+            buffer.resize(across * down, 0);
+        }
+        for tile in 0..down {
+            let row = |k: usize| image.row((tile * TILE + k).min(image.height - 1));
+            let part = tile * across..(tile + 1) * across;
+            simd.tile_range(
+                [row(0), row(1), row(2), row(3)],
+                &mut self.low[part.clone()],
+                &mut self.high[part],
+            );
+        }
+        widen(&self.low, &mut self.wide_low, &mut self.scratch, across, u8::min);
+        widen(&self.high, &mut self.wide_high, &mut self.scratch, across, u8::max);
+        self.weigh(gate);
+    }
+
+    /// Fills in `relative` and `least_relative`: see `BUSY_SHARE`.
+    fn weigh(&mut self, gate: u8) {
+        let mut tiles = [0u32; 256];
+        for ((r, &low), &high) in self.relative.iter_mut().zip(&self.wide_low).zip(&self.wide_high) {
+            let range = high - low;
+            *r = if range >= gate { relative(range, high) } else { 0 };
+            tiles[usize::from(*r)] += 1;
+        }
+        let budget = (BUSY_SHARE * self.wide_low.len() as f32) as u32;
+        let from = |r: u8| tiles[usize::from(r)];
+        let (mut least, mut passed) = (ENOUGH_RELATIVE, (ENOUGH_RELATIVE..=u8::MAX).map(from).sum::<u32>());
+        while least > LEAST_RELATIVE && passed + from(least - 1) <= budget {
+            least -= 1;
+            passed += from(least);
+        }
+        self.least_relative = least;
+    }
+
+    /// Whether more of the image has all the contrast a tag has than can be looked at cheaply.
+    pub fn is_busy(&self) -> bool {
+        self.least_relative == ENOUGH_RELATIVE
+    }
+
+    /// Marks pixels below `fraction`/256 of the way from the local minimum to the local maximum, where
+    /// the minimum is well below the maximum; elsewhere nothing is dark.
+    pub fn mark(&mut self, image: ImageView<'_>, fraction: u16, at: Where, out: &mut Bitmap, simd: Simd) {
+        let (across, down) = self.tiles;
+        self.thresholds.resize(across * down, 0);
+        let least = self.least_relative;
+        let measured = self.wide_low.iter().zip(&self.wide_high).zip(&self.relative);
+        for (t, ((&low, &high), &relative)) in self.thresholds.iter_mut().zip(measured) {
+            let above = (u16::from(high - low) * fraction + 128) >> 8;
+            *t = if relative >= least { low + above as u8 } else { 0 };
+        }
+        if at == Where::LightChanges {
+            self.clear_even_light();
+        }
+        let per_row = image.width.div_ceil(64);
+        (out.width, out.height) = (image.width, image.height);
+        out.words.resize(per_row * image.height, 0);
+        for (v, words) in out.words.chunks_exact_mut(per_row).enumerate() {
+            let tile = v / TILE;
+            simd.pack_below(image.row(v), &self.thresholds[tile * across..(tile + 1) * across], words);
+        }
+    }
+
+    /// Takes the thresholds away where the light of a block and its neighbours is much the same.
+    fn clear_even_light(&mut self) {
+        let (across, down) = self.tiles;
+        let (wide, high) = (across.div_ceil(BLOCK), down.div_ceil(BLOCK));
+        let span = |block: usize, tiles: usize| block * BLOCK..tiles.min((block + 1) * BLOCK);
+        self.lights.clear();
+        for (y, x) in (0..high).flat_map(|y| (0..wide).map(move |x| (y, x))) {
+            let (rows, columns) = (span(y, down), span(x, across));
+            let count = (rows.len() * columns.len()) as f32;
+            let row = |v: usize| &self.wide_high[v * across..][columns.clone()];
+            let sum: u32 = rows.flat_map(row).map(|&h| u32::from(h)).sum();
+            self.lights.push(sum as f32 / count);
+        }
+        for (y, x) in (0..high).flat_map(|y| (0..wide).map(move |x| (y, x))) {
+            let (mut least, mut most) = (f32::MAX, 0.0f32);
+            for v in y.saturating_sub(1)..(y + 2).min(high) {
+                for &light in &self.lights[v * wide + x.saturating_sub(1)..v * wide + (x + 2).min(wide)] {
+                    (least, most) = (least.min(light), most.max(light));
+                }
+            }
+            if most < LIGHT_STEP * least {
+                let columns = span(x, across);
+                span(y, down).for_each(|v| self.thresholds[v * across..][columns.clone()].fill(0));
+            }
+        }
+    }
+}
+
+/// `RECIPROCALS[n]` = 255 · 2¹⁶ / n, rounded up: products with up to n, shifted back, are exact.
+const RECIPROCALS: [u32; 256] = {
+    let mut table = [0; 256];
+    let mut n = 1;
+    while n < 256 {
+        table[n] = (255u32 << 16).div_ceil(n as u32);
+        n += 1;
+    }
+    table
+};
+
+/// Range over maximum, of 255, without a division.
+fn relative(range: u8, high: u8) -> u8 {
+    ((u32::from(range) * RECIPROCALS[usize::from(high)]) >> 16) as u8
+}
+
+/// Extreme over 3×3 tiles.
+fn widen(from: &[u8], to: &mut [u8], scratch: &mut Vec<u8>, across: usize, pick: impl Fn(u8, u8) -> u8) {
+    let down = from.len() / across;
+    scratch.resize(across, 0);
+    for tile in 0..down {
+        let row = |t: usize| &from[t * across..(t + 1) * across];
+        let (above, here, below) = (row(tile.saturating_sub(1)), row(tile), row((tile + 1).min(down - 1)));
+        for (((s, &a), &b), &c) in scratch.iter_mut().zip(above).zip(here).zip(below) {
+            *s = pick(pick(a, b), c);
+        }
+        let to = &mut to[tile * across..(tile + 1) * across];
+        to[0] = pick(scratch[0], scratch[1.min(across - 1)]);
+        to[across - 1] = pick(scratch[across - 1], scratch[across.saturating_sub(2)]);
+        if across > 2 {
+            for (t, s) in to[1..across - 1].iter_mut().zip(scratch.windows(3)) {
+                *t = pick(pick(s[0], s[1]), s[2]);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use windhover_base::msg::GrayImage;
+
+    #[test]
+    fn a_dark_square_on_light_ground_is_marked() {
+        let mut image = GrayImage::from_vec(40, 30, vec![200; 1200]).expect("size");
+        for v in 10..18 {
+            (12..22).for_each(|u| image.data[v * 40 + u] = 20);
+        }
+        let (mut binariser, mut bits) = (Binariser::default(), Bitmap::default());
+        binariser.measure(image.view(), 30, Simd::best());
+        binariser.mark(image.view(), 128, Where::Everywhere, &mut bits, Simd::best());
+        for v in 0..30 {
+            for u in 0..40 {
+                let dark = bits.row(v)[u / 64] >> (u % 64) & 1 == 1;
+                assert_eq!(dark, image.data[v * 40 + u] == 20, "({u}, {v})");
+            }
+        }
+        binariser.measure(image.view(), 190, Simd::best());
+        binariser.mark(image.view(), 128, Where::Everywhere, &mut bits, Simd::best());
+        assert!((0..30).all(|v| bits.row(v)[0] == 0), "a gate above the contrast leaves nothing");
+    }
+
+    #[test]
+    fn low_divisions_look_where_light_changes() {
+        // A chequer of three pixels, the right half in shadow: all of it has all the contrast a tag has.
+        let light = |u: usize, v: usize| match (u / 3 + v / 3) % 2 {
+            0 => 20,
+            _ if u < 160 => 200,
+            _ => 100,
+        };
+        let pixels = (0..320 * 128).map(|i| light(i % 320, i / 320)).collect();
+        let image = GrayImage::from_vec(320, 128, pixels).expect("size");
+        let (mut binariser, mut bits) = (Binariser::default(), Bitmap::default());
+        binariser.measure(image.view(), 30, Simd::best());
+        assert!(binariser.is_busy());
+        let marked = |bits: &Bitmap| -> Vec<bool> {
+            (0..5).map(|word| (0..128).any(|v| bits.row(v)[word] != 0)).collect()
+        };
+        binariser.mark(image.view(), 72, Where::Everywhere, &mut bits, Simd::best());
+        assert_eq!(marked(&bits), [true; 5]);
+        binariser.mark(image.view(), 72, Where::LightChanges, &mut bits, Simd::best());
+        assert_eq!(marked(&bits), [false, false, true, false, false], "only about the shadow's edge");
+    }
+
+    #[test]
+    fn reciprocals_divide_exactly() {
+        for high in 1..=255u8 {
+            for range in 0..=high {
+                assert_eq!(u32::from(relative(range, high)), u32::from(range) * 255 / u32::from(high));
+            }
+        }
+    }
+}

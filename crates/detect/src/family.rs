@@ -1,0 +1,252 @@
+//! Tag families: where their cells lie and which word a grid of bits is nearest to.
+//!
+//! A tag is a grid of unit cells. Its border, the square that is found in the image, is `width`
+//! cells on a side and cell (0, 0) is the border's top-left one. Around it lies a ring of the other
+//! colour; tagStandard41h12 has its data outside that ring as well, and its border is the light
+//! square inside a dark ring: it is looked for in the inverted image.
+
+use super::codes;
+use windhover_base::msg::TagFamily;
+
+/// What a grid of bits was recognised as.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) struct Word {
+    /// Identity.
+    pub id: u32,
+    /// Wrong bits.
+    pub hamming: u8,
+    /// The tag's corner `i` is the quadrilateral's corner `(i + turns) % 4`.
+    pub turns: usize,
+}
+
+/// One family, ready for lookup.
+#[derive(Clone, Debug)]
+pub(super) struct Family {
+    /// Which.
+    pub family: TagFamily,
+    /// Border cells on a side.
+    pub width: usize,
+    /// Cells sampled around the border: 1, or 2 where data lie outside.
+    pub pad: usize,
+    /// Whether the border is light inside a dark ring.
+    pub inverted: bool,
+    /// Data cells (x, y), first in the word's top bit.
+    pub cells: Vec<(i32, i32)>,
+    codes: &'static [u64],
+    /// For each of four turns, the grid index of every data cell.
+    turned: [Vec<u16>; 4],
+    index: ChunkIndex,
+}
+
+impl Family {
+    /// The tables of a family; `max_hamming` is cut to what keeps chance matches rare.
+    ///
+    /// With N codes of n bits, a random grid matches within h errors in one of four turns with
+    /// probability about `4 N Σ C(n, k) / 2ⁿ`. The limits keep that below 2·10⁻⁴ save for 16h5,
+    /// whose 2·10⁻³ at h = 0 is what its few bits allow.
+    pub fn new(family: TagFamily, max_hamming: u8) -> Self {
+        let (width, pad, inverted, limit, codes): (usize, usize, bool, u8, &'static [u64]) = match family {
+            TagFamily::Tag36h11 => (8, 1, false, 2, &codes::TAG36H11),
+            TagFamily::Tag25h9 => (7, 1, false, 1, &codes::TAG25H9),
+            TagFamily::Tag16h5 => (6, 1, false, 0, &codes::TAG16H5),
+            TagFamily::Tag41h12 => (5, 2, true, 3, &codes::TAG41H12),
+        };
+        let cells = data_cells(width, pad);
+        let turned = std::array::from_fn(|turns| {
+            cells.iter().map(|&cell| grid_index(turn(cell, width, turns), width, pad)).collect()
+        });
+        let max_hamming = max_hamming.min(limit);
+        let index = ChunkIndex::new(codes, cells.len(), max_hamming);
+        Self { family, width, pad, inverted, cells, codes, turned, index }
+    }
+
+    /// Cells on a side of the sampled grid.
+    pub fn grid_side(&self) -> usize {
+        self.width + 2 * self.pad
+    }
+
+    /// The bit of data cell `cell` of tag `id`: true for white in the (possibly inverted) image.
+    pub fn bit(&self, id: u32, cell: usize) -> bool {
+        let bit = self.codes[id as usize] >> (self.cells.len() - 1 - cell) & 1 == 1;
+        bit != self.inverted
+    }
+
+    /// Whether cell (x, y) of tag `id` is light in the (possibly inverted) image: data, border (dark) or the
+    /// ring around it (light). `None` beyond the ring, where it is not known.
+    pub fn is_light(&self, id: u32, x: i32, y: i32) -> Option<bool> {
+        let w = self.width as i32;
+        let inside = |margin: i32| (margin..w - margin).contains(&x) && (margin..w - margin).contains(&y);
+        if !inside(-1) {
+            return None;
+        }
+        if inside(1) {
+            let cell = self.cells.iter().position(|&c| c == (x, y))?;
+            return Some(self.bit(id, cell));
+        }
+        Some(!inside(0))
+    }
+
+    /// The word nearest to a grid of bits (`grid_side²`, row by row, true for white), if any is near
+    /// enough.
+    pub fn find(&self, grid: &[bool]) -> Option<Word> {
+        let mut best: Option<Word> = None;
+        for (turns, order) in self.turned.iter().enumerate() {
+            let word =
+                order.iter().fold(0, |word, &i| word << 1 | u64::from(grid[usize::from(i)] != self.inverted));
+            if let Some((id, hamming)) = self.index.nearest(word, self.codes)
+                && best.is_none_or(|b| hamming < b.hamming)
+            {
+                best = Some(Word { id, hamming, turns });
+            }
+        }
+        best
+    }
+}
+
+/// Data cells row by row: all inside the border ring, and the outermost ring where `pad` is 2.
+fn data_cells(width: usize, pad: usize) -> Vec<(i32, i32)> {
+    let (w, p) = (width as i32, pad as i32);
+    let mut cells = Vec::new();
+    for y in -p..w + p {
+        for x in -p..w + p {
+            let inside = |margin: i32| (margin..w - margin).contains(&x) && (margin..w - margin).contains(&y);
+            if inside(1) || (p == 2 && !inside(-1)) {
+                cells.push((x, y));
+            }
+        }
+    }
+    cells
+}
+
+/// A cell after `turns` quarter turns, clockwise as seen, about the tag's centre.
+fn turn((x, y): (i32, i32), width: usize, turns: usize) -> (i32, i32) {
+    (0..turns).fold((x, y), |(x, y), _| (width as i32 - 1 - y, x))
+}
+
+fn grid_index((x, y): (i32, i32), width: usize, pad: usize) -> u16 {
+    let side = width + 2 * pad;
+    ((y + pad as i32) as usize * side + (x + pad as i32) as usize) as u16
+}
+
+/// Exact-chunk index: of `h + 1` chunks of a word with at most `h` wrong bits, one is exact.
+#[derive(Clone, Debug)]
+struct ChunkIndex {
+    max_hamming: u8,
+    chunks: Vec<Chunk>,
+}
+
+#[derive(Clone, Debug)]
+struct Chunk {
+    shift: u32,
+    mask: u64,
+    /// Where the ids of each chunk value start in `ids`.
+    starts: Vec<u32>,
+    ids: Vec<u32>,
+}
+
+impl ChunkIndex {
+    fn new(codes: &[u64], bits: usize, max_hamming: u8) -> Self {
+        let count = usize::from(max_hamming) + 1;
+        // At most 14 bits a chunk keep the tables small; more chunks than needed do no harm.
+        let count = count.max(bits.div_ceil(14));
+        let chunks =
+            (0..count).map(|k| Chunk::new(codes, bits * k / count, bits * (k + 1) / count)).collect();
+        Self { max_hamming, chunks }
+    }
+
+    fn nearest(&self, word: u64, codes: &[u64]) -> Option<(u32, u8)> {
+        let mut best: Option<(u32, u8)> = None;
+        for chunk in &self.chunks {
+            for &id in chunk.sharing(word) {
+                let hamming = (codes[id as usize] ^ word).count_ones() as u8;
+                if hamming <= self.max_hamming && best.is_none_or(|b| hamming < b.1) {
+                    best = Some((id, hamming));
+                }
+            }
+        }
+        best
+    }
+}
+
+impl Chunk {
+    fn new(codes: &[u64], low: usize, high: usize) -> Self {
+        let (shift, mask) = (low as u32, (1 << (high - low)) - 1);
+        let value = |code: u64| (code >> shift & mask) as usize;
+        let mut starts = vec![0u32; mask as usize + 2];
+        codes.iter().for_each(|&code| starts[value(code) + 1] += 1);
+        (1..starts.len()).for_each(|i| starts[i] += starts[i - 1]);
+        let mut next = starts.clone();
+        let mut ids = vec![0; codes.len()];
+        for (id, &code) in codes.iter().enumerate() {
+            let slot = &mut next[value(code)];
+            ids[*slot as usize] = id as u32;
+            *slot += 1;
+        }
+        Self { shift, mask, starts, ids }
+    }
+
+    fn sharing(&self, word: u64) -> &[u32] {
+        let value = (word >> self.shift & self.mask) as usize;
+        &self.ids[self.starts[value] as usize..self.starts[value + 1] as usize]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grid_of(family: &Family, id: u32, turns: usize) -> Vec<bool> {
+        let mut grid = vec![false; family.grid_side() * family.grid_side()];
+        for (i, &cell) in family.cells.iter().enumerate() {
+            let at = grid_index(turn(cell, family.width, turns), family.width, family.pad);
+            grid[usize::from(at)] = family.bit(id, i);
+        }
+        grid
+    }
+
+    #[test]
+    fn every_word_is_found_in_every_turn() {
+        for family in TagFamily::ALL {
+            let table = Family::new(family, 3);
+            assert_eq!(table.codes.len(), family.codes());
+            for id in 0..family.codes() as u32 {
+                for turns in 0..4 {
+                    let found = table.find(&grid_of(&table, id, turns));
+                    assert_eq!(found, Some(Word { id, hamming: 0, turns }), "{}", family.name());
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn wrong_bits_are_corrected_up_to_the_limit() {
+        let table = Family::new(TagFamily::Tag36h11, 2);
+        for wrong in [[3usize, 17], [0, 35], [11, 12]] {
+            let mut grid = grid_of(&table, 42, 1);
+            for w in wrong {
+                let at = usize::from(table.turned[1][w]);
+                grid[at] = !grid[at];
+            }
+            assert_eq!(table.find(&grid), Some(Word { id: 42, hamming: 2, turns: 1 }));
+            let at = usize::from(table.turned[1][20]);
+            grid[at] = !grid[at];
+            assert_eq!(table.find(&grid), None);
+        }
+    }
+
+    #[test]
+    fn words_are_as_far_apart_as_their_family_says() {
+        for (family, distance) in [
+            (TagFamily::Tag36h11, 11),
+            (TagFamily::Tag25h9, 9),
+            (TagFamily::Tag16h5, 5),
+            (TagFamily::Tag41h12, 12),
+        ] {
+            let codes = Family::new(family, 0).codes;
+            let nearest = (0..codes.len().min(400))
+                .flat_map(|i| (i + 1..codes.len()).map(move |j| (codes[i] ^ codes[j]).count_ones()))
+                .min();
+            assert!(nearest.is_some_and(|n| n >= distance), "{}: {nearest:?}", family.name());
+        }
+    }
+}

@@ -1,0 +1,154 @@
+//! Box-averaged image pyramid: a first reduction by 3/2 or 2, then halvings.
+//!
+//! A pixel is the mean of the square of frame pixels it covers. With pixel centres at integers, a level of
+//! scale `s` relates to the frame by `u_frame + ½ = s (u_level + ½)`.
+
+use super::simd::Simd;
+use windhover_base::msg::{GrayImage, ImageView};
+
+/// How the first level comes from the frame.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Base {
+    /// It is the frame.
+    Full,
+    /// Three pixels become two.
+    TwoThirds,
+    /// Two pixels become one.
+    Half,
+}
+
+/// An image and how many frame pixels are one of its own.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(super) struct Level<'a> {
+    pub image: ImageView<'a>,
+    pub scale: f32,
+}
+
+impl Level<'_> {
+    /// Coordinates in this level of coordinates in the frame.
+    pub fn of_frame(self, u: f32) -> f32 {
+        (u + 0.5) / self.scale - 0.5
+    }
+
+    /// Coordinates in the frame of coordinates in this level.
+    pub fn to_frame(self, u: f32) -> f32 {
+        (u + 0.5) * self.scale - 0.5
+    }
+}
+
+/// Levels below the frame itself, biggest first; keeps its buffers.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Pyramid {
+    levels: Vec<GrayImage>,
+    scales: Vec<f32>,
+}
+
+/// Most levels: a cell of a tag as wide as the largest image is then a few pixels.
+const MOST_LEVELS: usize = 8;
+
+impl Pyramid {
+    /// Builds as many levels as leave at least `least` pixels on the shorter side.
+    pub fn build(&mut self, image: ImageView<'_>, base: Base, least: usize, simd: Simd) {
+        self.scales.clear();
+        let mut scale = 1.0;
+        let (mut width, mut height) = (image.width, image.height);
+        for n in 0..MOST_LEVELS {
+            let first_by_thirds = n == 0 && base == Base::TwoThirds;
+            let reduced = |size: usize| if first_by_thirds { size / 3 * 2 } else { size / 2 };
+            if reduced(width).min(reduced(height)) < least.max(1) {
+                break;
+            }
+            (width, height) = (reduced(width), reduced(height));
+            scale *= if first_by_thirds { 1.5 } else { 2.0 };
+            if self.levels.len() == n {
+                self.levels.push(GrayImage::default());
+            }
+            let (below, rest) = self.levels.split_at_mut(n);
+            let level = &mut rest[0];
+            (level.width, level.height, level.stride) = (width, height, width);
+            level.data.resize(width * height, 0);
+            let below = below.last().map_or(image, |b| b.view());
+            if first_by_thirds {
+                two_thirds(below, level, simd);
+            } else {
+                halve(below, level, simd);
+            }
+            self.scales.push(scale);
+        }
+    }
+
+    /// How many levels there are, the frame included.
+    pub fn len(&self) -> usize {
+        self.scales.len() + 1
+    }
+
+    /// Level 0 is the frame.
+    pub fn level<'a>(&'a self, image: ImageView<'a>, n: usize) -> Level<'a> {
+        match n {
+            0 => Level { image, scale: 1.0 },
+            n => Level { image: self.levels[n - 1].view(), scale: self.scales[n - 1] },
+        }
+    }
+
+    /// The coarsest level in which something `size` frame pixels wide still is `least` pixels wide.
+    pub fn for_size<'a>(&'a self, image: ImageView<'a>, size: f32, least: f32) -> Level<'a> {
+        let n = self.scales.iter().take_while(|&&scale| size >= least * scale).count();
+        self.level(image, n)
+    }
+}
+
+/// Averages 2×2 blocks, halves rounded up; an odd last row or column is left out.
+fn halve(from: ImageView<'_>, to: &mut GrayImage, simd: Simd) {
+    for (v, row) in to.data.chunks_exact_mut(to.width).enumerate() {
+        simd.halve_rows(from.row(2 * v), from.row(2 * v + 1), row);
+    }
+}
+
+/// Averages blocks of 3/2×3/2; what is left over on the right and below is left out.
+fn two_thirds(from: ImageView<'_>, to: &mut GrayImage, simd: Simd) {
+    for (k, rows) in to.data.chunks_exact_mut(2 * to.width).enumerate() {
+        let (first, second) = rows.split_at_mut(to.width);
+        simd.two_thirds_rows([from.row(3 * k), from.row(3 * k + 1), from.row(3 * k + 2)], [first, second]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_ramp_keeps_its_place() {
+        let ramp = GrayImage::from_vec(60, 12, (0..720).map(|i| (i % 60 * 4) as u8).collect()).expect("size");
+        for (base, scales) in [
+            (Base::Half, vec![1.0, 2.0, 4.0]),
+            (Base::TwoThirds, vec![1.0, 1.5, 3.0]),
+            (Base::Full, vec![1.0, 2.0, 4.0]),
+        ] {
+            let mut pyramid = Pyramid::default();
+            pyramid.build(ramp.view(), base, 3, Simd::best());
+            assert_eq!(
+                (0..pyramid.len()).map(|n| pyramid.level(ramp.view(), n).scale).collect::<Vec<_>>(),
+                scales
+            );
+            for n in 0..pyramid.len() {
+                let level = pyramid.level(ramp.view(), n);
+                for u in 0..level.image.width {
+                    let expected = 4.0 * level.to_frame(u as f32);
+                    assert!((f32::from(level.image.row(0)[u]) - expected).abs() <= 1.0);
+                    assert!((level.of_frame(level.to_frame(u as f32)) - u as f32).abs() < 1e-5);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn tiny_images_have_no_levels() {
+        for (width, height) in [(1, 1), (1, 90), (3, 3)] {
+            for base in [Base::Full, Base::TwoThirds, Base::Half] {
+                let mut pyramid = Pyramid::default();
+                pyramid.build(GrayImage::new(width, height).view(), base, 4, Simd::best());
+                assert_eq!(pyramid.len(), 1);
+            }
+        }
+    }
+}

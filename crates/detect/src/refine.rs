@@ -1,0 +1,290 @@
+//! Corners of a decoded tag to a few hundredths of a pixel, with their covariance: every edge between its
+//! dark and light cells, not only the border, takes part in one fit.
+//!
+//! Model, with ξ, η ∈ [−1, 1] across the border square, q = ξ a + η b and d(q) = (d₁ e − d₂ o, −d₁ o − d₂ e),
+//! e = q₁² − q₂², o = 2 q₁ q₂: `p = H(ξ, η) + (|q|² − 2) (c + k q) + d(q)`: a homography and what a lens with radial
+//! distortion adds to it over a small part of the image. With a point's place P off the optical axis that is
+//! `κ |P|² P`; to third order about a tag's middle what is no homography is `κ |q|² (P + q)`, and as lengths shrink
+//! more along P than across, |q|² of the image has a part besides that of the tag: the twist d, which with H and c
+//! makes up every quadratic. a and b are half the tag's sides in the image over their mean length, so that the bow c
+//! and the barrel k change nothing at a square's corners; all are held near nought by what a wide lens does. Beside a
+//! cell that is one wide, blur lets an edge appear nearer the other cell; by how much is one more unknown for edges
+//! along ξ and one for those along η. Gauss–Newton on distances along edge normals, each weighed by how well its edge
+//! is placed, Cauchy's weights on top.
+
+use nalgebra::{Cholesky, Const, Vector2};
+
+use super::edge_points::{Locate, Located, PARAMETERS};
+use super::equations::{Accumulate, Advance, Equations, Information, Row, weigh};
+use super::family::Family;
+use super::quad::{Quad, distance};
+use super::simd::Simd;
+use super::tag_edges::{MOST_BLOCKS, TagEdges};
+use super::tag_model::{Model, Refined};
+use super::windows::{WIDEST_CELL, Windows};
+use windhover_base::msg::ImageView;
+
+/// Curvature that a wide lens gives a tag's middle lines, 1/px: 2·0.18 r over a focal length of 1000 px, where it
+/// distorts by 0.18 r², is 10⁻⁴ to 2·10⁻⁴ on the way to the rim.
+const LENS_CURVATURE: f64 = 1.5e-4;
+
+/// What a wide lens bends a tag's sides outwards by, over the third power of half their length, 1/px²: 0.3 r² at a
+/// focal length of 1000 px.
+const LENS_BARREL: f64 = 3e-7;
+
+/// What a wide lens twists a tag by, over the square of half its length, 1/px: of the bow, the difference between
+/// what it shrinks lengths by along the radius and across, a third where it shrinks them by 5 and 15 %.
+const LENS_TWIST: f64 = 2.5e-5;
+
+/// Parameters after the homography's eight, which are held near nought: their sigmas are given.
+const HELD: usize = PARAMETERS - 8;
+
+/// How many blocks' worth the fit takes up, for each parameter, of the errors it is made from.
+const TAKEN_UP: f64 = 0.375;
+
+/// Most that a neighbouring cell's nearness shifts an edge, in cells: what the shift is held near nought by.
+const NARROW_SHIFT: f64 = 0.1;
+
+/// Error that neighbouring cells leave on all edges of one direction alike, their shift being fitted: pixels, at a
+/// blur of one pixel and one pixel a cell (it grows with the square of the blur and falls with the cube of the cell),
+/// and a share of the shift. Measured on generated tags.
+const NEIGHBOURS: f64 = 1.2;
+const SHIFT_ERROR: f64 = 0.3;
+
+/// A round that moves no corner further is the last, pixels: another would move them by a twentieth of it.
+const SETTLED_PX: f64 = 0.08;
+const MOST_ROUNDS: usize = 10;
+
+/// Steps of the fit between looking for edges and looking again: at most so many, or one no corner is moved further
+/// by, pixels.
+const MOST_STEPS: usize = 4;
+const LEAST_STEP_PX: f64 = 0.005;
+
+/// Share of the edges between a tag's cells that are seen where the fit is right. Where fewer are and windows reach
+/// from cell to cell, edges were taken for their neighbours: blur is wider than a cell then, and corners are wrong
+/// by so much of one, measured on generated tags.
+const ENOUGH_SEEN: f64 = 0.93;
+const MISTAKEN: f64 = 0.25;
+
+/// Fewest edge points.
+const LEAST_EDGES: usize = 24;
+
+/// Finds edges and fits them; keeps its buffers.
+#[derive(Clone, Debug)]
+pub(super) struct Refiner {
+    simd: Simd,
+    edges: TagEdges,
+    located: Vec<Located>,
+    equations: Equations,
+}
+
+impl Refiner {
+    pub fn new(simd: Simd) -> Self {
+        Self { simd, edges: TagEdges::default(), located: Vec::new(), equations: Equations::default() }
+    }
+
+    /// Refines corners given in the tag's own order; `None` where too few edges are seen or the fit leaves
+    /// what was given.
+    pub fn refine(
+        &mut self,
+        image: ImageView<'_>,
+        corners: &Quad,
+        family: &Family,
+        id: u32,
+    ) -> Option<Refined> {
+        let edge = (0..4).map(|i| distance(corners[i], corners[(i + 1) % 4])).sum::<f32>() / 4.0;
+        let cell = f64::from(edge) / family.width as f64;
+        let mut model = Model::of_corners(corners)?;
+        self.edges.place(family, id, cell);
+        let half = 0.5 * f64::from(edge);
+        let shift = NARROW_SHIFT * cell;
+        let (bow, barrel) = (LENS_CURVATURE * half.powi(2) / 2.0, LENS_BARREL * half.powi(3));
+        let twist = LENS_TWIST * half.powi(2);
+        let (covariance, windows) =
+            self.fit(image, &mut model, family.width, [bow, bow, barrel, twist, twist, shift, shift])?;
+        let (pitches, blurs) = (model.pitches(family.width), windows.blurs_squared());
+        let seen = self.count() as f64 / self.edges.count() as f64;
+        let mistaken = if seen < ENOUGH_SEEN && cell < WIDEST_CELL { MISTAKEN } else { 0.0 };
+        let common = [0, 1].map(|k| {
+            let pitch = pitches[k];
+            let left =
+                (NEIGHBOURS * blurs[k] / pitch.powi(3)).powi(2) + (SHIFT_ERROR * model.shift(k)).powi(2);
+            left.min((0.2 * pitch).powi(2)) + (mistaken * pitch).powi(2)
+        });
+        let refined = model.result(&covariance, common)?;
+        let moved = (0..4).map(|i| {
+            (refined.corners[i] - Vector2::new(f64::from(corners[i][0]), f64::from(corners[i][1]))).norm()
+        });
+        (moved.fold(0.0, f64::max) < (1.5 * cell).max(2.0)).then_some(refined)
+    }
+
+    /// Moves a model to where the edges are; the covariance of its parameters.
+    ///
+    /// First with few points and wide windows, until the corners are nearly right; then with all, in windows as
+    /// narrow as the blur allows: in one narrower than a smear, edges stay where they are put.
+    fn fit(
+        &mut self,
+        image: ImageView<'_>,
+        model: &mut Model,
+        cells: usize,
+        held: [f64; HELD],
+    ) -> Option<(Information, Windows)> {
+        let mut windows = Windows::default();
+        let (mut coarse, mut settled, mut spread) = (true, false, 0.0);
+        let mut last = None;
+        for round in 0..MOST_ROUNDS {
+            let pitches = model.pitches(cells);
+            windows.half = windows.halves(pitches, coarse);
+            self.locate(image, model, windows.half, if coarse { 2 } else { 1 });
+            if self.count() < LEAST_EDGES {
+                return None;
+            }
+            self.normalise();
+            if !settled {
+                spread = self.spread();
+            }
+            let before = *model;
+            last = Some(self.settle(model, held, spread)?);
+            let moved = model.moved(&before);
+            windows.sharpness = self.sharpness();
+            if windows.widen() && round + 2 < MOST_ROUNDS {
+                settled = false;
+                continue;
+            }
+            if !coarse && moved < SETTLED_PX {
+                break;
+            }
+            settled = moved < 0.1;
+            let nearly = 0.1 * pitches[0].min(pitches[1]);
+            if coarse && (moved < nearly || round + 6 >= MOST_ROUNDS) {
+                coarse = false;
+                windows.narrow();
+            }
+        }
+        Some((self.covariance(&last?, spread)?, windows))
+    }
+
+    /// Moves a model to where the located edges have it, their places left as they are.
+    fn settle(&mut self, model: &mut Model, held: [f64; HELD], spread: f64) -> Option<Solved> {
+        let mut last = None;
+        for _ in 0..MOST_STEPS {
+            let solved = self.solve(model, held, spread)?;
+            let before = *model;
+            model.theta += solved.step;
+            let step = std::array::from_fn(|k| solved.step[k] as f32);
+            self.simd.run(Advance { located: &mut self.located, step });
+            last = Some(solved);
+            if model.moved(&before) < LEAST_STEP_PX {
+                break;
+            }
+        }
+        last
+    }
+
+    fn locate(&mut self, image: ImageView<'_>, model: &Model, half: [f32; 2], every: usize) {
+        let Self { edges, located, .. } = self;
+        self.simd.run(Locate { points: &edges.points, located, image, model: model.narrow(), half, every });
+    }
+
+    /// How many edges are located.
+    fn count(&self) -> usize {
+        self.located.iter().map(|l| l.count).sum()
+    }
+
+    /// Makes strengths relative to their mean. Strong edges are located better, up to the point where noise no
+    /// longer tells.
+    fn normalise(&mut self) {
+        let mean = self.located.iter().flat_map(|l| l.strength).sum::<f32>() / self.count() as f32;
+        for strength in self.located.iter_mut().flat_map(|l| &mut l.strength) {
+            *strength = (*strength / mean).min(1.5);
+        }
+    }
+
+    /// Mean sharpness of the edges crossed along ξ and along η.
+    fn sharpness(&self) -> [f64; 2] {
+        let mut sums = [(0.0f32, 1e-3f32); 2];
+        for l in &self.located {
+            sums[l.axis].0 += l.sharpness.iter().sum::<f32>();
+            sums[l.axis].1 += l.count as f32;
+        }
+        sums.map(|(sum, count)| f64::from(sum / count))
+    }
+
+    /// Robust spread of the residuals of edges of mean strength, pixels.
+    fn spread(&self) -> f64 {
+        let mut histogram = [0u32; 100];
+        for (residual, strength) in
+            self.located.iter().flat_map(|l| l.residual.iter().zip(&l.strength)).filter(|(_, s)| **s > 0.0)
+        {
+            histogram[((residual.abs() * strength * 32.0) as usize).min(99)] += 1;
+        }
+        let (mut below, mut median, all) = (0, 2.0, histogram.iter().sum::<u32>());
+        for (bin, count) in histogram.iter().enumerate() {
+            below += count;
+            if 2 * below >= all {
+                median = (bin as f64 + 0.5) / 32.0;
+                break;
+            }
+        }
+        (1.4826 * median).max(0.08)
+    }
+
+    fn solve(&mut self, model: &Model, held: [f64; HELD], spread: f64) -> Option<Solved> {
+        let count = self.count() as f64;
+        let sums = &mut self.equations;
+        self.simd.run(Accumulate { located: &self.located, spread: spread as f32, to: sums });
+        let variance = sums.squares() / (count - 8.0);
+        let mut information = sums.matrix();
+        let mut right = sums.right();
+        let holds = held.map(|sigma| variance.max(1e-4) / (sigma * sigma));
+        for (k, hold) in (PARAMETERS - HELD..PARAMETERS).zip(holds) {
+            information[(k, k)] += hold;
+            right[k] -= hold * model.theta[k];
+        }
+        let information = information.cholesky()?;
+        let step = information.solve(&right);
+        let flattening = sums.flattening();
+        step.iter().all(|s| s.is_finite()).then_some(Solved { step, information, holds, flattening })
+    }
+
+    /// Covariance of the parameters: of M-estimates, with errors that are alike within a block. How much more
+    /// they err together than each by itself is one number, from the blocks' pulls `g` on the parameters:
+    /// `λ = Σ gᵀ A⁻¹ g / p`, p being how many parameters the image tells, which counts noise and whatever else the
+    /// model leaves over; the covariance is `λ A⁻¹ / ρ²`, ρ being how much Cauchy's weights flatten the residuals.
+    fn covariance(&self, solved: &Solved, spread: f64) -> Option<Information> {
+        let mut pulls = [[0.0f32; PARAMETERS]; MOST_BLOCKS];
+        for l in &self.located {
+            let (weights, _) = weigh(l, spread as f32);
+            for (lane, weight) in weights.into_iter().enumerate() {
+                let pull = weight * l.residual[lane];
+                let to = &mut pulls[usize::from(l.block[lane])];
+                to.iter_mut().zip(&l.rows).for_each(|(to, row)| *to += pull * row[lane]);
+            }
+        }
+        let (mut sum, mut blocks) = (0.0, 0.0f64);
+        for pull in pulls.iter().filter(|b| b.iter().any(|x| *x != 0.0)) {
+            let mut pull = Row::from_fn(|i, _| f64::from(pull[i]));
+            solved.information.l_dirty().solve_lower_triangular_mut(&mut pull);
+            sum += pull.norm_squared();
+            blocks += 1.0;
+        }
+        let inverse = solved.information.inverse();
+        // As many parameters as the image tells: of those held, the share that is not what they are held by.
+        let held =
+            solved.holds.iter().zip(PARAMETERS - HELD..).map(|(hold, k)| hold * inverse[(k, k)]).sum::<f64>();
+        let told = PARAMETERS as f64 - held;
+        // The fit takes up some of it, most in the corners.
+        let lambda = sum / told / (1.0 - TAKEN_UP * told / blocks).max(0.5);
+        let flattening = solved.flattening.clamp(0.4, 1.0);
+        (blocks > 4.0).then(|| inverse * (lambda / (flattening * flattening)))
+    }
+}
+
+/// One step of the fit.
+struct Solved {
+    step: Row,
+    information: Cholesky<f64, Const<PARAMETERS>>,
+    /// What of the information is not the image's.
+    holds: [f64; HELD],
+    flattening: f64,
+}

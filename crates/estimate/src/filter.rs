@@ -1,0 +1,369 @@
+//! The estimator as the pipeline sees it: measurements in whatever order they come, estimates out.
+
+use std::collections::VecDeque;
+
+use nalgebra::Vector3;
+
+use crate::align::{History, Stamp};
+use windhover_base::geo::wrap_angle;
+use windhover_base::msg::{
+    AttitudeSample, Disposition, FrameObservations, FramePrediction, FusionResult, FusionSource, GnssEpoch,
+    Ownship, Stamped, TargetEstimate, WarmFilter,
+};
+use windhover_base::settings::{EstimatorConfig, Rig};
+use windhover_base::time::{MonoTime, Span};
+
+use super::Site;
+use super::core::{AnyMeasurement, Core, Kind};
+use super::ownship::start;
+use super::state::State;
+
+/// What the estimator tells.
+#[derive(Clone, PartialEq, Debug)]
+pub enum EstimatorOutput {
+    /// A target at a frame, as known when the frame had been looked at.
+    Estimate(TargetEstimate),
+    /// A target at an earlier frame, with what was measured up to the smoother's lag after it.
+    Smoothed(TargetEstimate),
+    /// The helicopter at a frame.
+    Ownship(Ownship),
+    /// What became of a measurement.
+    Fusion(FusionResult),
+    /// The receiver jumped for good: helicopter, targets and ground features moved along.
+    Anchored {
+        /// By how much, NED.
+        moved_m: Vector3<f64>,
+    },
+    /// The filter started again.
+    Reset {
+        /// Why.
+        reason: &'static str,
+    },
+}
+
+/// The joint filter with its history of measurements.
+#[derive(Clone, Debug)]
+pub struct Estimator {
+    pub(super) core: Core,
+    history: History<AnyMeasurement, State>,
+    /// Compass readings heard before there was a state.
+    compass: VecDeque<Stamped<AttitudeSample>>,
+    /// Room to look ahead in.
+    ahead: State,
+    lag: Span,
+    /// What the next start continues from.
+    warm: Option<WarmFilter>,
+    /// Exposure time of the last frame whose smoothed estimate has been told.
+    smoothed_to: Option<MonoTime>,
+    /// Time of the last anchoring that has been told.
+    anchored: Option<MonoTime>,
+}
+
+/// Without any measurement for so long the state is worth nothing.
+const SILENCE: Span = Span::from_ns(60_000_000_000);
+/// Farther ahead than this a frame is not foreseen, s.
+const FORESIGHT_S: f64 = 2.0;
+/// Compass readings this old still start the filter, if there are enough of them.
+const COMPASS_AGE: Span = Span::from_ns(3_000_000_000);
+/// Readings kept to start from, and the fewest that outvote a wrong one.
+const READINGS: usize = 15;
+const FEWEST_READINGS: usize = 3;
+/// Most measurements in the history: three devices at 100 Hz over ten seconds.
+const CAPACITY: usize = 3_000;
+/// Means beyond these are no flight: metres from the datum, metres a second.
+const ABSURD: (f64, f64) = (1e6, 500.0);
+
+impl Estimator {
+    /// An estimator that knows nothing yet.
+    pub fn new(rig: &Rig, estimator: &EstimatorConfig, site: &Site) -> Self {
+        let core = Core::new(rig, estimator, site);
+        let span = Span::from_ms(estimator.history_ms);
+        Self {
+            ahead: State::default(),
+            history: History::new(span, CAPACITY, core.state.clone(), MonoTime::default()),
+            core,
+            compass: VecDeque::with_capacity(READINGS + 1),
+            lag: Span::from_ms(estimator.smoother_lag_ms),
+            warm: None,
+            smoothed_to: None,
+            anchored: None,
+        }
+    }
+
+    /// Continues, at the first start, from the sensors' errors as an earlier run had learnt them.
+    pub fn resume(&mut self, warm: WarmFilter) {
+        self.warm = Some(warm);
+    }
+
+    /// What [`Self::resume`] takes; `None` while nothing is known.
+    pub fn warm_state(&self) -> Option<WarmFilter> {
+        self.core.state.alive.then(|| self.core.state.warm())
+    }
+
+    /// Whether the helicopter's own state is known.
+    pub fn is_started(&self) -> bool {
+        self.core.state.alive
+    }
+
+    /// Takes a GPS epoch; `t_valid` has the configured latency taken off.
+    pub fn gnss(&mut self, epoch: &Stamped<GnssEpoch>, out: &mut Vec<EstimatorOutput>) {
+        if !self.core.state.alive && !self.start(epoch, out) {
+            self.refused(FusionSource::GpsPosition, epoch.t_valid, Disposition::NoOwnship, out);
+            return;
+        }
+        let value = epoch.value;
+        self.take(stamp_of(epoch), FusionSource::GpsPosition, out, |m| {
+            m.kind = Kind::Gnss;
+            m.gnss = value;
+        });
+        self.tell_smoothed(out);
+    }
+
+    /// Takes a compass reading; `t_valid` has the configured latency taken off.
+    pub fn attitude(&mut self, sample: &Stamped<AttitudeSample>, out: &mut Vec<EstimatorOutput>) {
+        if !self.core.state.alive {
+            if sample.value.heading.is_some() {
+                self.compass.push_back(*sample);
+                if self.compass.len() > READINGS {
+                    self.compass.pop_front();
+                }
+            }
+            self.refused(FusionSource::CompassHeading, sample.t_valid, Disposition::NoOwnship, out);
+            return;
+        }
+        let value = sample.value;
+        self.take(stamp_of(sample), FusionSource::CompassHeading, out, |m| {
+            m.kind = Kind::Attitude;
+            m.attitude = value;
+        });
+        self.tell_smoothed(out);
+    }
+
+    /// Takes what a frame showed, and tells one estimate a target and the helicopter's own state at
+    /// the frame's exposure.
+    pub fn frame(&mut self, frame: &Stamped<FrameObservations>, out: &mut Vec<EstimatorOutput>) {
+        let (t, number) = (frame.t_valid, frame.value.frame);
+        let taken = if self.core.state.alive {
+            self.take(stamp_of(frame), FusionSource::Marker, out, |m| {
+                m.kind = Kind::Frame;
+                m.frame.frame = number;
+                m.frame.markers.clone_from(&frame.value.markers);
+                m.frame.features.clone_from(&frame.value.features);
+            })
+        } else {
+            self.refused(FusionSource::Marker, t, Disposition::NoOwnship, out);
+            None
+        };
+        // The state after this frame; where it was not taken, the newest one.
+        let state = match taken {
+            Some(index) => self.history.before(index + 1),
+            None => &self.core.state,
+        };
+        for target in 0..state.targets.len() {
+            out.push(EstimatorOutput::Estimate(state.estimate(&self.core.models, target, number, t)));
+        }
+        if taken.is_some() {
+            out.push(EstimatorOutput::Ownship(state.ownship(&self.core.models, number, t)));
+        }
+        self.tell_smoothed(out);
+    }
+
+    /// Lets time pass: tells smoothed estimates that are due, and starts again after a long silence.
+    pub fn tick(&mut self, now: MonoTime, out: &mut Vec<EstimatorOutput>) {
+        if self.core.state.alive && now - self.core.state.t > SILENCE {
+            self.tell_smoothed_until(None, out);
+            self.reset("nothing was heard for a minute", out);
+        } else {
+            self.tell_smoothed_until(Some(now - self.lag), out);
+        }
+    }
+
+    /// Tells every smoothed estimate still owed: the flight is over.
+    pub fn finish(&mut self, out: &mut Vec<EstimatorOutput>) {
+        self.tell_smoothed_until(None, out);
+    }
+
+    /// What a frame exposed at `t` should show, into a recycled value.
+    pub fn predict(&mut self, t: MonoTime, expected: &mut FramePrediction) {
+        expected.clear();
+        let ahead = t - self.core.state.t;
+        if self.core.state.alive && ahead.s() <= FORESIGHT_S {
+            self.ahead.copy_present(&self.core.state);
+            self.ahead.propagate(t, &self.core.models);
+            self.ahead.expect(&self.core.models, expected);
+        }
+    }
+
+    /// How much older GPS is than configured, as learnt so far, seconds.
+    pub fn gps_delay_s(&self) -> f64 {
+        self.core.state.own.gps_delay_s
+    }
+
+    /// One line on what the filter believes of the sensors and of the intensities of motion.
+    pub fn inside(&self) -> String {
+        let (own, l) = (&self.core.state.own, &self.core.state.learnt);
+        let sigma = |i: usize| self.core.state.cov.at(i, i).max(0.0).sqrt();
+        let targets: Vec<String> =
+            l.target_q.iter().map(|q| format!("{:.3}/{:.3}", q[0].sqrt(), q[1].sqrt())).collect();
+        format!(
+            "heading bias {:.2}±{:.2} deg, tilt gain {:.2}±{:.2}, tilt bias {:.2},{:.2}±{:.2} deg, delay {:.0}±{:.0} ms, \
+             sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} force {:.2}/{:.2} targets {} pixels {:.2?} {:.2}",
+            own.heading_bias.to_degrees(),
+            sigma(super::state::at::HEADING_BIAS).to_degrees(),
+            own.tilt_gain,
+            sigma(super::state::at::TILT_GAIN),
+            own.tilt_bias.x.to_degrees(),
+            own.tilt_bias.y.to_degrees(),
+            sigma(super::state::at::TILT_BIAS).to_degrees(),
+            own.gps_delay_s * 1e3,
+            sigma(super::state::at::GPS_DELAY) * 1e3,
+            l.heading_var.sqrt().to_degrees(),
+            l.tilt_var.sqrt().to_degrees(),
+            l.tilt_rate_q.sqrt(),
+            l.yaw_rate_q.sqrt(),
+            l.side_force_var.sqrt(),
+            l.thrust_var.sqrt(),
+            targets.join(" "),
+            l.marker_factor,
+            l.feature_factor
+        )
+    }
+
+    fn start(&mut self, epoch: &Stamped<GnssEpoch>, out: &mut Vec<EstimatorOutput>) -> bool {
+        self.compass.retain(|c| (epoch.t_recv - c.t_recv).abs() <= COMPASS_AGE);
+        if self.compass.len() < FEWEST_READINGS {
+            return false;
+        }
+        let Some(typical) = most_typical(&self.compass) else { return false };
+        let core = &mut self.core;
+        core.state.learnt.copy_from(&core.learning.start);
+        if !start(&mut core.state, epoch.t_valid, &epoch.value, &typical, &core.models) {
+            return false;
+        }
+        if let Some(warm) = self.warm.take() {
+            core.state.resume(&warm, &core.models, &core.learning);
+        }
+        let state = &self.core.state;
+        self.history.restart(epoch.t_valid, |base| base.copy_from(state));
+        for reading in std::mem::take(&mut self.compass) {
+            if reading.t_valid >= epoch.t_valid {
+                self.attitude(&reading, out);
+            }
+        }
+        true
+    }
+
+    /// Puts a measurement in its place and fuses it and everything after it; gives its index.
+    fn take(
+        &mut self,
+        stamp: Stamp,
+        source: FusionSource,
+        out: &mut Vec<EstimatorOutput>,
+        fill: impl FnOnce(&mut AnyMeasurement),
+    ) -> Option<usize> {
+        if let Err(disposition) = self.history.admit(stamp) {
+            self.refused(source, stamp.t_valid, disposition, out);
+            return None;
+        }
+        let at = self.history.insert(stamp, fill);
+        if at + 1 < self.history.len() {
+            self.core.state.copy_from(self.history.before(at));
+        }
+        for index in at..self.history.len() {
+            let entry = self.history.entry_mut(index);
+            self.core.reporting = index == at;
+            self.core.process(entry.stamp.t_valid, &entry.value);
+            entry.after.copy_from(&self.core.state);
+        }
+        out.extend(self.core.results.drain(..).map(EstimatorOutput::Fusion));
+        if let Some((t, moved_m)) = self.core.state.anchored
+            && self.anchored.is_none_or(|told| t > told)
+        {
+            self.anchored = Some(t);
+            out.push(EstimatorOutput::Anchored { moved_m });
+        }
+        if !self.is_reasonable() {
+            self.reset("the state was no longer a number within reason", out);
+            return None;
+        }
+        let before = self.history.len();
+        self.history.trim();
+        let gone = before - self.history.len();
+        // A measurement true just within the history may be trimmed at once; its state is the base then.
+        (at >= gone).then(|| at - gone)
+    }
+
+    fn is_reasonable(&self) -> bool {
+        let (state, own) = (&self.core.state, &self.core.state.own);
+        state.is_sound() && own.position.norm() < ABSURD.0 && own.velocity.norm() < ABSURD.1
+    }
+
+    fn reset(&mut self, reason: &'static str, out: &mut Vec<EstimatorOutput>) {
+        let core = &mut self.core;
+        core.state.alive = false;
+        core.state.own = Default::default();
+        core.state.targets.fill(Default::default());
+        core.state.features.fill(Default::default());
+        core.state.echoes.iter_mut().for_each(|echo| echo.live = false);
+        core.state.probe.live = false;
+        core.state.cov.fill(0.0);
+        self.compass.clear();
+        let t = core.state.t;
+        self.history.restart(t, |_| {});
+        out.push(EstimatorOutput::Reset { reason });
+    }
+
+    fn tell_smoothed(&mut self, out: &mut Vec<EstimatorOutput>) {
+        self.tell_smoothed_until(Some(self.core.state.t - self.lag), out);
+    }
+
+    /// Tells the smoothed estimates of frames exposed no later than `until` (all of them for `None`)
+    /// that have not been told yet, in their order.
+    fn tell_smoothed_until(&mut self, until: Option<MonoTime>, out: &mut Vec<EstimatorOutput>) {
+        loop {
+            let told = self.smoothed_to;
+            let due = |t: MonoTime| until.is_none_or(|u| t <= u) && told.is_none_or(|s| t > s);
+            let echoes = self.core.state.echoes.iter().filter(|e| e.live && due(e.t));
+            let Some(echo) = echoes.min_by_key(|e| e.t) else { return };
+            for target in 0..self.core.state.targets.len() {
+                out.push(EstimatorOutput::Smoothed(echo.estimate(&self.core.models, target)));
+            }
+            self.smoothed_to = Some(echo.t);
+        }
+    }
+
+    fn refused(
+        &self,
+        source: FusionSource,
+        t_valid: MonoTime,
+        disposition: Disposition,
+        out: &mut Vec<EstimatorOutput>,
+    ) {
+        out.push(EstimatorOutput::Fusion(FusionResult {
+            t_valid,
+            source,
+            disposition,
+            innovation: [0.0; 3],
+            dimension: 0,
+            test_ratio: f64::NAN,
+        }));
+    }
+}
+
+/// The reading that differs least from all others in sum: a wrong one among them does not win.
+fn most_typical(readings: &VecDeque<Stamped<AttitudeSample>>) -> Option<AttitudeSample> {
+    let apart = |a: &AttitudeSample, b: &AttitudeSample| {
+        let heading = a.heading.zip(b.heading).map_or(0.0, |(a, b)| wrap_angle(a - b).abs());
+        let tilt = |a: &windhover_base::geo::Tilt, b: &windhover_base::geo::Tilt| {
+            wrap_angle(a.pitch - b.pitch).abs() + wrap_angle(a.roll - b.roll).abs()
+        };
+        heading + a.tilt.zip(b.tilt).map_or(0.0, |(a, b)| tilt(&a, &b))
+    };
+    let in_sum = |a: &AttitudeSample| readings.iter().map(|b| apart(a, &b.value)).sum::<f64>();
+    let best = readings.iter().min_by(|a, b| in_sum(&a.value).total_cmp(&in_sum(&b.value)));
+    best.map(|reading| reading.value)
+}
+
+fn stamp_of<T>(stamped: &Stamped<T>) -> Stamp {
+    Stamp { t_valid: stamped.t_valid, t_recv: stamped.t_recv, seq: stamped.seq }
+}

@@ -1,0 +1,565 @@
+//! Every F and H of the filter against central finite differences at random states.
+//!
+//! What the linear model leaves out on purpose is listed here term by term with a bound on its size
+//! ([`Omitted`]); a derivative that differs anywhere else, or by more than the bound, fails. Seeds are the
+//! loop's own numbers and stand in every message.
+
+use std::sync::Arc;
+
+use nalgebra::{DMatrix, Matrix2, Rotation3, Vector2, Vector3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::core::Core;
+use super::state::{GRAVITY, State, at};
+use super::vision::{target_point, view};
+use super::*;
+use windhover_base::geo::{Geodetic, Ground, Terrain, Tile, ned_from_body_321};
+use windhover_base::msg::{AttitudeSample, FeatureTrack, FixKind, GnssEpoch, MarkerDetection, TrackStatus};
+use windhover_base::settings::{EstimatorConfig, Rig};
+use windhover_base::time::{MonoTime, Span};
+
+/// A car with a tag and a disc, a rover, a tag on the ground; lever arms, lens and mount as crooked as a real one's.
+const RIG: &str = r#"
+[gps]
+device = "/dev/ttyS0"
+baud = 38400
+antenna_position_m = [0.4, -0.3, -0.6]
+[compass]
+device = "/dev/ttyS1"
+baud = 38400
+format = "tcm2"
+angles = "euler321"
+declination_deg = 0.0
+[camera]
+device = "/dev/video0"
+width = 1280
+height = 1024
+fps = 15.0
+[camera.intrinsics]
+fx = 1020.0
+fy = 1000.0
+cx = 640.0
+cy = 512.0
+distortion = [-0.2, 0.1, 0.001, -0.002, 0.0]
+[camera.mount]
+image_top = "forward"
+position_m = [0.2, 0.1, 0.3]
+roll_deg = 2.0
+pitch_deg = -3.0
+yaw_deg = 4.0
+[[target]]
+name = "car"
+model = "ackermann"
+wheelbase_m = 1.2
+[[target.marker]]
+kind = "apriltag"
+family = "36h11"
+id = 0
+size_m = 0.48
+yaw_deg = 20.0
+position_m = [0.8, -0.2, -0.5]
+[[target.marker]]
+kind = "disc"
+brightness = "dark"
+diameter_m = 0.2
+position_m = [-0.3, 0.2, -0.4]
+[[target]]
+name = "rover"
+model = "unicycle"
+[[target.marker]]
+kind = "apriltag"
+family = "36h11"
+id = 2
+size_m = 0.48
+position_m = [0.0, 0.0, -0.3]
+[[target]]
+name = "point"
+model = "static"
+[[target.marker]]
+kind = "apriltag"
+family = "36h11"
+id = 7
+size_m = 0.48
+position_m = [0.0, 0.0, 0.0]
+"#;
+
+/// Random states each derivative is taken at.
+const STATES: u64 = 40;
+/// Step of the differences, in each state's own unit.
+const STEP: f64 = 1e-4;
+
+/// Most of what is drawn below: the bounds of [`Omitted`] are made of these.
+mod most {
+    pub(super) const SPEED: f64 = 8.0;
+    pub(super) const RATE: f64 = 1.0;
+    pub(super) const FORCE: f64 = super::GRAVITY + 3.0;
+    pub(super) const DELAY_S: f64 = 0.15;
+    pub(super) const DRAG: f64 = 0.4;
+    pub(super) const ARM: f64 = 0.8;
+    /// Longest step of the prediction, s.
+    pub(super) const DT: f64 = 0.05;
+}
+
+/// Columns in which a derivative is left out, and the most that any of their entries is.
+struct Omitted {
+    term: &'static str,
+    columns: std::ops::Range<usize>,
+    /// Rows likewise: of a measurement all.
+    rows: std::ops::Range<usize>,
+    at_most: f64,
+}
+
+const ALL_ROWS: std::ops::Range<usize> = 0..usize::MAX;
+
+fn three(first: usize) -> std::ops::Range<usize> {
+    first..first + 3
+}
+
+fn site(ground: Ground) -> Site {
+    Site { frame: frame(), ground, declination_rad: 0.0 }
+}
+
+fn frame() -> LocalFrame {
+    LocalFrame::new(Geodetic { lat_deg: 47.0, lon_deg: 8.0, height_m: 0.0 })
+}
+
+/// A slope that falls by some 8 % to the north and rises by 5 % to the east.
+fn slope() -> Ground {
+    let (step_deg, frame) = (0.01, frame());
+    let height = |row: usize, column: usize| {
+        let place = Geodetic {
+            lat_deg: 47.01 - step_deg * row as f64,
+            lon_deg: 7.99 + step_deg * column as f64,
+            height_m: 0.0,
+        };
+        let ned = frame.ned(place);
+        (-0.08 * ned.x + 0.05 * ned.y) as f32
+    };
+    let heights = (0..9).map(|i| height(i / 3, i % 3)).collect();
+    let tile = Tile::new((47.01, 7.99), [step_deg; 2], (3, 3), heights).expect("a whole tile");
+    Ground::Terrain(Arc::new(Terrain::new(Arc::new(tile), &frame, 0.0)))
+}
+
+/// A filter in a random state over its targets, which all lie in view; without covariance, so that fusing moves nothing.
+fn random_core(seed: u64, ground: Ground) -> Core {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let rig: Rig = toml::from_str(RIG).expect("the rig is valid");
+    let mut core = Core::new(&rig, &EstimatorConfig::default(), &site(ground));
+    let mut within = |most: f64| rng.random_range(-most..most);
+    let mut vector = |most: f64| Vector3::new(within(most), within(most), within(most));
+    let state = &mut core.state;
+    state.alive = true;
+    state.t = MonoTime::from_ns(1_000_000_000_000);
+    let own = &mut state.own;
+    own.position = vector(20.0);
+    own.velocity = vector(most::SPEED / 3f64.sqrt());
+    own.rate = vector(most::RATE / 3f64.sqrt());
+    own.force = Vector3::new(0.0, 0.0, -GRAVITY) + vector(3.0 / 3f64.sqrt());
+    own.gps_bias = vector(2.0);
+    own.heading_bias = within(0.1);
+    own.tilt_gain = 0.6 + within(0.5);
+    own.tilt_bias = Vector2::new(within(0.02), within(0.02));
+    own.gps_delay_s = within(most::DELAY_S);
+    own.drag_per_s = 0.2 + within(0.2);
+    own.ned_from_body = ned_from_body_321(within(3.1), within(0.2), within(0.2));
+    own.position.z = core.models.ground.down_m(own.position.x, own.position.y) - 12.0 + within(4.0);
+    let below = own.position;
+    for target in &mut state.targets {
+        target.held = true;
+        target.status = TrackStatus::Tracking;
+        target.seen = 100;
+        target.last_seen = state.t;
+        target.mean = [below.x + within(2.0), below.y + within(2.0), within(3.1), within(8.0), within(1.5)];
+    }
+    for (id, feature) in state.features.iter_mut().enumerate() {
+        feature.id = Some(id as u64);
+        feature.mean = [below.x + within(2.0), below.y + within(2.0)];
+    }
+    core
+}
+
+/// The state moved by a step along one column.
+fn moved(core: &Core, column: usize, by: f64) -> Core {
+    let mut core = core.clone();
+    let mut dx = vec![0.0; core.state.len()];
+    dx[column] = by;
+    core.state.inject(&dx);
+    core
+}
+
+/// The error state that leads from `from` to `to`: what `inject` would have to be given.
+fn difference(to: &State, from: &State) -> Vec<f64> {
+    let mut dx = vec![0.0; to.len()];
+    let (a, b) = (&to.own, &from.own);
+    let turn = (a.ned_from_body * b.ned_from_body.inverse()).scaled_axis();
+    let vectors = [
+        (at::POSITION, a.position - b.position),
+        (at::VELOCITY, a.velocity - b.velocity),
+        (at::ATTITUDE, turn),
+        (at::RATE, a.rate - b.rate),
+        (at::FORCE, a.force - b.force),
+        (at::GPS_BIAS, a.gps_bias - b.gps_bias),
+    ];
+    for (first, vector) in vectors {
+        dx[first..first + 3].copy_from_slice(vector.as_slice());
+    }
+    dx[at::HEADING_BIAS] = a.heading_bias - b.heading_bias;
+    dx[at::TILT_GAIN] = a.tilt_gain - b.tilt_gain;
+    dx[at::TILT_BIAS..at::TILT_BIAS + 2].copy_from_slice((a.tilt_bias - b.tilt_bias).as_slice());
+    dx[at::GPS_DELAY] = a.gps_delay_s - b.gps_delay_s;
+    dx[at::DRAG] = a.drag_per_s - b.drag_per_s;
+    for i in 0..to.targets.len() {
+        for k in 0..at::TARGET {
+            dx[to.target_at(i) + k] = to.targets[i].mean[k] - from.targets[i].mean[k];
+        }
+    }
+    for i in 0..to.features.len() {
+        for k in 0..at::FEATURE {
+            dx[to.feature_at(i) + k] = to.features[i].mean[k] - from.features[i].mean[k];
+        }
+    }
+    dx
+}
+
+/// Holds a linear model against differences: `got` rows by state columns.
+fn compare(
+    what: &str,
+    seed: u64,
+    got: &DMatrix<f64>,
+    wanted: &DMatrix<f64>,
+    omitted: &[Omitted],
+    tolerance: f64,
+) {
+    for ((row, column), value) in (0..got.nrows())
+        .flat_map(|r| (0..got.ncols()).map(move |c| (r, c)))
+        .map(|place| (place, got[place] - wanted[place]))
+    {
+        let term = omitted.iter().find(|o| o.columns.contains(&column) && o.rows.contains(&row));
+        let scale = 1.0 + wanted[(row, column)].abs();
+        let allowed = term.map_or(tolerance * scale, |o| o.at_most);
+        assert!(
+            value.abs() <= allowed,
+            "{what}, seed {seed}: row {row}, column {column}: {} by the model, {} by differences{}",
+            got[(row, column)],
+            wanted[(row, column)],
+            term.map_or(String::new(), |o| format!(" ({}, at most {})", o.term, o.at_most)),
+        );
+    }
+}
+
+/// F of one step of `dt` seconds, read off what it does to the covariance of a delayed copy with the present state: to
+/// each row `e_j` of the copy's it applies `Fᵀ`.
+fn transition(core: &Core, dt_s: f64) -> DMatrix<f64> {
+    let n = core.state.len();
+    let mut state = core.state.clone();
+    let rows = state.echoes[0].cross.rows();
+    let mut f = DMatrix::zeros(n, n);
+    for first in (0..n).step_by(rows) {
+        state.copy_from(&core.state);
+        let copy = &mut state.echoes[0];
+        copy.live = true;
+        copy.cross.fill(0.0);
+        (0..rows.min(n - first)).for_each(|i| copy.cross.set(i, first + i, 1.0));
+        state.propagate(state.t + Span::from_s(dt_s), &core.models);
+        for i in 0..rows.min(n - first) {
+            for (row, value) in state.echoes[0].cross.row(i).iter().enumerate() {
+                f[(row, first + i)] = *value;
+            }
+        }
+    }
+    f
+}
+
+fn transition_by_differences(core: &Core, dt_s: f64) -> DMatrix<f64> {
+    let n = core.state.len();
+    let mut f = DMatrix::zeros(n, n);
+    for column in 0..n {
+        let after = |by: f64| {
+            let mut core = moved(core, column, by);
+            let t = core.state.t + Span::from_s(dt_s);
+            core.state.propagate(t, &core.models);
+            core.state
+        };
+        let change = difference(&after(STEP), &after(-STEP));
+        (0..n).for_each(|row| f[(row, column)] = change[row] / (2.0 * STEP));
+    }
+    f
+}
+
+#[test]
+fn motion_of_helicopter_targets_and_features() {
+    // R exp(ω dt) moves by R J_r(ω dt) dω dt; the right Jacobian J_r is taken as one.
+    let right_jacobian = Omitted {
+        term: "right Jacobian of the turn in a step",
+        rows: three(at::ATTITUDE),
+        columns: three(at::RATE),
+        at_most: 0.5 * most::RATE * most::DT * most::DT,
+    };
+    for seed in 0..STATES {
+        let core = random_core(seed, Ground::Flat { down_m: 0.0 });
+        for dt_s in [0.01, 0.05] {
+            let (f, wanted) = (transition(&core, dt_s), transition_by_differences(&core, dt_s));
+            compare("motion", seed, &f, &wanted, std::slice::from_ref(&right_jacobian), 1e-6);
+        }
+    }
+}
+
+#[test]
+fn covariance_and_delayed_copies_move_by_the_same_f() {
+    for seed in 0..STATES {
+        let mut core = random_core(seed, Ground::Flat { down_m: 0.0 });
+        let (n, dt_s) = (core.state.len(), 0.04);
+        let f = transition(&core, dt_s);
+        let after = |core: &Core| {
+            let mut state = core.state.clone();
+            state.propagate(state.t + Span::from_s(dt_s), &core.models);
+            DMatrix::from_fn(n, n, |i, j| state.cov.at(i, j))
+        };
+        let mut rng = ChaCha8Rng::seed_from_u64(1_000 + seed);
+        let root = DMatrix::from_fn(n, n, |_, _| rng.random_range(-0.3..0.3));
+        let p = &root * root.transpose();
+        // Intensities of a car's yaw rate depend on the variance of its speed: the same with and without P.
+        for i in 0..core.state.targets.len() {
+            core.models.targets[i].max_curvature = None;
+        }
+        let noise = after(&core);
+        (0..n).for_each(|i| (0..n).for_each(|j| core.state.cov.set(i, j, p[(i, j)])));
+        compare("covariance", seed, &(after(&core) - noise), &(&f * p * f.transpose()), &[], 1e-9);
+    }
+}
+
+/// A measurement's H and residual: what stands in the workspace after it was fused.
+fn measured(core: &mut Core, fuse: &dyn Fn(&mut Core)) -> (DMatrix<f64>, Vec<f64>) {
+    fuse(core);
+    let (n, z) = (core.state.len(), &core.z);
+    let h = DMatrix::from_fn(z.m, n, |component, column| z.derivative_by(component, column));
+    (h, z.residual[..z.m].to_vec())
+}
+
+fn check_measurement(what: &str, seed: u64, core: &Core, omitted: &[Omitted], fuse: &dyn Fn(&mut Core)) {
+    let (h, residual) = measured(&mut core.clone(), fuse);
+    assert!(!residual.is_empty(), "{what}, seed {seed}: nothing was fused");
+    let mut wanted = DMatrix::zeros(residual.len(), core.state.len());
+    for column in 0..core.state.len() {
+        let (_, more) = measured(&mut moved(core, column, STEP), fuse);
+        let (_, less) = measured(&mut moved(core, column, -STEP), fuse);
+        for row in 0..residual.len() {
+            // r = z − h(x)
+            wanted[(row, column)] = (less[row] - more[row]) / (2.0 * STEP);
+        }
+    }
+    compare(what, seed, &h, &wanted, omitted, 1e-5);
+}
+
+#[test]
+fn gps_position() {
+    use most::{ARM, DELAY_S, DRAG, FORCE, RATE, SPEED};
+    // Of −v_a τ + ½ a τ² only what the position of a fix is worth: the rest is centimetres beside its metres.
+    let half_tau2 = 0.5 * DELAY_S * DELAY_S;
+    let omitted = [
+        Omitted {
+            term: "½ τ² ∂a/∂v",
+            columns: three(at::VELOCITY),
+            rows: ALL_ROWS,
+            at_most: half_tau2 * DRAG,
+        },
+        Omitted {
+            term: "τ and ½ τ² of attitude",
+            columns: three(at::ATTITUDE),
+            rows: ALL_ROWS,
+            at_most: DELAY_S * RATE * ARM + half_tau2 * FORCE,
+        },
+        Omitted { term: "τ R l×", columns: three(at::RATE), rows: ALL_ROWS, at_most: DELAY_S * ARM },
+        Omitted { term: "½ τ² R", columns: three(at::FORCE), rows: ALL_ROWS, at_most: half_tau2 },
+        Omitted {
+            term: "½ τ² v",
+            columns: at::DRAG..at::DRAG + 1,
+            rows: ALL_ROWS,
+            at_most: half_tau2 * SPEED,
+        },
+    ];
+    let epoch = GnssEpoch {
+        fix: FixKind::ThreeD,
+        lat_deg: Some(47.0),
+        lon_deg: Some(8.0),
+        alt_msl_m: Some(10.0),
+        geoid_m: Some(0.0),
+        ..GnssEpoch::default()
+    };
+    for seed in 0..STATES {
+        let core = random_core(seed, Ground::Flat { down_m: 0.0 });
+        check_measurement("GPS position", seed, &core, &omitted, &|core| core.fuse_gnss(&epoch));
+    }
+}
+
+#[test]
+fn gps_velocity() {
+    use most::{DELAY_S, DRAG};
+    // Beside one: with a velocity known to 0.05 m/s, 3 mm/s.
+    let omitted =
+        [Omitted { term: "τ c", columns: three(at::VELOCITY), rows: ALL_ROWS, at_most: DELAY_S * DRAG }];
+    let epoch = GnssEpoch {
+        fix: FixKind::ThreeD,
+        vel_ned_mps: Some(Vector3::new(1.0, 2.0, 0.5)),
+        vel_has_down: true,
+        ..GnssEpoch::default()
+    };
+    for seed in 0..STATES {
+        let core = random_core(seed, Ground::Flat { down_m: 0.0 });
+        check_measurement("GPS velocity", seed, &core, &omitted, &|core| core.fuse_gnss(&epoch));
+    }
+}
+
+#[test]
+fn compass_heading_and_tilt() {
+    let tilt = Some(windhover_base::geo::Tilt { pitch: 0.02, roll: -0.05 });
+    for seed in 0..STATES {
+        let core = random_core(seed, Ground::Flat { down_m: 0.0 });
+        let heading = AttitudeSample { heading: Some(1.0), heading_is_true: true, tilt: None };
+        check_measurement("heading", seed, &core, &[], &|core| core.fuse_attitude(&heading));
+        let tilt = AttitudeSample { heading: None, heading_is_true: true, tilt };
+        check_measurement("tilt", seed, &core, &[], &|core| core.fuse_attitude(&tilt));
+    }
+}
+
+fn detection(core: &Core, target: usize, marker: usize) -> MarkerDetection {
+    let model = &core.models.targets[target].markers[marker];
+    MarkerDetection {
+        marker: model.id,
+        center_px: Vector2::new(640.0, 512.0),
+        center_cov_px2: Matrix2::identity(),
+        corners_px: model.corners.map(|_| [Vector2::new(640.0, 512.0); 4]),
+        corner_cov_px2: [Matrix2::identity(); 4],
+        hamming: 0,
+        margin: 100.0,
+        size_px: 40.0,
+    }
+}
+
+#[test]
+fn tag_corners_discs_and_features() {
+    // Pixels per metre; the ground's slope is 8 %.
+    let slope_of_a_cell = Omitted {
+        term: "slope is that over a cell, not at the point",
+        columns: at::OWN..usize::MAX,
+        rows: ALL_ROWS,
+        at_most: 1e-3,
+    };
+    for seed in 0..STATES {
+        for (ground, omitted) in
+            [(Ground::Flat { down_m: 0.0 }, &[][..]), (slope(), std::slice::from_ref(&slope_of_a_cell))]
+        {
+            let core = random_core(seed, ground);
+            for (what, target, marker) in
+                [("tag", 0, 0), ("disc", 0, 1), ("rover's tag", 1, 0), ("tag on the ground", 2, 0)]
+            {
+                let seen = detection(&core, target, marker);
+                check_measurement(what, seed, &core, omitted, &|core| {
+                    core.fuse_marker(target, marker, &seen, true);
+                });
+            }
+            let track = FeatureTrack { id: 3, px: Vector2::new(640.0, 512.0), sigma_px: 1.0 };
+            check_measurement("feature", seed, &core, omitted, &|core| core.fuse_feature(3, &track, true));
+        }
+    }
+}
+
+/// Turning helicopter, velocity and everything seen about the vertical changes no pixel, whatever was fused before:
+/// the covariance is carried along so that no heading comes of it (`State::keep_heading_unobserved`).
+#[test]
+fn nothing_seen_tells_absolute_heading() {
+    for seed in 0..STATES {
+        let core = random_core(seed, Ground::Flat { down_m: 0.0 });
+        let state = &core.state;
+        let mut turn = vec![0.0; state.len()];
+        let mut put = |first: usize, north: f64, east: f64| (turn[first], turn[first + 1]) = (-east, north);
+        put(at::POSITION, state.own.position.x, state.own.position.y);
+        put(at::VELOCITY, state.own.velocity.x, state.own.velocity.y);
+        for (i, target) in state.targets.iter().enumerate() {
+            put(state.target_at(i), target.mean[0], target.mean[1]);
+        }
+        for (i, feature) in state.features.iter().enumerate() {
+            put(state.feature_at(i), feature.mean[0], feature.mean[1]);
+        }
+        turn[at::ATTITUDE + 2] = 1.0;
+        (0..state.targets.len()).for_each(|i| turn[state.target_at(i) + 2] = 1.0);
+        let turn = nalgebra::DVector::from(turn);
+        for target in 0..state.targets.len() {
+            let seen = detection(&core, target, 0);
+            let (h, _) = measured(&mut core.clone(), &|core| {
+                core.fuse_marker(target, 0, &seen, true);
+            });
+            let pixels = (h * &turn).amax();
+            assert!(pixels < 1e-8, "seed {seed}, target {target}: {pixels} px per radian");
+        }
+    }
+}
+
+/// A delayed copy is moved by an update as if it were part of the state: against the same update in dense matrices.
+#[test]
+fn delayed_copies_are_fused_like_states() {
+    for seed in 0..STATES {
+        let mut core = random_core(seed, Ground::Flat { down_m: 0.0 });
+        let n = core.state.len();
+        let copied = core.state.echoes[0].mean.len();
+        let mut rng = ChaCha8Rng::seed_from_u64(2_000 + seed);
+        let root = DMatrix::from_fn(n + copied, n + copied, |_, _| rng.random_range(-0.05..0.05));
+        let p = &root * root.transpose();
+        (0..n).for_each(|i| (0..n).for_each(|j| core.state.cov.set(i, j, p[(i, j)])));
+        let copy = &mut core.state.echoes[0];
+        copy.live = true;
+        for i in 0..copied {
+            (0..n).for_each(|j| copy.cross.set(i, j, p[(n + i, j)]));
+            (0..copied).for_each(|j| copy.cov.set(i, j, p[(n + i, n + j)]));
+        }
+        // Seen a pixel off where it is expected, so that the gate has no part in it.
+        let (target, marker) = (1, 0);
+        let mut seen = detection(&core, target, marker);
+        let corners = core.models.targets[target].markers[marker].corners.expect("a tag");
+        seen.corners_px = Some(corners.map(|corner| {
+            let (world, _) = target_point(&core.state.targets[target].mean, &core.models, &corner);
+            view(&core.state.own, &core.models, &world).expect("it lies below").px + Vector2::new(1.0, -0.5)
+        }));
+        let z = {
+            let mut twin = core.clone();
+            twin.fuse_marker(target, marker, &seen, true);
+            twin.z.clone()
+        };
+        core.state.echoes.truncate(1);
+        let h = DMatrix::from_fn(z.m, n + copied, |i, j| if j < n { z.derivative_by(i, j) } else { 0.0 });
+        let r = DMatrix::from_fn(z.m, z.m, |i, j| z.noise[i][j]);
+        let s = &h * &p * h.transpose() + r;
+        let gain = &p * h.transpose() * s.try_inverse().expect("positive definite");
+        let step = &gain * nalgebra::DVector::from_column_slice(&z.residual[..z.m]);
+        let left = &p - &gain * &h * &p;
+        core.fuse_marker(target, marker, &seen, true);
+        let copy = &core.state.echoes[0];
+        for i in 0..copied {
+            assert!((copy.mean[i] - step[n + i]).abs() < 1e-6, "seed {seed}: mean {i}");
+            for j in 0..copied {
+                let (got, want) = (copy.cov.at(i, j), left[(n + i, n + j)]);
+                assert!(
+                    (got - want).abs() < 1e-6 * (1.0 + want.abs()),
+                    "seed {seed}: {i}, {j}: {got} for {want}"
+                );
+            }
+        }
+    }
+}
+
+/// A small turn about each axis moves attitude as `R = exp(δ) R̂` says.
+#[test]
+fn attitude_errors_are_turns_about_the_axes_of_ned() {
+    for seed in 0..STATES {
+        let core = random_core(seed, Ground::Flat { down_m: 0.0 });
+        for axis in 0..3 {
+            let turned = moved(&core, at::ATTITUDE + axis, 0.3).state.own.ned_from_body;
+            let about =
+                Rotation3::from_axis_angle(&nalgebra::Unit::new_normalize(Vector3::ith(axis, 1.0)), 0.3);
+            let wanted = about * core.state.own.ned_from_body;
+            let off = (turned.matrix() - wanted.matrix()).amax();
+            assert!(off < 1e-12, "seed {seed}, axis {axis}: {off}");
+        }
+    }
+}

@@ -1,0 +1,190 @@
+//! The configuration and site in the form the filter computes with: radians, metres, matrices.
+
+use nalgebra::{Matrix3, Vector3};
+
+use windhover_base::geo::{CameraModel, Ground, LocalFrame, TiltConvention, rot_z};
+use windhover_base::msg::MarkerId;
+use windhover_base::settings::{EstimatorConfig, MarkerConfig, MarkerKind, Rig, TargetConfig, TargetModel};
+
+use super::Site;
+use super::matrix::chi_square_quantile;
+
+/// Correlation times.
+#[derive(Clone, Debug)]
+pub(super) struct Taus {
+    pub(super) rate_s: f64,
+    pub(super) force_s: f64,
+    pub(super) gps_bias_s: f64,
+}
+
+/// Intensities of the walks that are not learnt, units²/s.
+#[derive(Clone, Debug)]
+pub(super) struct Walks {
+    pub(super) velocity_q: f64,
+    pub(super) heading_bias_q: f64,
+    pub(super) tilt_gain_q: f64,
+    pub(super) tilt_bias_q: f64,
+    pub(super) gps_delay_q: f64,
+    pub(super) slip_q: f64,
+}
+
+/// A marker in its vehicle's frame.
+#[derive(Clone, Debug)]
+pub(super) struct Marker {
+    pub(super) id: MarkerId,
+    /// Centre, forward-right-down, m.
+    pub(super) center: Vector3<f64>,
+    /// A tag's corners in the order of [`windhover_base::msg::MarkerDetection::corners_px`].
+    pub(super) corners: Option<[Vector3<f64>; 4]>,
+    /// Edge or diameter, m.
+    pub(super) size_m: f64,
+    /// Where a tag's top points in the vehicle frame, rad.
+    pub(super) yaw: f64,
+}
+
+/// A target as configured.
+#[derive(Clone, Debug)]
+pub(super) struct TargetModels {
+    pub(super) model: TargetModel,
+    pub(super) reference_m: f64,
+    /// 1/m, of the tightest turn; `None` where the target may turn on the spot.
+    pub(super) max_curvature: Option<f64>,
+    pub(super) markers: Vec<Marker>,
+    /// Around the middle of its markers, what the vehicle may cover, m.
+    pub(super) radius_m: f64,
+}
+
+/// Everything the filter computes with.
+#[derive(Clone, Debug)]
+pub(super) struct Models {
+    pub(super) frame: LocalFrame,
+    pub(super) ground: Ground,
+    pub(super) camera: CameraModel,
+    pub(super) image_px: (f64, f64),
+    pub(super) camera_from_body: Matrix3<f64>,
+    pub(super) camera_at: Vector3<f64>,
+    pub(super) antenna_at: Vector3<f64>,
+    pub(super) convention: TiltConvention,
+    pub(super) declination: f64,
+    pub(super) yaw_offset: f64,
+    pub(super) pitch_offset: f64,
+    pub(super) roll_offset: f64,
+    pub(super) gps_bias_var: Vector3<f64>,
+    pub(super) gps_noise_var: f64,
+    pub(super) gps_velocity_var: f64,
+    pub(super) gps_delay_var: f64,
+    pub(super) heading_bias_var: f64,
+    pub(super) tau: Taus,
+    pub(super) walk: Walks,
+    /// Intensities of a target's speed and yaw rate walks as configured.
+    pub(super) target_walks: [f64; 2],
+    pub(super) targets: Vec<TargetModels>,
+    pub(super) marker_var_px2: f64,
+    pub(super) feature_factor2: f64,
+    /// Chi-square gate by number of components.
+    pub(super) gates: [f64; 9],
+}
+
+/// Steepest wheel angle of a car-like vehicle, rad: 40° is at the upper end of what is built.
+const MAX_STEER: f64 = 0.7;
+
+/// GPS height errs about twice as much as position: satellites are only above.
+const GPS_DOWN_FACTOR: f64 = 2.0;
+
+impl Models {
+    pub(super) fn new(rig: &Rig, estimator: &EstimatorConfig, site: &Site) -> Self {
+        let Rig { gps, compass, camera, target } = rig;
+        let mount = &camera.mount;
+        let across = gps.bias_sigma_m.powi(2);
+        let mut gates = [f64::INFINITY; 9];
+        for (m, gate) in gates.iter_mut().enumerate().skip(1) {
+            *gate = chi_square_quantile(estimator.gate_probability, m);
+        }
+        Self {
+            frame: site.frame,
+            ground: site.ground.clone(),
+            camera: camera.intrinsics,
+            image_px: (f64::from(camera.width), f64::from(camera.height)),
+            camera_from_body: mount.body_from_camera().matrix().transpose(),
+            camera_at: mount.position(),
+            antenna_at: Vector3::from(gps.antenna_position_m),
+            convention: compass.angles,
+            declination: site.declination_rad,
+            yaw_offset: compass.yaw_offset_deg.to_radians(),
+            pitch_offset: compass.pitch_offset_deg.to_radians(),
+            roll_offset: compass.roll_offset_deg.to_radians(),
+            gps_bias_var: Vector3::new(across, across, across * GPS_DOWN_FACTOR.powi(2)),
+            gps_noise_var: gps.noise_m.powi(2),
+            gps_velocity_var: gps.velocity_noise_mps.powi(2),
+            gps_delay_var: (gps.latency_sigma_ms * 1e-3).powi(2),
+            heading_bias_var: compass.heading_bias_sigma_deg.to_radians().powi(2),
+            tau: Taus { rate_s: RATE_TAU_S, force_s: estimator.force_tau_s, gps_bias_s: gps.bias_tau_s },
+            walk: Walks {
+                velocity_q: VELOCITY_WALK.powi(2),
+                heading_bias_q: HEADING_BIAS_WALK.powi(2),
+                tilt_gain_q: TILT_GAIN_WALK.powi(2),
+                tilt_bias_q: TILT_BIAS_WALK.powi(2),
+                gps_delay_q: GPS_DELAY_WALK.powi(2),
+                slip_q: estimator.target_slip_walk.powi(2),
+            },
+            target_walks: [estimator.target_speed_walk.powi(2), estimator.target_yaw_rate_walk.powi(2)],
+            targets: target.iter().enumerate().map(|(i, t)| target_models(i, t)).collect(),
+            marker_var_px2: estimator.marker_noise_px.powi(2),
+            feature_factor2: estimator.feature_sigma_factor.powi(2),
+            gates,
+        }
+    }
+
+    /// Which marker of which target a detection is of.
+    pub(super) fn find(&self, id: MarkerId) -> Option<(usize, usize)> {
+        self.targets
+            .iter()
+            .enumerate()
+            .find_map(|(t, target)| target.markers.iter().position(|marker| marker.id == id).map(|m| (t, m)))
+    }
+}
+
+/// Correlation time of the helicopter's angular rate, s: a rotor's body answers within a second.
+const RATE_TAU_S: f64 = 1.0;
+/// Gusts and vibration straight into velocity, m/s per √s.
+const VELOCITY_WALK: f64 = 0.02;
+/// Wander of the compass's heading bias, rad per √s (a tenth of a degree over 100 s is 2e-4).
+const HEADING_BIAS_WALK: f64 = 3e-4;
+/// Wander of the share of tilt the compass reads, per √s.
+const TILT_GAIN_WALK: f64 = 0.005;
+/// Wander of the tilt bias, rad per √s.
+const TILT_BIAS_WALK: f64 = 3e-4;
+/// Wander of the GPS delay, s per √s.
+const GPS_DELAY_WALK: f64 = 2e-4;
+
+fn target_models(index: usize, config: &TargetConfig) -> TargetModels {
+    let markers: Vec<Marker> =
+        config.marker.iter().enumerate().map(|(m, marker)| marker_model(index, m, marker)).collect();
+    let wheelbase = config.wheelbase_m.unwrap_or(0.0);
+    let reach = markers.iter().map(|m| m.center.xy().norm() + m.size_m).fold(wheelbase, f64::max);
+    let max_curvature =
+        (config.model == TargetModel::Ackermann && wheelbase > 0.0).then(|| MAX_STEER.tan() / wheelbase);
+    TargetModels {
+        model: config.model,
+        reference_m: config.reference_m,
+        max_curvature,
+        markers,
+        radius_m: reach + 0.5,
+    }
+}
+
+fn marker_model(target: usize, marker: usize, config: &MarkerConfig) -> Marker {
+    let center = Vector3::from(config.position_m);
+    let yaw = config.yaw_deg.to_radians();
+    let tag = (config.kind == MarkerKind::Apriltag).then_some(()).and(config.family.zip(config.id));
+    let Some((family, id)) = tag else {
+        let size_m = config.diameter_m.unwrap_or(0.0);
+        return Marker { id: MarkerId::Disc { target, marker }, center, corners: None, size_m, yaw };
+    };
+    let size_m = config.size_m.unwrap_or(0.0);
+    let half = 0.5 * size_m;
+    // Seen from above with its top toward `yaw`: up in the print is forward, right is right.
+    let corner = |up: f64, right: f64| center + rot_z(yaw) * Vector3::new(up * half, right * half, 0.0);
+    let corners = [corner(1.0, -1.0), corner(1.0, 1.0), corner(-1.0, 1.0), corner(-1.0, -1.0)];
+    Marker { id: MarkerId::Tag { family, id }, center, corners: Some(corners), size_m, yaw }
+}

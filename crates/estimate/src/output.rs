@@ -1,0 +1,174 @@
+//! From the state to what is told: reference point, covariance, geodetic position, expectation of a
+//! frame.
+
+use nalgebra::{SMatrix, UnitQuaternion, Vector2, Vector3};
+
+use windhover_base::geo::wrap_angle;
+use windhover_base::msg::{
+    FramePrediction, MarkerPrediction, Ownship, TargetEstimate, TargetState, TrackStatus,
+};
+use windhover_base::time::MonoTime;
+
+use super::matrix::Grid;
+use super::models::Models;
+use super::state::{Echo, State, at};
+use super::vision::{target_point, view};
+
+/// State and covariance at the reference point, `reference_m` ahead of the rear axle.
+pub(super) fn target_state(
+    models: &Models,
+    target: usize,
+    mean: &[f64],
+    covariance: &SMatrix<f64, 5, 5>,
+) -> TargetState {
+    let ahead = models.targets[target].reference_m;
+    let (s, c) = mean[2].sin_cos();
+    let (north_m, east_m) = (mean[0] + ahead * c, mean[1] + ahead * s);
+    let mut jacobian = SMatrix::<f64, 5, 5>::identity();
+    jacobian[(0, 2)] = -ahead * s;
+    jacobian[(1, 2)] = ahead * c;
+    let down = models.ground.down_m(north_m, east_m);
+    let place = models.frame.geodetic(&Vector3::new(north_m, east_m, down));
+    TargetState {
+        north_m,
+        east_m,
+        heading_rad: wrap_angle(mean[2]),
+        speed_mps: mean[3],
+        yaw_rate_radps: mean[4],
+        lat_deg: place.lat_deg,
+        lon_deg: place.lon_deg,
+        covariance: Some(jacobian * covariance * jacobian.transpose()),
+    }
+}
+
+fn block(cov: &Grid, start: usize) -> SMatrix<f64, 5, 5> {
+    SMatrix::from_fn(|i, j| 0.5 * (cov.at(start + i, start + j) + cov.at(start + j, start + i)))
+}
+
+impl State {
+    /// The estimate of a target at a frame, from the present state.
+    pub(super) fn estimate(&self, models: &Models, target: usize, frame: u32, t: MonoTime) -> TargetEstimate {
+        let track = &self.targets[target];
+        let known = self.alive && track.held && track.status != TrackStatus::Lost;
+        let status = if known { track.status } else { TrackStatus::Lost };
+        let state = known
+            .then(|| target_state(models, target, &track.mean, &block(&self.cov, self.target_at(target))));
+        TargetEstimate { t_valid: t, frame, target, status, state }
+    }
+
+    /// The helicopter at a frame.
+    pub(super) fn ownship(&self, models: &Models, frame: u32, t: MonoTime) -> Ownship {
+        let own = &self.own;
+        let place = models.frame.geodetic(&own.position);
+        let sigma = |first: usize| Vector3::from_fn(|i, _| self.cov.at(first + i, first + i).max(0.0).sqrt());
+        Ownship {
+            t_valid: t,
+            frame,
+            position_ned_m: own.position,
+            velocity_ned_mps: own.velocity,
+            ned_from_body: UnitQuaternion::from_rotation_matrix(&own.ned_from_body),
+            lat_deg: place.lat_deg,
+            lon_deg: place.lon_deg,
+            height_m: place.height_m,
+            position_sigma_m: sigma(at::POSITION),
+            attitude_sigma_rad: sigma(at::ATTITUDE),
+        }
+    }
+
+    /// What a frame taken about now should show.
+    pub(super) fn expect(&self, models: &Models, expected: &mut FramePrediction) {
+        let camera = self.own.position + self.own.ned_from_body * models.camera_at;
+        let height = models.ground.down_m(camera.x, camera.y) - camera.z;
+        let height_sigma = self.cov.at(at::POSITION + 2, at::POSITION + 2).max(0.0).sqrt();
+        expected.size_range_px = size_range(models, height, height_sigma);
+        let held = |t: &super::state::Target| t.held && t.status != TrackStatus::Lost;
+        expected.search = self.targets.iter().any(|t| !(held(t) && t.status == TrackStatus::Tracking));
+        for (i, target) in self.targets.iter().enumerate().filter(|(_, t)| held(t)) {
+            let model = &models.targets[i];
+            let (middle, _) = target_point(&target.mean, models, &middle_of(model));
+            let scale = models.camera.fx / (middle - camera).norm().max(0.5);
+            if let Some(seen) = view(&self.own, models, &middle) {
+                expected.occupied.push((seen.px, model.radius_m * scale));
+            }
+            for marker in &model.markers {
+                let (world, _) = target_point(&target.mean, models, &marker.center);
+                let Some(seen) = view(&self.own, models, &world) else { continue };
+                let sigma_px = self.pixel_sigma(i, models, &world, &seen);
+                let size_px = marker.size_m * models.camera.fx / (world - camera).norm().max(0.5);
+                let reach = 3.0 * sigma_px + size_px;
+                let inside = seen.px.x > -reach
+                    && seen.px.y > -reach
+                    && seen.px.x < models.image_px.0 + reach
+                    && seen.px.y < models.image_px.1 + reach;
+                if inside {
+                    expected.markers.push(MarkerPrediction {
+                        marker: marker.id,
+                        center_px: seen.px,
+                        sigma_px,
+                        size_px,
+                    });
+                }
+            }
+        }
+    }
+
+    /// One-sigma of a marker's pixel (larger axis): `√λ(H P Hᵀ)`.
+    fn pixel_sigma(
+        &self,
+        target: usize,
+        models: &Models,
+        world: &Vector3<f64>,
+        seen: &super::vision::PointView,
+    ) -> f64 {
+        let s = self.target_at(target);
+        let index = [0, 1, 2, 6, 7, 8, s, s + 1, s + 2];
+        let mean = &self.targets[target].mean;
+        let lever = Vector3::new(mean[1] - world.y, world.x - mean[0], 0.0);
+        let [slope_n, slope_e] = models.ground.slope(mean[0], mean[1]);
+        let mut h = SMatrix::<f64, 2, 9>::zeros();
+        h.fixed_columns_mut::<3>(0).copy_from(&-seen.d_point);
+        h.fixed_columns_mut::<3>(3).copy_from(&seen.d_attitude);
+        h.set_column(6, &(seen.d_point * Vector3::new(1.0, 0.0, slope_n)));
+        h.set_column(7, &(seen.d_point * Vector3::new(0.0, 1.0, slope_e)));
+        h.set_column(8, &(seen.d_point * lever));
+        let p = SMatrix::<f64, 9, 9>::from_fn(|i, j| self.cov.at(index[i], index[j]));
+        let s: nalgebra::Matrix2<f64> = h * p * h.transpose();
+        let (mean, half) = (0.5 * s.trace(), 0.5 * (s[(0, 0)] - s[(1, 1)]));
+        (mean + half.hypot(s[(0, 1)])).max(0.0).sqrt()
+    }
+}
+
+impl Echo {
+    /// The smoothed estimate of a target.
+    pub(super) fn estimate(&self, models: &Models, target: usize) -> TargetEstimate {
+        let status = self.status[target];
+        let start = at::TARGET * target;
+        let state = (status != TrackStatus::Lost).then(|| {
+            target_state(models, target, &self.mean[start..start + at::TARGET], &block(&self.cov, start))
+        });
+        TargetEstimate { t_valid: self.t, frame: self.frame, target, status, state }
+    }
+}
+
+fn middle_of(model: &super::models::TargetModels) -> Vector3<f64> {
+    let sum: Vector3<f64> = model.markers.iter().map(|m| m.center).sum();
+    sum / model.markers.len().max(1) as f64
+}
+
+/// Smallest and largest apparent tag edge from a height over the ground: straight below is largest;
+/// toward the image's corner and tilted it shrinks.
+fn size_range(models: &Models, height_m: f64, sigma_m: f64) -> Option<(f64, f64)> {
+    let tags = || models.targets.iter().flat_map(|t| &t.markers).filter(|m| m.corners.is_some());
+    let smallest = tags().map(|m| m.size_m).fold(f64::INFINITY, f64::min);
+    let largest = tags().map(|m| m.size_m).fold(0.0, f64::max);
+    let top = tags().map(|m| -m.center.z).fold(0.0, f64::max);
+    if !(smallest.is_finite() && height_m > 0.5) {
+        return None;
+    }
+    let half = Vector2::new(models.image_px.0, models.image_px.1) * 0.5;
+    let corner = (half.norm() / models.camera.fx).atan();
+    let shrink = corner.cos().powi(2) * 0.6;
+    let near = (height_m - top - 3.0 * sigma_m).max(0.3);
+    let far = height_m + 3.0 * sigma_m;
+    Some((smallest * models.camera.fx / far * shrink, largest * models.camera.fx / near * 1.2))
+}

@@ -1,0 +1,277 @@
+//! One measurement into the state: gate, gain, mean, covariance, delayed copies.
+
+#![expect(clippy::needless_range_loop, reason = "matrix arithmetic reads by its indices")]
+
+use windhover_base::msg::Disposition;
+
+use super::matrix::{Grid, MAX_MEASURED, Small, axpy, cholesky, forward};
+use super::state::{Echo, State};
+
+/// Most state columns one measurement touches.
+const MAX_COLUMNS: usize = 24;
+
+/// Beyond this many times the gate a measurement is refused: no model error explains it.
+pub(super) const REFUSE_RATIO: f64 = 50.0;
+
+/// A linearised measurement `r = H δx + noise` of `m` components that touches few columns.
+#[derive(Clone, Debug)]
+pub(super) struct Measurement {
+    pub(super) m: usize,
+    columns: usize,
+    column: [usize; MAX_COLUMNS],
+    h: [[f64; MAX_COLUMNS]; MAX_MEASURED],
+    /// Innovation.
+    pub(super) residual: [f64; MAX_MEASURED],
+    /// Noise covariance.
+    pub(super) noise: Small,
+}
+
+impl Default for Measurement {
+    fn default() -> Self {
+        Self {
+            m: 0,
+            columns: 0,
+            column: [0; MAX_COLUMNS],
+            h: [[0.0; MAX_COLUMNS]; MAX_MEASURED],
+            residual: [0.0; MAX_MEASURED],
+            noise: [[0.0; MAX_MEASURED]; MAX_MEASURED],
+        }
+    }
+}
+
+impl Measurement {
+    /// Empties it for `m` components.
+    pub(super) fn begin(&mut self, m: usize) {
+        *self = Self { m, ..Self::default() };
+    }
+
+    /// Adds the columns of `len` states from `start`; gives the index of the first.
+    pub(super) fn columns(&mut self, start: usize, len: usize) -> usize {
+        let first = self.columns;
+        for i in 0..len {
+            self.column[first + i] = start + i;
+        }
+        self.columns += len;
+        first
+    }
+
+    /// ∂component/∂column.
+    pub(super) fn set(&mut self, component: usize, column: usize, value: f64) {
+        self.h[component][column] = value;
+    }
+
+    /// ∂component/∂column.
+    pub(super) fn derivative(&self, component: usize, column: usize) -> f64 {
+        self.h[component][column]
+    }
+
+    /// ∂component/∂(column of the error state).
+    #[cfg(test)]
+    pub(super) fn derivative_by(&self, component: usize, column: usize) -> f64 {
+        let entries = self.row(component).iter().zip(&self.column);
+        entries.filter(|(_, c)| **c == column).map(|(h, _)| h).sum()
+    }
+
+    /// Raises the noise by a factor on its variance.
+    pub(super) fn scale_noise(&mut self, factor: f64) {
+        self.noise.iter_mut().flatten().for_each(|x| *x *= factor);
+    }
+
+    fn row(&self, component: usize) -> &[f64] {
+        &self.h[component][..self.columns]
+    }
+
+    fn is_finite(&self) -> bool {
+        (0..self.m).all(|i| self.residual[i].is_finite() && self.row(i).iter().all(|x| x.is_finite()))
+    }
+}
+
+/// What became of a measurement.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Outcome {
+    pub(super) disposition: Disposition,
+    /// Normalised innovation squared over the gate.
+    pub(super) ratio: f64,
+    /// Variance of each component's innovation as predicted.
+    pub(super) innovation_var: [f64; MAX_MEASURED],
+    /// Posterior expectation of the squared error over the noise assumed, a component: one on average
+    /// where that noise is the true one, `E[(z − h)ᵀ R⁻¹ (z − h) | data] / m`.
+    pub(super) misfit: f64,
+}
+
+/// Room for the arithmetic, made once.
+#[derive(Clone, Debug)]
+pub(super) struct Workspace {
+    /// `L⁻¹ H P`, one row a component.
+    whitened: Grid,
+    dx: Vec<f64>,
+    /// `L⁻¹ H P_xc`, one entry a state of the delayed copy at hand.
+    gains: Vec<[f64; MAX_MEASURED]>,
+}
+
+impl Workspace {
+    pub(super) fn new(n: usize) -> Self {
+        Self { whitened: Grid::zeros(MAX_MEASURED, n), dx: vec![0.0; n], gains: vec![[0.0; MAX_MEASURED]; n] }
+    }
+
+    /// Fuses `z`. With a gate (a chi-square value) the noise of a measurement outside it is raised until
+    /// its innovation lies on the gate (soft gate: `R ← R + (ratio − 1) S`, so its weight falls as
+    /// 1/ratio however uncertain the state is), and one absurdly far outside is refused.
+    pub(super) fn fuse(&mut self, state: &mut State, z: &Measurement, gate: Option<f64>) -> Outcome {
+        let mut outcome = Outcome {
+            disposition: Disposition::Invalid,
+            ratio: f64::NAN,
+            innovation_var: [0.0; MAX_MEASURED],
+            misfit: f64::NAN,
+        };
+        if !z.is_finite() {
+            return outcome;
+        }
+        let m = z.m;
+        self.project(state, z);
+        let spread = self.spread(z);
+        let mut s = spread;
+        for i in 0..m {
+            for j in 0..m {
+                s[i][j] += z.noise[i][j];
+            }
+        }
+        for i in 0..m {
+            outcome.innovation_var[i] = s[i][i];
+        }
+        if !cholesky(&mut s, m) {
+            return outcome;
+        }
+        let mut white = z.residual;
+        forward(&s, m, &mut white);
+        let squared: f64 = white[..m].iter().map(|x| x * x).sum();
+        outcome.ratio = gate.map_or(0.0, |g| squared / g);
+        outcome.misfit = misfit(&s, &z.noise, m, &white);
+        outcome.disposition = Disposition::Fused;
+        if !(outcome.ratio <= REFUSE_RATIO) {
+            outcome.disposition = Disposition::GateRejected;
+            return outcome;
+        }
+        if outcome.ratio > 1.0 {
+            outcome.disposition = Disposition::Deweighted;
+            // Innovation covariance raised until the innovation lies on the gate.
+            let root = outcome.ratio.sqrt();
+            s.iter_mut().flatten().for_each(|x| *x *= root);
+            white.iter_mut().for_each(|x| *x /= root);
+        }
+        self.apply(state, z, &s, &white);
+        outcome
+    }
+
+    /// `H P` into the workspace.
+    fn project(&mut self, state: &State, z: &Measurement) {
+        for i in 0..z.m {
+            let out = self.whitened.row_mut(i);
+            out.fill(0.0);
+            for (h, column) in z.row(i).iter().zip(&z.column) {
+                if *h != 0.0 {
+                    axpy(out, *h, state.cov.row(*column));
+                }
+            }
+        }
+    }
+
+    /// `H P Hᵀ` of what [`Self::project`] left.
+    fn spread(&self, z: &Measurement) -> Small {
+        let mut s = [[0.0; MAX_MEASURED]; MAX_MEASURED];
+        for i in 0..z.m {
+            let hp = self.whitened.row(i);
+            for j in 0..=i {
+                let value: f64 = z.row(j).iter().zip(&z.column).map(|(h, c)| h * hp[*c]).sum();
+                (s[i][j], s[j][i]) = (value, value);
+            }
+        }
+        s
+    }
+
+    fn apply(&mut self, state: &mut State, z: &Measurement, l: &Small, white: &[f64; MAX_MEASURED]) {
+        let m = z.m;
+        for i in 0..m {
+            for k in 0..i {
+                self.whitened.add_row(i, -l[i][k], k);
+            }
+            let scale = 1.0 / l[i][i];
+            self.whitened.row_mut(i).iter_mut().for_each(|x| *x *= scale);
+        }
+        self.dx.fill(0.0);
+        for (i, white) in white[..m].iter().enumerate() {
+            axpy(&mut self.dx, *white, self.whitened.row(i));
+        }
+        for r in 0..state.cov.rows() {
+            let row = state.cov.row_mut(r);
+            for i in 0..m {
+                let w = self.whitened.row(i);
+                axpy(row, -w[r], w);
+            }
+        }
+        for echo in state.echoes.iter_mut().chain([&mut state.probe]).filter(|e| e.live) {
+            self.update_echo(echo, z, l, white);
+        }
+        state.inject(&self.dx);
+        state.keep_heading_unobserved(&self.dx);
+    }
+
+    /// Fixed-point smoothing: the copy `c` moves by `P_cx Hᵀ S⁻¹ r`.
+    fn update_echo(&mut self, echo: &mut Echo, z: &Measurement, l: &Small, white: &[f64; MAX_MEASURED]) {
+        let m = z.m;
+        let rows = echo.mean.len();
+        for c in 0..rows {
+            let cross = echo.cross.row(c);
+            let mut y = [0.0; MAX_MEASURED];
+            for (i, y) in y[..m].iter_mut().enumerate() {
+                *y = z.row(i).iter().zip(&z.column).map(|(h, column)| h * cross[*column]).sum();
+            }
+            forward(l, m, &mut y);
+            self.gains[c] = y;
+        }
+        for c in 0..rows {
+            let y = &self.gains[c];
+            let row = echo.cross.row_mut(c);
+            for i in 0..m {
+                axpy(row, -y[i], self.whitened.row(i));
+                echo.mean[c] += y[i] * white[i];
+            }
+            for d in 0..rows {
+                let product: f64 = y[..m].iter().zip(&self.gains[d]).map(|(a, b)| a * b).sum();
+                echo.cov.add(c, d, -product);
+            }
+        }
+    }
+}
+
+/// `(νᵀ S⁻¹ R S⁻¹ ν + m − tr(S⁻¹ R)) / m` from `S = L Lᵀ` and the whitened innovation `L⁻¹ ν`.
+fn misfit(l: &Small, noise: &Small, m: usize, white: &[f64; MAX_MEASURED]) -> f64 {
+    let mut inverse = [[0.0; MAX_MEASURED]; MAX_MEASURED];
+    for k in 0..m {
+        // Column k of L⁻¹ as a row: only entries from k on differ from zero.
+        inverse[k][k] = 1.0;
+        for i in k..m {
+            for j in k..i {
+                inverse[k][i] -= l[i][j] * inverse[k][j];
+            }
+            inverse[k][i] /= l[i][i];
+        }
+    }
+    let dot = |a: &[f64; MAX_MEASURED], b: &[f64; MAX_MEASURED]| -> f64 {
+        a[..m].iter().zip(&b[..m]).map(|(a, b)| a * b).sum()
+    };
+    let mut weighed = [0.0; MAX_MEASURED];
+    for (k, weighed) in weighed[..m].iter_mut().enumerate() {
+        *weighed = dot(&inverse[k], white);
+    }
+    let (mut square, mut trace) = (0.0, 0.0);
+    for i in 0..m {
+        for j in 0..m {
+            if noise[i][j] != 0.0 {
+                square += weighed[i] * noise[i][j] * weighed[j];
+                trace += dot(&inverse[i], &inverse[j]) * noise[i][j];
+            }
+        }
+    }
+    (square + m as f64 - trace) / m as f64
+}

@@ -1,0 +1,108 @@
+//! The digital compass: heading with bias and noise, tilt as its convention and its gain have it.
+
+use nalgebra::Vector3;
+
+use super::random::{Purpose, Stream};
+use super::scenario::{Scenario, within};
+use super::world::{OwnshipTruth, World};
+use windhover_base::geo::{Tilt, euler_321, ned_from_body_321, rot_z, wrap_angle};
+use windhover_base::msg::AttitudeSample;
+use windhover_base::time::{MonoTime, Span};
+
+/// One reading.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(super) struct CompassSample {
+    /// When it was true, host time.
+    pub(super) t_true: MonoTime,
+    /// When its first byte arrives.
+    pub(super) t_first_byte: MonoTime,
+    /// What the device says, radians.
+    pub(super) sample: AttitudeSample,
+}
+
+/// The compass.
+#[derive(Clone, Debug)]
+pub(super) struct Compass {
+    stream: Stream,
+    latency: Span,
+    bias: f64,
+    count: u64,
+    phase_s: f64,
+}
+
+impl Compass {
+    pub(super) fn new(world: &World) -> Self {
+        let scenario = world.scenario();
+        let sim = &scenario.compass;
+        let mut stream = Stream::of(world.seed(), Purpose::Compass);
+        let drawn_ms = stream.uniform(-1.0, 1.0) * sim.latency_spread_ms;
+        let bias_deg = sim.bias_offset_deg + sim.bias_sigma_deg * stream.normal();
+        let phase_s = stream.uniform(0.0, 1.0 / sim.rate_hz);
+        let latency = Span::from_ms(scenario.rig.compass.latency_ms + sim.latency_offset_ms + drawn_ms);
+        Self { stream, latency, bias: bias_deg.to_radians(), count: 0, phase_s }
+    }
+
+    /// True latency minus the configured one.
+    pub(super) fn latency_error(&self, scenario: &Scenario) -> Span {
+        self.latency - Span::from_ms(scenario.rig.compass.latency_ms)
+    }
+
+    /// The heading's constant error, radians.
+    pub(super) fn bias_rad(&self) -> f64 {
+        self.bias
+    }
+
+    /// The next reading that is sent; `None` at the flight's end.
+    pub(super) fn next(&mut self, world: &World) -> Option<CompassSample> {
+        let scenario = world.scenario();
+        let sim = &scenario.compass;
+        loop {
+            let t_s = self.phase_s + self.count as f64 / sim.rate_hz;
+            if t_s > scenario.duration_s {
+                return None;
+            }
+            self.count += 1;
+            let noise = Vector3::from_fn(|_, _| self.stream.normal());
+            let jitter = Span::from_ms(self.stream.normal() * sim.jitter_ms);
+            let flagged = self.stream.chance(sim.flagged);
+            if within(&sim.outages_s, t_s) {
+                continue;
+            }
+            let t_true = world.time(t_s);
+            let mut sample = reading(scenario, &world.ownship(t_true), self.bias, &noise);
+            if flagged {
+                // What a PNI device means by "inclinometer out of range": neither can be used.
+                sample.heading = None;
+                sample.tilt = None;
+            }
+            return Some(CompassSample { t_true, t_first_byte: t_true + self.latency + jitter, sample });
+        }
+    }
+}
+
+/// The reading at an attitude; `noise` is standard normal (heading, pitch, roll).
+fn reading(scenario: &Scenario, own: &OwnshipTruth, bias: f64, noise: &Vector3<f64>) -> AttitudeSample {
+    let (sim, config) = (&scenario.compass, &scenario.rig.compass);
+    let (_, pitch, roll) = euler_321(&own.ned_from_body);
+    // What an accelerometer shows of the tilt, and what the device makes of that.
+    let (seen_pitch, seen_roll) = (sim.tilt_gain * pitch, sim.tilt_gain * roll);
+    let seen_level = ned_from_body_321(0.0, seen_pitch, seen_roll);
+    let exact = config.angles.tilt_of(&(seen_level.inverse() * Vector3::z()));
+    let tilt_noise = sim.tilt_noise_deg.to_radians();
+    let tilt = Tilt {
+        pitch: exact.pitch + config.pitch_offset_deg.to_radians() + tilt_noise * noise.y,
+        roll: exact.roll + config.roll_offset_deg.to_radians() + tilt_noise * noise.z,
+    };
+    let magnetic = match sim.dip_deg {
+        None => own.heading_rad - scenario.declination_deg.to_radians(),
+        Some(dip_deg) => {
+            let (s, c) = dip_deg.to_radians().sin_cos();
+            let field = rot_z(scenario.declination_deg.to_radians()) * Vector3::new(c, 0.0, s);
+            let levelled = seen_level * (own.ned_from_body.inverse() * field);
+            (-levelled.y).atan2(levelled.x)
+        }
+    };
+    let heading =
+        magnetic - config.yaw_offset_deg.to_radians() + bias + sim.heading_noise_deg.to_radians() * noise.x;
+    AttitudeSample { heading: Some(wrap_angle(heading)), heading_is_true: false, tilt: Some(tilt) }
+}

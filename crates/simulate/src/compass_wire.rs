@@ -1,0 +1,90 @@
+//! Compass sentences and packets in every format that is understood.
+
+use super::garmin::write_sentence;
+use windhover_base::msg::AttitudeSample;
+use windhover_base::settings::CompassFormat;
+use windhover_base::time::UtcTime;
+
+/// What a format needs beside the reading.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct WireContext {
+    pub(super) format: CompassFormat,
+    /// Degrees, east positive: for formats that tell a true heading or the variation.
+    pub(super) declination_deg: f64,
+    /// For formats with a time of day.
+    pub(super) utc: UtcTime,
+}
+
+/// CRC-16 of PNI's binary packets: polynomial 0x1021, start 0 (XMODEM).
+const PNI_CRC: crc::Crc<u16> = crc::Crc::<u16>::new(&crc::CRC_16_XMODEM);
+/// kDataResp and the components sent.
+const PNI_DATA_RESPONSE: u8 = 5;
+const PNI_HEADING: u8 = 5;
+const PNI_DISTORTION: u8 = 8;
+const PNI_PITCH: u8 = 24;
+const PNI_ROLL: u8 = 25;
+
+/// Appends one reading as the device sends it. A reading without a heading is one that the device
+/// flags as not valid.
+pub(super) fn write_reading(sample: &AttitudeSample, context: &WireContext, line: &mut Vec<u8>) {
+    let valid = sample.heading.is_some() && sample.tilt.is_some();
+    let heading = sample.heading.unwrap_or(0.0).to_degrees().rem_euclid(360.0);
+    let tilt = sample.tilt.unwrap_or_default();
+    let (pitch, roll) = (tilt.pitch.to_degrees(), tilt.roll.to_degrees());
+    let h = wrapped(heading, 1);
+    let body = match context.format {
+        CompassFormat::Tcm2 => {
+            // 006: both inclinometer and magnetometer out of range.
+            format!("C{h:.1}P{pitch:.1}R{roll:.1}{}", if valid { "" } else { "E006" })
+        }
+        CompassFormat::Os5000 => format!("C{h:.1}P{pitch:.1}R{roll:.1}T21.5"),
+        CompassFormat::Hmr3000 if valid => format!("PTNTHPR,{h:.1},N,{pitch:.1},N,{roll:.1},N"),
+        CompassFormat::Hmr3000 => "PTNTHPR,,P,,P,,P".into(),
+        CompassFormat::Revolution => {
+            let status = if valid { 'N' } else { 'P' };
+            let counts = |degrees: f64| (degrees * 65_536.0 / 360.0).round() as i64;
+            let turn = counts(heading) % 65_536;
+            let (p, r) = (counts(pitch), counts(roll));
+            format!("PTNTHTM,{turn},{status},{p},{status},{r},{status},13641,2454")
+        }
+        CompassFormat::Pashr => {
+            let c = context.utc.civil();
+            let time = format!("{:02}{:02}{:02}.{:03}", c.hour, c.minute, c.second, c.nanosecond / 1_000_000);
+            let t = wrapped((heading + context.declination_deg).rem_euclid(360.0), 2);
+            let quality = u8::from(valid);
+            format!("PASHR,{time},{t:.2},T,{roll:+.2},{pitch:+.2},+0.00,0.300,0.300,0.500,{quality}")
+        }
+        CompassFormat::Nmea => {
+            let (size, letter) =
+                (context.declination_deg.abs(), if context.declination_deg < 0.0 { 'W' } else { 'E' });
+            if !valid {
+                return;
+            }
+            write_sentence(line, &format!("HCHDG,{h:.1},,,{size:.1},{letter}"));
+            format!("HCXDR,A,{pitch:.1},D,PITCH,A,{roll:.1},D,ROLL")
+        }
+        CompassFormat::Pni => return write_pni(heading, pitch, roll, valid, line),
+    };
+    write_sentence(line, &body);
+}
+
+/// `degrees` rounded to this many digits, 360 becoming 0.
+fn wrapped(degrees: f64, digits: i32) -> f64 {
+    let scale = 10_f64.powi(digits);
+    ((degrees * scale).round() / scale).rem_euclid(360.0)
+}
+
+/// A binary packet: length of the whole, frame, count of components, components, checksum.
+fn write_pni(heading: f64, pitch: f64, roll: f64, valid: bool, line: &mut Vec<u8>) {
+    let mut packet = vec![0, 0, PNI_DATA_RESPONSE, 4];
+    for (component, degrees) in [(PNI_HEADING, heading), (PNI_PITCH, pitch), (PNI_ROLL, roll)] {
+        packet.push(component);
+        packet.extend_from_slice(&(degrees as f32).to_be_bytes());
+    }
+    packet.extend_from_slice(&[PNI_DISTORTION, u8::from(!valid)]);
+    let length = (packet.len() + 2) as u16;
+    packet[..2].copy_from_slice(&length.to_be_bytes());
+    let sum = PNI_CRC.checksum(&packet);
+    packet.extend_from_slice(&sum.to_be_bytes());
+    line.extend_from_slice(&packet);
+}

@@ -1,0 +1,184 @@
+//! How the helicopter moves: thrust along −z of the body, gravity and drag, so that attitude and
+//! acceleration agree; a controller that holds or follows; wind.
+//!
+//! `a = g e_D + f + c_d (w − v)`, `f = −|f| z_body`: the thrust acceleration `f` follows the
+//! controller's command as a damped oscillator (the attitude loop), so attitude is continuous with
+//! its rate.
+
+use nalgebra::{Matrix3, Rotation3, Vector3};
+
+use super::ode::Table;
+use super::random::{Purpose, Stream, Wander};
+use super::scenario::{Helicopter, HelicopterPath, Wind};
+use super::vehicle::VehicleMotion;
+use super::world::{OwnshipTruth, STEP_S};
+use windhover_base::geo::{ned_from_body_321, wrap_angle};
+
+/// Standard gravity, m/s².
+const GRAVITY: f64 = 9.806_65;
+/// Damping of the attitude loop.
+const DAMPING: f64 = 0.8;
+
+// State: position, velocity, thrust acceleration and its rate, each north, east, down.
+const STATES: usize = 12;
+
+/// The helicopter's motion over the flight.
+#[derive(Clone, Debug)]
+pub(super) struct HelicopterMotion {
+    table: Table<STATES>,
+    air: Air,
+    drag_per_s: f64,
+    heading: (f64, Wander),
+}
+
+#[derive(Clone, Debug)]
+struct Air {
+    mean: Vector3<f64>,
+    gusts: [Wander; 3],
+}
+
+struct Pilot<'a> {
+    plan: &'a Helicopter,
+    vehicles: &'a [VehicleMotion],
+    air: Air,
+    agitation: [Wander; 3],
+    offset: Vector3<f64>,
+    phase: f64,
+}
+
+impl Air {
+    fn new(wind: &Wind, seed: u64) -> Self {
+        let mut stream = Stream::of(seed, Purpose::Wind);
+        let random = stream.uniform(-180.0, 180.0);
+        let toward = wind.toward_deg.unwrap_or(random).to_radians();
+        let mean = Vector3::new(toward.cos(), toward.sin(), 0.0) * wind.mean_mps;
+        let gust = wind.gust_mps;
+        let gusts = [gust, gust, 0.4 * gust].map(|rms| Wander::new(rms, 1.5, 15.0, &mut stream));
+        Self { mean, gusts }
+    }
+
+    fn at(&self, t: f64) -> Vector3<f64> {
+        self.mean + Vector3::from_fn(|i, _| self.gusts[i].at(t))
+    }
+}
+
+impl HelicopterMotion {
+    pub(super) fn new(
+        plan: &Helicopter,
+        wind: &Wind,
+        vehicles: &[VehicleMotion],
+        seed: u64,
+        span_s: (f64, f64),
+    ) -> Self {
+        let mut stream = Stream::of(seed, Purpose::Flight);
+        let random_heading = stream.uniform(-180.0, 180.0);
+        let heading = plan.heading_deg.unwrap_or(random_heading).to_radians();
+        let wander = Wander::new(plan.heading_wander_deg.to_radians(), 5.0, 30.0, &mut stream);
+        let pilot = Pilot {
+            plan,
+            vehicles,
+            air: Air::new(wind, seed),
+            agitation: [1.0, 1.0, 0.6]
+                .map(|share| Wander::new(share * plan.agitation_mps2, 1.0, 6.0, &mut stream)),
+            offset: Vector3::new(stream.uniform(-0.7, 0.7), stream.uniform(-0.7, 0.7), 0.0),
+            phase: stream.uniform(0.0, std::f64::consts::TAU),
+        };
+        let start = pilot.start_state(span_s.0);
+        let table = Table::integrate(|t, y| pilot.derivative(t, y), start, span_s, STEP_S);
+        Self { table, air: pilot.air.clone(), drag_per_s: plan.drag_per_s, heading: (heading, wander) }
+    }
+
+    pub(super) fn at(&self, t_s: f64) -> OwnshipTruth {
+        let y = self.table.at(t_s);
+        let part = |k: usize| Vector3::new(y[k], y[k + 1], y[k + 2]);
+        let (position, velocity, thrust, thrust_rate) = (part(0), part(3), part(6), part(9));
+        let heading = self.heading.0 + self.heading.1.at(t_s);
+        let ned_from_body = attitude(&thrust, heading);
+        let acceleration = thrust + Vector3::z() * GRAVITY + (self.air.at(t_s) - velocity) * self.drag_per_s;
+        // The body's rate by a central difference of the attitude over 2 ms.
+        let h = 1e-3;
+        let later = attitude(&(thrust + thrust_rate * h), heading + self.heading.1.rate(t_s) * h);
+        let earlier = attitude(&(thrust - thrust_rate * h), heading - self.heading.1.rate(t_s) * h);
+        let body_rate_radps = (earlier.inverse() * later).scaled_axis() / (2.0 * h);
+        OwnshipTruth {
+            position_ned_m: position,
+            velocity_ned_mps: velocity,
+            acceleration_ned_mps2: acceleration,
+            ned_from_body,
+            body_rate_radps,
+            heading_rad: wrap_angle(heading),
+        }
+    }
+}
+
+/// The attitude whose −z axis lies along the thrust and whose x axis has this azimuth.
+fn attitude(thrust: &Vector3<f64>, heading: f64) -> Rotation3<f64> {
+    let z_body = -thrust.normalize();
+    let (s, c) = heading.sin_cos();
+    // z_body in the frame turned by the heading is Ry(pitch) Rx(roll) e_z = (sθ cφ, −sφ, cθ cφ).
+    let w = Matrix3::new(c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0) * z_body;
+    ned_from_body_321(heading, w.x.atan2(w.z), (-w.y).clamp(-1.0, 1.0).asin())
+}
+
+impl Pilot<'_> {
+    /// Where to be, and how fast.
+    fn reference(&self, t: f64) -> (Vector3<f64>, Vector3<f64>, Vector3<f64>) {
+        let down = -self.plan.height_m;
+        let (p, v, a) = match self.plan.path {
+            HelicopterPath::Hover { north_m, east_m } => {
+                (Vector3::new(north_m, east_m, down), Vector3::zeros(), Vector3::zeros())
+            }
+            HelicopterPath::Follow { target } => match self.vehicles.get(target) {
+                Some(vehicle) => {
+                    let at = vehicle.at(t);
+                    let (s, c) = at.heading_rad.sin_cos();
+                    let v = Vector3::new(c, s, 0.0) * at.speed_mps;
+                    (Vector3::new(at.north_m, at.east_m, down), v, Vector3::zeros())
+                }
+                None => (Vector3::new(0.0, 0.0, down), Vector3::zeros(), Vector3::zeros()),
+            },
+            HelicopterPath::Circle { radius_m, speed_mps } => {
+                let rate = speed_mps / radius_m;
+                let (s, c) = (self.phase + rate * t).sin_cos();
+                let p = Vector3::new(radius_m * c, radius_m * s, down);
+                (p, Vector3::new(-s, c, 0.0) * speed_mps, Vector3::new(-c, -s, 0.0) * (speed_mps * rate))
+            }
+        };
+        (p + self.offset, v, a)
+    }
+
+    fn start_state(&self, t: f64) -> [f64; STATES] {
+        let (p, v, _) = self.reference(t);
+        let thrust = self.command(t, &p, &v);
+        [p.x, p.y, p.z, v.x, v.y, v.z, thrust.x, thrust.y, thrust.z, 0.0, 0.0, 0.0]
+    }
+
+    /// Thrust acceleration asked for: feedback on position and velocity, the mean wind's drag known.
+    fn command(&self, t: f64, p: &Vector3<f64>, v: &Vector3<f64>) -> Vector3<f64> {
+        let (p_ref, v_ref, a_ref) = self.reference(t);
+        let restless = Vector3::from_fn(|i, _| self.agitation[i].at(t));
+        let mut wanted = a_ref
+            + (p_ref - p) * self.plan.position_gain
+            + (v_ref - v) * self.plan.velocity_gain
+            + restless
+            + (v_ref - self.air.mean) * self.plan.drag_per_s;
+        let limit = self.plan.limit_mps2;
+        let level = wanted.x.hypot(wanted.y);
+        if level > 1e-9 {
+            let held = limit * (level / limit).tanh() / level;
+            wanted.x *= held;
+            wanted.y *= held;
+        }
+        wanted.z = limit * (wanted.z / limit).tanh();
+        wanted - Vector3::z() * GRAVITY
+    }
+
+    fn derivative(&self, t: f64, y: &[f64; STATES]) -> [f64; STATES] {
+        let part = |k: usize| Vector3::new(y[k], y[k + 1], y[k + 2]);
+        let (p, v, thrust, rate) = (part(0), part(3), part(6), part(9));
+        let a = thrust + Vector3::z() * GRAVITY + (self.air.at(t) - v) * self.plan.drag_per_s;
+        let omega = self.plan.attitude_rate;
+        let jerk = (self.command(t, &p, &v) - thrust) * (omega * omega) - rate * (2.0 * DAMPING * omega);
+        [v.x, v.y, v.z, a.x, a.y, a.z, rate.x, rate.y, rate.z, jerk.x, jerk.y, jerk.z]
+    }
+}

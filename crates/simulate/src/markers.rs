@@ -1,0 +1,17 @@
+//! Where a marker's corners are on its vehicle.
+
+use nalgebra::Vector3;
+
+use windhover_base::settings::MarkerConfig;
+
+/// The corners of a marker in the vehicle frame, metres: top-left, top-right, bottom-right,
+/// bottom-left of the tag as printed, seen from above; of a disc, of the square around it.
+pub fn corners_in_vehicle(marker: &MarkerConfig) -> [Vector3<f64>; 4] {
+    let half = 0.5 * marker.size_m.or(marker.diameter_m).unwrap_or(0.0);
+    let (s, c) = marker.yaw_deg.to_radians().sin_cos();
+    let centre = Vector3::from(marker.position_m);
+    // Along the tag's top (clockwise from vehicle forward by yaw) and along its right.
+    let corner =
+        |top: f64, right: f64| centre + Vector3::new(c * top - s * right, s * top + c * right, 0.0) * half;
+    [corner(1.0, -1.0), corner(1.0, 1.0), corner(-1.0, 1.0), corner(-1.0, -1.0)]
+}
