@@ -4,17 +4,17 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::config::Config;
-use crate::pipeline::{Pipeline, Ticks};
-use windhover_base::msg::{Event, EventBody, Health, Output, TargetEstimate};
-use windhover_base::time::{MonoTime, Span};
+use crate::pipeline::Pipeline;
+use windhover_base::msg::{EstimatorOutput, Event, EventBody, Health, Output, TargetEstimate, TimedOutput};
+use windhover_base::time::Span;
 
-use super::card::CardOrders;
+use super::card::{CardOrders, Slot};
 use super::config_file;
 use super::devices::Surroundings;
 use super::events::{self, OperatorEvent};
 use super::health::{Figures, HealthLine};
 use super::latencies::Latencies;
-use super::outlets::Outlets;
+use super::sink::{Outlets, Sink};
 use super::supervise::Heart;
 use super::warm::{self, Earlier, Origin};
 
@@ -49,7 +49,7 @@ pub fn run(
     config: &Config,
     around: &Surroundings,
     board: &Board,
-    outlets: Outlets,
+    (slot, outlets): (Slot, Outlets<Box<dyn Sink>>),
     orders: &CardOrders,
     heart: &Heart,
 ) {
@@ -58,9 +58,9 @@ pub fn run(
         around,
         board,
         origin: Origin::here(config, around.clock),
+        slot,
         outlets,
         pipeline: Pipeline::with_terrain(config, config_file::terrain_of(config)),
-        ticks: Ticks::default(),
         latencies: Latencies::default(),
         health_line: HealthLine::new(config),
         outputs: Vec::new(),
@@ -90,12 +90,12 @@ struct Brain<'a> {
     around: &'a Surroundings,
     board: &'a Board,
     origin: Origin,
-    outlets: Outlets,
+    slot: Slot,
+    outlets: Outlets<Box<dyn Sink>>,
     pipeline: Pipeline,
-    ticks: Ticks,
     latencies: Latencies,
     health_line: HealthLine,
-    outputs: Vec<Output>,
+    outputs: Vec<TimedOutput>,
 }
 
 impl Brain<'_> {
@@ -106,7 +106,7 @@ impl Brain<'_> {
             return;
         }
         let tell = |words: String| self.around.log.tell(OperatorEvent::WarmStart, "", words);
-        match warm::wait_for(self.outlets.slot(), &self.origin, self.around, heart) {
+        match warm::wait_for(&self.slot, &self.origin, self.around, heart) {
             Earlier::Known(state, age) => {
                 tell(format!("continues from what was known {:.1} s ago", age.s()));
                 let body = EventBody::Warm(state);
@@ -123,45 +123,39 @@ impl Brain<'_> {
     }
 
     fn pass_time(&mut self) {
-        let now = self.around.clock.now();
-        for t in self.ticks.until(now) {
+        if let Some(t) = self.pipeline.tick_due(self.around.clock.now()) {
             let tick = self.around.inbox.number(t, EventBody::Tick);
             self.pipeline.handle(&tick, &mut self.outputs);
-            self.pass_on(t);
+            self.pass_on();
         }
     }
 
     fn handle(&mut self, event: &Event) {
-        for t in self.ticks.until(event.t_recv) {
-            let tick = Event { t_recv: t, seq: event.seq, body: EventBody::Tick };
-            self.pipeline.handle(&tick, &mut self.outputs);
-            self.pass_on(t);
-        }
         // Recorded first: what the pipeline stumbles over is on the card.
         self.outlets.event(event);
         self.pipeline.handle(event, &mut self.outputs);
-        self.pass_on(event.t_recv);
+        self.pass_on();
     }
 
     fn finish(&mut self) {
         self.pipeline.finish(&mut self.outputs);
-        self.pass_on(self.around.clock.now());
+        self.pass_on();
         if let Some(all) = self.latencies.of_flight() {
             events::latencies(&all);
         }
     }
 
-    /// Passes on what followed from what was heard at `t`.
-    fn pass_on(&mut self, t: MonoTime) {
+    /// Passes on what followed.
+    fn pass_on(&mut self) {
         let outputs = std::mem::take(&mut self.outputs);
-        for output in &outputs {
-            match output {
+        for timed in &outputs {
+            match &timed.output {
                 Output::Notice(notice) => events::notice(notice),
                 Output::Health(health) => self.health(health),
-                Output::Estimate(estimate) => self.estimate(estimate),
+                Output::Estimator(EstimatorOutput::Estimate(estimate)) => self.estimate(estimate),
                 _ => {}
             }
-            self.outlets.output(output, t);
+            self.outlets.output(timed);
         }
         self.outputs = outputs;
         self.outputs.clear();
@@ -183,7 +177,7 @@ impl Brain<'_> {
         });
         self.outlets.figures(figures.by_name());
         self.health_line.emit(health, Some(&figures));
-        if let (Some(state), Some(store)) = (self.pipeline.warm_state(), self.outlets.slot().get()) {
+        if let (Some(state), Some(store)) = (self.pipeline.warm_state(), self.slot.get()) {
             warm::save(&store, &self.origin, health.t, &state);
         }
     }

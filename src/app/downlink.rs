@@ -89,12 +89,16 @@ impl Downlink {
         }
     }
 
-    /// Takes what MAVLink and thumbnails need of an output.
-    pub fn output(&self, output: &Output) {
-        let mut lines = self.lines();
-        if let Some(mavlink) = &mut lines.mavlink {
+    /// Gives MAVLink what it needs of an output.
+    pub fn mavlink(&self, output: &Output) {
+        if let Some(mavlink) = &mut self.lines().mavlink {
             mavlink.output(output);
         }
+    }
+
+    /// Makes a thumbnail's picture of what was seen in a frame that was kept for it.
+    pub fn picture(&self, output: &Output) {
+        let mut lines = self.lines();
         let Output::Detections { frame, markers, features, .. } = output else { return };
         let Some(of) = lines.frame.take_if(|of| of.index == *frame) else { return };
         if let Some(link) = &lines.link {

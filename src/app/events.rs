@@ -288,7 +288,7 @@ impl From<&StoreNotice> for OperatorEvent {
 
 /// Emits the pipeline's notice, at its own time; replay and daemon show it alike.
 pub fn notice(notice: &Notice) {
-    let about = notice.source.map_or("", Source::name);
+    let about = notice.source.map(Source::name).or(notice.target.as_deref()).unwrap_or("");
     OperatorEvent::from(notice.kind).send(Some(notice.t), about, &notice.detail);
 }
 

@@ -24,6 +24,8 @@ pub mod recording;
 pub mod replay;
 pub mod report;
 pub mod run;
+pub mod sink;
+pub mod sinks;
 pub mod supervise;
 pub mod topology;
 pub mod truth;

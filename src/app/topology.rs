@@ -38,7 +38,7 @@ use super::devices::{self, Surroundings};
 use super::downlink::{self, Downlink};
 use super::inbox::Inbox;
 use super::log::Log;
-use super::outlets::Outlets;
+use super::outlets;
 use super::presence::Presence;
 use super::supervise::{Restart, Supervisor, TaskRule};
 
@@ -100,7 +100,8 @@ pub fn start(config: &Config, clock: HostClock, log: &Log) -> std::io::Result<Gr
     }
     {
         let (config, around, board) = (config.clone(), around.clone(), board.clone());
-        let (outlets, orders) = (Outlets::new(&config, slot, downlink), orders.clone());
+        let outlets = (slot.clone(), outlets::of_daemon(&config, &slot, &downlink));
+        let orders = orders.clone();
         tasks.spawn(PIPELINE, move |heart| brain::run(&config, &around, &board, outlets, &orders, &heart))?;
     }
     if config.gps.pps_device.is_some() {

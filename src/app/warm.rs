@@ -11,7 +11,7 @@ use crate::config::Config;
 use crate::io::clock::HostClock;
 use crate::io::process;
 use crate::io::proto::{host_time, windhover};
-use crate::io::records::warm;
+use crate::io::records::warm_message;
 use crate::io::store::{Recording, StoreHandle};
 use windhover_base::msg::WarmState;
 use windhover_base::time::{MonoTime, Span};
@@ -83,7 +83,7 @@ impl Origin {
             boot_id: self.boot_id.clone().unwrap_or_default(),
             host_from_monotonic_ns: self.host_from_monotonic.ns(),
             config_crc: self.config_crc,
-            ..warm::message(t, state)
+            ..warm_message::message(t, state)
         };
         message.encode_to_vec()
     }
@@ -92,7 +92,7 @@ impl Origin {
     /// is told by the monotonic clock, so the computer's date may have been set between.
     pub fn take_back(&self, kept: &[u8], now: MonoTime) -> Result<(WarmState, Span), Stale> {
         let message = windhover::WarmState::decode(kept).map_err(|_| Stale::Unreadable)?;
-        let mut state = warm::state(&message).ok_or(Stale::Unreadable)?;
+        let mut state = warm_message::state(&message).ok_or(Stale::Unreadable)?;
         if self.boot_id.as_deref() != Some(message.boot_id.as_str()) {
             return Err(Stale::AnotherBoot);
         }

@@ -2,13 +2,11 @@
 
 use std::collections::VecDeque;
 
-use nalgebra::Vector3;
-
 use crate::align::{History, Stamp};
 use windhover_base::geo::wrap_angle;
 use windhover_base::msg::{
-    AttitudeSample, Disposition, FrameObservations, FramePrediction, FusionResult, FusionSource, GnssEpoch,
-    Ownship, Stamped, TargetEstimate, WarmFilter,
+    AttitudeSample, Disposition, EstimatorOutput, FrameObservations, FramePrediction, FusionResult,
+    FusionSource, GnssEpoch, Stamped, WarmFilter,
 };
 use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::{MonoTime, Span};
@@ -17,29 +15,6 @@ use super::Site;
 use super::core::{AnyMeasurement, Core, Kind};
 use super::ownship::start;
 use super::state::State;
-
-/// What the estimator tells.
-#[derive(Clone, PartialEq, Debug)]
-pub enum EstimatorOutput {
-    /// A target at a frame, as known when the frame had been looked at.
-    Estimate(TargetEstimate),
-    /// A target at an earlier frame, with what was measured up to the smoother's lag after it.
-    Smoothed(TargetEstimate),
-    /// The helicopter at a frame.
-    Ownship(Ownship),
-    /// What became of a measurement.
-    Fusion(FusionResult),
-    /// The receiver jumped for good: helicopter, targets and ground features moved along.
-    Anchored {
-        /// By how much, NED.
-        moved_m: Vector3<f64>,
-    },
-    /// The filter started again.
-    Reset {
-        /// Why.
-        reason: &'static str,
-    },
-}
 
 /// The joint filter with its history of measurements.
 #[derive(Clone, Debug)]

@@ -31,8 +31,9 @@ mod jacobians;
 mod tests;
 
 pub use bound::{Bound, BoundTruth};
-pub use filter::{Estimator, EstimatorOutput};
+pub use filter::Estimator;
 pub use paper::PaperEstimator;
+pub use windhover_base::msg::EstimatorOutput;
 
 use windhover_base::geo::{Ground, LocalFrame};
 

@@ -259,6 +259,7 @@ pub(super) mod tests {
                     t: MonoTime::from_ns(1_795_014_245_501_000_000) + Span::from_s(f64::from(s)),
                     kind: NoticeKind::FrameUnusable,
                     source: Some(windhover_base::msg::Source::Camera),
+                    target: None,
                     detail: "too short".into(),
                 });
             }
