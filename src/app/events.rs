@@ -12,7 +12,7 @@ use tracing::{Level, Metadata, Span};
 use crate::io::device::{Fault, NoteKind};
 use crate::io::store::StoreNotice;
 use windhover_base::msg::{Notice, NoticeKind, Source};
-use windhover_base::time::{self, MonoTime, NS_PER_S};
+use windhover_base::time::{self, MonoTime, NS_PER_S, UtcTime};
 
 use super::latencies::OfFlight;
 
@@ -317,15 +317,16 @@ pub fn log_lines_lost(sink: &str, lines: u64) {
     emit!(LogLinesLost, { about = sink, lines }, "the sink does not keep up");
 }
 
-/// The span around everything a run of the daemon does; its fields are known only once the card is.
-pub fn run_span() -> Span {
-    tracing::error_span!(target: TARGET, "run", run = Empty, flight = Empty)
+/// The span around everything that a run of the daemon does; the flight becomes known later.
+pub fn run_span(began: MonoTime) -> Span {
+    let run = UtcTime::from_unix_ns(began.ns()).compact();
+    // Of the gravest severity, to be there whatever is shown.
+    tracing::error_span!(target: TARGET, "run", run, flight = Empty)
 }
 
-/// The run's number and the flight it records have become known, or have changed.
-pub fn flight_of_run(span: &Span, run: u32, flight: &str) {
-    span.record("run", run);
-    span.record("flight", flight);
+/// The flight that the card records from now on, for the span around the caller.
+pub fn flight(name: &str) {
+    Span::current().record("flight", name);
 }
 
 /// Decimals with which a field's figure is shown; those of a sigma are its figure's.

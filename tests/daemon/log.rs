@@ -27,7 +27,7 @@ fn a_stuck_pipe_holds_up_neither_the_file_nor_the_end() {
     let file = bench.path("windhover.log");
     bench.configure(|text| format!("{text}\n[log]\nfile = {:?}\n", file.display().to_string()));
     let (reader, writer) = full_pipe();
-    let daemon = Daemon::start_with(&bench.config(), Stdio::from(writer), &file);
+    let daemon = Daemon::start_with(&bench.config(), Stdio::from(writer), &file, None);
 
     // When it flies for a while and is asked to end, then it goes on, and ends, with everything in the file.
     let (_, seen) = daemon.wait(&["event=health"]);
@@ -53,7 +53,7 @@ fn a_daemon_that_fails_ends_though_nobody_reads_its_last_words() {
     let bench = Bench::new();
     bench.configure(|text| text.replace("38400", "38401"));
     let (reader, writer) = full_pipe();
-    let daemon = Daemon::start_with(&bench.config(), Stdio::from(writer), &bench.path("log"));
+    let daemon = Daemon::start_with(&bench.config(), Stdio::from(writer), &bench.path("log"), None);
     assert_eq!(daemon.ended().code(), Some(78));
     drop(reader);
 }

@@ -4,6 +4,7 @@
 mod devices;
 mod harness;
 mod log;
+mod signals;
 mod warm;
 
 use std::process::Command;

@@ -202,13 +202,6 @@ impl Drop for LogEnd {
     }
 }
 
-impl Log {
-    /// Emits an operator event.
-    pub fn tell(&self, event: events::OperatorEvent, about: &str, message: impl Into<String>) {
-        event.emit(about, message.into());
-    }
-}
-
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
@@ -325,13 +318,16 @@ pub(super) mod tests {
         let sinks = vec![sink(Format::Text, &text, clock), sink(Format::Json, &json, clock)];
         let (layers, _) = layers(sinks, LogLevel::Error, None);
         tracing::subscriber::with_default(layers, || {
-            let run = events::run_span();
-            events::flight_of_run(&run, 7, "boot-7");
-            events::flight_of_run(&run, 7, "20261118T150405Z");
-            run.in_scope(|| events::OperatorEvent::TaskFailed.emit("gps", "ended by itself"));
+            let run = events::run_span(MonoTime::from_ns(1_795_014_245_501_000_000));
+            run.in_scope(|| {
+                events::flight("boot-7");
+                events::flight("20261118T150407Z");
+                events::OperatorEvent::TaskFailed.emit("gps", "ended by itself");
+            });
         });
         assert!(text.take().ends_with("level=error event=task_failed msg=\"ended by itself\" about=gps\n"));
         let object: serde_json::Value = serde_json::from_str(&json.take()).expect("one object");
-        assert_eq!((&object["run"], &object["flight"]), (&7.into(), &"20261118T150405Z".into()));
+        assert_eq!(object["run"], "20261118T150405Z");
+        assert_eq!(object["flight"], "20261118T150407Z");
     }
 }

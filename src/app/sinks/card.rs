@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use crate::app::card::Slot;
 use crate::app::downlink::Downlink;
+use crate::app::flight_store::FlightStore;
 use crate::app::sink::{OutgoingRecord, Sink};
 use crate::io::records;
 use crate::io::store::StoreHandle;
@@ -14,7 +14,7 @@ use windhover_base::time::{MonoTime, UtcTime};
 /// Keeps everything on the data card, while there is one.
 pub struct CardSink {
     camera: CameraConfig,
-    slot: Slot,
+    flight_store: FlightStore,
     downlink: Downlink,
     began: Option<MonoTime>,
     dated: bool,
@@ -22,9 +22,9 @@ pub struct CardSink {
 }
 
 impl CardSink {
-    /// Onto the store in this slot. The link is told when its flight is closed.
-    pub fn new(camera: CameraConfig, slot: Slot, downlink: Downlink) -> Self {
-        Self { camera, slot, downlink, began: None, dated: false, opened: false }
+    /// Onto the store in this flight_store. The link is told when its flight is closed.
+    pub fn new(camera: CameraConfig, flight_store: FlightStore, downlink: Downlink) -> Self {
+        Self { camera, flight_store, downlink, began: None, dated: false, opened: false }
     }
 
     /// The flight's name is the UTC of its start, as the receiver tells it.
@@ -39,7 +39,7 @@ impl CardSink {
 impl Sink for CardSink {
     fn event(&mut self, event: &Event) {
         self.began.get_or_insert(event.t_recv);
-        let Some(store) = self.slot.get() else {
+        let Some(store) = self.flight_store.get() else {
             if std::mem::replace(&mut self.opened, false) {
                 self.downlink.store_closed();
             }
@@ -56,7 +56,7 @@ impl Sink for CardSink {
     }
 
     fn output(&mut self, output: &TimedOutput) {
-        let Some(store) = self.slot.get() else { return };
+        let Some(store) = self.flight_store.get() else { return };
         match &output.output {
             Output::Measured(Measurement::Gnss(epoch)) => self.date(epoch, &store),
             Output::Detections { markers, .. } => store.watch(pixels(markers)),
@@ -65,7 +65,7 @@ impl Sink for CardSink {
     }
 
     fn record(&mut self, record: &mut OutgoingRecord) {
-        if let Some(store) = self.slot.get() {
+        if let Some(store) = self.flight_store.get() {
             store.record(Arc::clone(&record.record), record.number);
         }
     }

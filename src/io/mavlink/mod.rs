@@ -55,7 +55,13 @@ pub struct MavlinkCounts {
     pub refused: u64,
 }
 
-/// Sends the vehicles. Nothing here blocks, but for the look-up of names at the start.
+/// IPv4 addresses of stations by their names. Blocks while they are looked up.
+pub fn look_up(names: &[String]) -> Vec<SocketAddr> {
+    let v4 = |name: &String| name.to_socket_addrs().ok()?.find(SocketAddr::is_ipv4);
+    names.iter().filter_map(v4).collect()
+}
+
+/// Sends the vehicles. Nothing here blocks.
 pub struct MavlinkSender {
     socket: UdpSocket,
     names: Vec<String>,
@@ -150,7 +156,6 @@ impl MavlinkSender {
     pub fn send(&mut self, now: MonoTime) {
         let utc = self.utc_from_host_ns.map(|ahead| UtcTime::from_unix_ns(now.ns().saturating_add(ahead)));
         let started = *self.started.get_or_insert(now);
-        self.resolve(now);
         self.listen(utc);
         if self.key.is_some() && utc.is_none() {
             return;
@@ -199,14 +204,19 @@ impl MavlinkSender {
         }
     }
 
-    fn resolve(&mut self, now: MonoTime) {
+    /// Names of stations that are to be looked up at `now`: all, until each has an address.
+    pub fn unresolved(&mut self, now: MonoTime) -> Option<Vec<String>> {
         let whole = self.addresses.len() == self.names.len();
         if whole || self.resolved.is_some_and(|last| now - last < RESOLVE_EVERY) {
-            return;
+            return None;
         }
         self.resolved = Some(now);
-        let v4 = |name: &String| name.to_socket_addrs().ok()?.find(SocketAddr::is_ipv4);
-        self.addresses = self.names.iter().filter_map(v4).collect();
+        Some(self.names.clone())
+    }
+
+    /// Sends to these addresses from now on.
+    pub fn send_to(&mut self, addresses: Vec<SocketAddr>) {
+        self.addresses = addresses;
     }
 
     /// Empties the socket: without a key nothing is even looked at.
