@@ -18,10 +18,15 @@ const STREAM: &[u8] = b"/run/systemd/journal/stdout";
 pub(super) struct Journal(UnixDatagram);
 
 impl Journal {
-    /// Asks with an empty datagram, which the journal discards; an error where there is no journal.
+    /// Asks with an empty datagram, which the journal discards; an error where there is no journal. One that does not
+    /// take it now is one.
     pub(super) fn open() -> io::Result<Self> {
         let socket = UnixDatagram::unbound()?;
-        socket.send_to(&[], SOCKET)?;
+        socket.set_nonblocking(true)?;
+        match socket.send_to(&[], SOCKET) {
+            Err(error) if error.kind() != io::ErrorKind::WouldBlock => return Err(error),
+            _ => socket.set_nonblocking(false)?,
+        }
         Ok(Self(socket))
     }
 
