@@ -7,7 +7,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{CliError, CliResult};
 use crate::app::health::HealthLine;
-use crate::app::replay::{self, ReplayError, Step};
+use crate::app::replay::{self, ReplayError, ReplayStep};
 use crate::app::{config_file, events, log};
 use crate::io::clock::HostClock;
 use windhover_base::msg::Output;
@@ -54,12 +54,12 @@ pub(super) fn run(args: &Args) -> CliResult {
     });
     let summary =
         replay::replay(&args.capture, &config, args.out.as_deref(), args.realtime, &mut |step| match step {
-            Step::Progress(done, total) => {
+            ReplayStep::Progress(done, total) => {
                 bar.set_length(total);
                 bar.set_position(done);
             }
-            Step::Warning(words) => bar.suspend(|| eprintln!("windhover: {words}")),
-            Step::Output(output) => {
+            ReplayStep::Warning(words) => bar.suspend(|| eprintln!("windhover: {words}")),
+            ReplayStep::Output(output) => {
                 if let Some(health) = &health_line {
                     log_output(output, health);
                 }

@@ -200,7 +200,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
             Err(source) => return Err(GroundError::Zenoh { words, source }),
         },
     };
-    let outlets = Outlets {
+    let outputs = StationOutputs {
         to_disk,
         view,
         live,
@@ -208,7 +208,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
         #[cfg(feature = "zenoh")]
         fleet,
     };
-    let taken = tokio::spawn(intake(records, ended.subscribe(), outlets));
+    let taken = tokio::spawn(intake(records, ended.subscribe(), outputs));
     let outcome = tokio::select! {
         _ = linked => Ok(()),
         Some(error) = failure.recv() => Err(error.into()),
@@ -221,7 +221,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
 }
 
 /// Where records go.
-struct Outlets {
+struct StationOutputs {
     to_disk: std::sync::mpsc::SyncSender<Arrival>,
     view: Arc<Mutex<View>>,
     live: broadcast::Sender<Arc<str>>,
@@ -230,7 +230,7 @@ struct Outlets {
     fleet: Option<fleet::Fleet>,
 }
 
-impl Outlets {
+impl StationOutputs {
     /// To everybody who looks; gives the message for the pages, where it makes one.
     fn show(&self, arrival: &Arrival) -> Option<Arc<str>> {
         if let Some(scope) = &self.scope {
@@ -261,7 +261,7 @@ impl Outlets {
 async fn intake(
     mut records: mpsc::Receiver<FromPayload>,
     mut ended: watch::Receiver<bool>,
-    outlets: Outlets,
+    outputs: StationOutputs,
 ) {
     loop {
         let message = tokio::select! {
@@ -272,22 +272,22 @@ async fn intake(
         let news = match message {
             None => return,
             Some(FromPayload::Record(arrival)) => {
-                let news = outlets.show(&arrival);
-                if !outlets.keep(arrival).await {
+                let news = outputs.show(&arrival);
+                if !outputs.keep(arrival).await {
                     return;
                 }
                 news
             }
             Some(FromPayload::Thumbnail { payload, thumbnail }) => {
-                if let Some(scope) = &outlets.scope {
+                if let Some(scope) = &outputs.scope {
                     scope.thumbnail(&payload, &thumbnail);
                 }
-                Some(lock(&outlets.view).thumbnail(&payload, thumbnail))
+                Some(lock(&outputs.view).thumbnail(&payload, thumbnail))
             }
         };
         if let Some(news) = news {
             // Nobody may be looking.
-            let _ = outlets.live.send(news);
+            let _ = outputs.live.send(news);
         }
     }
 }
