@@ -69,6 +69,9 @@ pub struct Intrinsics {
 ///
 /// Minimises the squared distance between seen and projected points over the camera and every
 /// plane's pose by Levenberg–Marquardt; poses are eliminated view by view (Schur complement).
+///
+/// # Errors
+/// With too few views, or where they do not determine the camera (all square to the lens, for example).
 pub fn calibrate(
     views: &[PlaneView],
     width: f64,

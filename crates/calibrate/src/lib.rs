@@ -1,6 +1,4 @@
-//! Calibration, and what accuracy to expect of it: the camera's intrinsics from boards, mounting
-//! angles from flights, the paper's Monte Carlo analysis.
-
+#![doc = include_str!("../README.md")]
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 pub mod boresight;

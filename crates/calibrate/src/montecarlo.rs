@@ -171,6 +171,9 @@ impl Setup {
     ///
     /// At (35): `σ_N² = σ_pN² + h² (σ_θ² + σ_u²)`, `σ_E² = σ_pE² + h² (σ_φ² + σ_v²)` with u and v
     /// along the body axes. An error of focal length or principal point acts as one of the pixel.
+    ///
+    /// # Errors
+    /// Where the ray of the pixel looked at does not meet the ground.
     pub fn closed_form(&self, sigmas: &PerSource) -> Result<Matrix2<f64>, LocateError> {
         let square = |k: usize| sigmas[k] * sigmas[k];
         let xd = {
@@ -214,6 +217,9 @@ impl Setup {
     }
 
     /// Runs the analysis over `samples` draws; the same seed gives the same figures.
+    ///
+    /// # Errors
+    /// Where the ray of the pixel looked at does not meet the ground without any error.
     pub fn run(&self, samples: usize, seed: u64) -> Result<Analysis, LocateError> {
         let truth = self.located(&[0.0; SOURCE_COUNT])?;
         let closed_m2 = self.closed_form(&self.sigmas)?;

@@ -1,9 +1,4 @@
-//! Serial framing, NMEA, Garmin sentences, compass formats.
-//!
-//! Bytes of one read go in with the time the read returned; epochs and attitude samples come out.
-//! Nothing here fails: what cannot be used is counted in [`DecodeCounts`], and the decoders are in
-//! step again with the next sound sentence.
-
+#![doc = include_str!("../README.md")]
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 mod burst;

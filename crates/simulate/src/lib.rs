@@ -1,10 +1,4 @@
-//! Simulated flights: motion, sensors with their errors, serial sentences and camera frames.
-//!
-//! A [`Scenario`] says everything by figures; [`World`] is the truth at any time; [`SensorSuite`]
-//! turns it into measurements as values (for Monte Carlo runs, without bytes or pixels); [`Flight`]
-//! into the events of real devices: serial bytes at the pace of their line, and rendered frames.
-//! Everything is seeded: the same scenario and seed give the same flight on any machine.
-
+#![doc = include_str!("../README.md")]
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 mod camera;
@@ -13,6 +7,7 @@ mod compass_wire;
 mod flight;
 mod garmin;
 mod gnss;
+mod guide;
 mod helicopter;
 mod line;
 mod markers;

@@ -16,7 +16,7 @@ pub use estimate::{
     Disposition, FusionResult, FusionSource, Ownship, TargetEstimate, TargetState, TrackStatus,
 };
 pub use event::{Event, EventBody, FrameEncoding, FramePayload};
-pub use family::TagFamily;
+pub use family::{FamilySpec, TagFamily};
 pub use health::{Health, SourceHealth, TargetHealth};
 pub use image::{GrayImage, ImageView, RgbImage};
 pub use measure::{

@@ -1,0 +1,5 @@
+//! What is kept: captures, the card and its index.
+
+mod capture;
+mod card;
+mod store;
