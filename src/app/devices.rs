@@ -9,7 +9,6 @@ use crate::io::device::{Fault, NoteKind, Report, Stop};
 use crate::io::pps;
 use crate::io::serial::{self, SerialSettings};
 use windhover_base::msg::{EventBody, Source};
-use windhover_base::settings::CompassFormat;
 use windhover_base::time::MonoTime;
 
 use super::events::Event;
@@ -52,7 +51,7 @@ pub fn compass(config: &Config, around: &Surroundings, heart: &Heart) {
     let settings = SerialSettings {
         device: config.compass.device.clone(),
         baud: config.compass.baud,
-        text: config.compass.format != CompassFormat::Pni,
+        text: config.compass.format.is_text(),
         configure_garmin: false,
     };
     let told = Told::new(Part::Compass, Source::Compass, around, heart);

@@ -118,15 +118,7 @@ fn arrival_jitter_is_removed() {
 /// Every compass format carries the same readings through its own sentences.
 #[test]
 fn every_compass_format_is_read_as_it_was_sent() {
-    for format in [
-        CompassFormat::Tcm2,
-        CompassFormat::Os5000,
-        CompassFormat::Hmr3000,
-        CompassFormat::Revolution,
-        CompassFormat::Pni,
-        CompassFormat::Pashr,
-        CompassFormat::Nmea,
-    ] {
+    for format in CompassFormat::ALL {
         let mut scenario = Scenario::named("follow").expect("known");
         scenario.duration_s = 8.0;
         scenario.rig.compass.format = format;

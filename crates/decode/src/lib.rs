@@ -3,17 +3,13 @@
 
 mod burst;
 mod compass;
-#[cfg(test)]
-mod compass_tests;
-mod compass_text;
 mod counts;
 mod epoch;
-mod frame;
+mod lines;
 mod garmin;
 mod gnss;
 #[cfg(test)]
 mod gnss_tests;
-mod pni;
 mod report;
 mod sentence;
 mod standard;

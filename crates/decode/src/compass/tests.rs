@@ -2,20 +2,10 @@
 
 use proptest::prelude::*;
 
-use super::sentence::framed;
 use super::{CompassDecoder, HeardAttitude};
+use crate::sentence::framed;
 use windhover_base::settings::CompassFormat;
 use windhover_base::time::MonoTime;
-
-const FORMATS: [CompassFormat; 7] = [
-    CompassFormat::Tcm2,
-    CompassFormat::Os5000,
-    CompassFormat::Hmr3000,
-    CompassFormat::Revolution,
-    CompassFormat::Pni,
-    CompassFormat::Pashr,
-    CompassFormat::Nmea,
-];
 
 fn in_pieces(format: CompassFormat, bytes: &[u8], sizes: &[usize]) -> Vec<HeardAttitude> {
     let (mut decoder, mut out) = (CompassDecoder::new(format), Vec::new());
@@ -41,7 +31,7 @@ fn check(heard: &[HeardAttitude]) -> Result<(), TestCaseError> {
 proptest! {
     #[test]
     fn any_bytes_are_survived(bytes in prop::collection::vec(any::<u8>(), 0..2_000)) {
-        for format in FORMATS {
+        for format in CompassFormat::ALL {
             check(&in_pieces(format, &bytes, &[usize::MAX]))?;
         }
     }
@@ -54,7 +44,7 @@ proptest! {
         ),
     ) {
         let text: String = bodies.iter().map(|body| framed(body) + "\r\n").collect();
-        for format in FORMATS {
+        for format in CompassFormat::ALL {
             check(&in_pieces(format, text.as_bytes(), &[usize::MAX]))?;
         }
     }
@@ -72,7 +62,7 @@ proptest! {
             let at = at.index(bytes.len());
             bytes[at] = byte;
         }
-        for format in FORMATS {
+        for format in CompassFormat::ALL {
             let readings = |sizes: &[usize]| {
                 in_pieces(format, &bytes, sizes).iter().map(|heard| heard.reading).collect::<Vec<_>>()
             };

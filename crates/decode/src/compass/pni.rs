@@ -7,9 +7,9 @@ use std::collections::VecDeque;
 
 use crc::{CRC_16_XMODEM, Crc};
 
-use super::compass::{CompassReading, HeardAttitude, heard};
-use super::counts::{DecodeCounts, Refusal};
-use super::frame::LineSpan;
+use super::reading::{CompassReading, HeardAttitude, heard};
+use crate::counts::{DecodeCounts, Refusal};
+use crate::lines::LineSpan;
 use windhover_base::time::MonoTime;
 
 const CRC: Crc<u16> = Crc::<u16>::new(&CRC_16_XMODEM);
