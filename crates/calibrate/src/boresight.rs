@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, DVector, Vector3};
 
-use super::boresight_filter::{Filter, PARAMETERS, Parameters};
+use super::boresight_filter::Filter;
+use super::boresight_state::{PARAMETERS, Parameters};
 use windhover_base::geo::{Geodetic, LocalFrame};
 use windhover_base::msg::{AttitudeSample, GnssEpoch, MarkerDetection, MarkerId, Stamped};
 use windhover_base::settings::{MarkerConfig, Rig, TargetConfig, TargetModel};

@@ -3,6 +3,7 @@
 
 pub mod boresight;
 mod boresight_filter;
+mod boresight_state;
 mod chessboard;
 #[cfg(test)]
 mod drawn_board;
@@ -11,6 +12,7 @@ pub mod intrinsics;
 mod least_squares;
 pub mod montecarlo;
 mod saddle;
+mod spread;
 mod subpixel;
 mod tag_grid;
 mod zhang;

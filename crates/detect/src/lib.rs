@@ -8,6 +8,7 @@ mod detection;
 mod detector;
 mod disc;
 mod disc_pairs;
+mod disjoint_sets;
 mod edge_points;
 mod edges;
 mod equations;

@@ -9,6 +9,7 @@ mod garmin;
 mod gnss;
 mod guide;
 mod helicopter;
+mod instant;
 mod line;
 mod markers;
 mod ode;
@@ -16,6 +17,7 @@ mod random;
 pub mod render;
 mod scenario;
 mod scenarios;
+mod sensor_errors;
 mod suite;
 pub mod truth;
 mod vehicle;
@@ -23,14 +25,13 @@ mod world;
 
 pub use camera::{CameraPose, FrameTruth, MarkerTruth};
 pub use flight::{Flight, FlightError, FrameStorage, JpegEncoder};
+pub use instant::{OwnshipTruth, VehicleTruth};
 pub use markers::corners_in_vehicle;
 pub use random::{Stream, Wander};
-pub use scenario::{
-    CameraSim, Clock, CompassSim, GpsSim, Helicopter, HelicopterPath, HiddenMarker, Route, Scenario, Scene,
-    SpeedPlan, VehiclePlan, Wind,
-};
+pub use scenario::{Clock, Helicopter, HelicopterPath, Route, Scenario, Scene, SpeedPlan, VehiclePlan, Wind};
+pub use sensor_errors::{CameraSim, CompassSim, GpsSim, HiddenMarker};
 pub use suite::{Sample, SensorSuite};
-pub use world::{OwnshipTruth, VehicleTruth, World};
+pub use world::World;
 
 #[cfg(test)]
 mod tests;
