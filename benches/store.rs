@@ -7,7 +7,7 @@ use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use windhover::config::{FramePolicy, StoreConfig};
 use windhover::io::store::flight_writer::{FlightWriter, SegmentLimits};
 use windhover::io::store::format::Compression;
-use windhover::io::store::frames::FrameKeeper;
+use windhover::io::store::frame_keeper::FrameKeeper;
 use windhover::io::store::record::{ChannelDef, RawRecord, Weight};
 use windhover::io::store::segment::Head;
 use windhover::io::store::volume::Volume;

@@ -7,6 +7,9 @@
 //! exposure to estimate, processor time by task, memory and losses. The flight hovers over a parked vehicle, so
 //! that its end fits its beginning; only the receiver's time jumps back.
 //!
+//! It also prints how long a byte and a frame waited for their stamp: from just before the write into the line, and
+//! from when the frame was due, to the log time in the flight. `--busy N` has N threads compute meanwhile.
+//!
 //! It runs as the unit runs it: that environment, and that niceness where root asks for it. A bystander that
 //! only sleeps and looks at the clock tells how long the machine itself stood still: a frame that is late while
 //! it slept on is not the daemon's.
@@ -26,8 +29,9 @@ use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use windhover::app::replay::config_of;
 use windhover::io::capture::CaptureReader;
+use windhover::io::clock::HostClock;
 use windhover_base::msg::{EventBody, Source};
-use windhover_base::time::Span;
+use windhover_base::time::{MonoTime, Span};
 
 #[derive(Parser)]
 struct Args {
@@ -43,6 +47,9 @@ struct Args {
     /// Where the frames are played from: a file system in memory, so that no disk makes them late
     #[arg(long, default_value = "/dev/shm")]
     frames_in: PathBuf,
+    /// Threads that compute all the time beside the daemon
+    #[arg(long, default_value_t = 0)]
+    busy: usize,
     /// The daemon
     #[arg(long, default_value = "target/release/windhover")]
     windhover: PathBuf,
@@ -83,12 +90,17 @@ fn main() -> Result<()> {
     let flight_s = args.flight_s;
     let feeder = Background::start(move |asked| feed(&bytes, flight_s, gps.0, compass.0, asked));
     let bystander = Background::start(stand_by);
+    let busy: Vec<_> = (0..args.busy).map(|_| Background::start(compute)).collect();
     let memory = watch(&mut daemon, args.seconds)?;
     let tasks = tasks(daemon.id())?;
     kill_process(Pid::from_raw(daemon.id().cast_signed()).ok_or("no process")?, Signal::TERM)?;
     daemon.wait()?;
-    feeder.stop()?;
+    let written = feeder.stop()?;
+    for busy in busy {
+        busy.stop()?;
+    }
     report(&fs::read_to_string(&log)?, args.seconds, &memory, &tasks)?;
+    report_stamps(&card, &written)?;
     let late = bystander.stop()?;
     let longest =
         late.iter().copied().reduce(f64::max).map_or(String::new(), |ms| format!(", by {ms:.1} ms at most"));
@@ -186,20 +198,78 @@ impl<T: Send + 'static> Background<T> {
     }
 }
 
-/// Feeds both lines at the real pace, again and again.
-fn feed(bytes: &Bytes, flight_s: u64, mut gps: File, mut compass: File, asked: &AtomicBool) {
+/// Computes until it is stopped.
+fn compute(asked: &AtomicBool) {
+    let mut sum = 0_u64;
+    while !asked.load(Ordering::Acquire) {
+        sum = std::hint::black_box((0..100_000).fold(sum, |sum, n| sum.rotate_left(5) ^ n));
+    }
+}
+
+/// What was written into a line, and when.
+struct Written {
+    t: MonoTime,
+    is_gps: bool,
+    data: Vec<u8>,
+}
+
+/// Feeds both lines at the real pace, again and again; what it wrote.
+fn feed(bytes: &Bytes, flight_s: u64, mut gps: File, mut compass: File, asked: &AtomicBool) -> Vec<Written> {
     let began = Instant::now();
+    let clock = HostClock::start();
+    let mut written = Vec::new();
     for round in 0.. {
         for (since, is_gps, data) in bytes {
             let due = Duration::from_secs(round * flight_s) + Duration::from_secs_f64(since.s().max(0.0));
             std::thread::sleep(due.saturating_sub(began.elapsed()));
             if asked.load(Ordering::Acquire) {
-                return;
+                return written;
             }
+            written.push(Written { t: clock.now(), is_gps: *is_gps, data: data.clone() });
             // Bytes for a line that nobody reads are lost, as on a real one.
             let _ = if *is_gps { &mut gps } else { &mut compass }.write_all(data);
         }
     }
+    written
+}
+
+/// Prints how long bytes and frames waited for their stamp.
+fn report_stamps(card: &Path, written: &[Written]) -> Result<()> {
+    let (mut reads, mut frames) = ([Vec::new(), Vec::new()], Vec::new());
+    for flight in fs::read_dir(card.join("FLIGHTS"))? {
+        for event in CaptureReader::open(&flight?.path())?.filter_map(|item| item.event) {
+            match event.body {
+                EventBody::Bytes { source, data } => {
+                    reads[usize::from(source == Source::Gps)].push((event.t_recv, data));
+                }
+                EventBody::Frame(frame) => frames.push((event.t_recv - frame.t_exposure).ms()),
+                _ => {}
+            }
+        }
+    }
+    let mut bytes = Vec::new();
+    for of in written {
+        let reads = &reads[usize::from(of.is_gps)];
+        let next = reads.partition_point(|(t, _)| *t < of.t);
+        // A read that begins with other bytes is of a write before it that waited.
+        bytes.extend(
+            reads.get(next).filter(|(_, data)| data.starts_with(&of.data)).map(|(t, _)| (*t - of.t).ms()),
+        );
+    }
+    let unmatched = written.len() - bytes.len();
+    for (what, mut waits) in [("bytes", bytes), ("frames", frames)] {
+        waits.sort_unstable_by(f64::total_cmp);
+        let at = |share: f64| waits.get((share * waits.len() as f64) as usize).copied().unwrap_or(f64::NAN);
+        println!(
+            "{what}, ready to stamped, ms: p50 {:.3}, p99 {:.3}, max {:.3} over {}",
+            at(0.5),
+            at(0.99),
+            waits.last().copied().unwrap_or(f64::NAN),
+            waits.len()
+        );
+    }
+    println!("writes without a read of their own: {unmatched} of {}", written.len());
+    Ok(())
 }
 
 /// Sleeps and looks at the clock: by how much it woke late, milliseconds, where that was 20 or more. So long the
@@ -286,6 +356,7 @@ fn report(log: &str, seconds: u64, memory: &[Resident], tasks: &[(String, f64)])
         field(health, "card_dropped")
     );
     let all: f64 = tasks.iter().map(|task| task.1).sum();
+    println!("threads: {}", tasks.len());
     println!("processor, share of one core: {:.1} %", all / seconds as f64 * 100.0);
     for (name, used) in tasks.iter().filter(|task| task.1 > 0.0005 * seconds as f64) {
         println!("  {name:15} {:5.1} %", used / seconds as f64 * 100.0);

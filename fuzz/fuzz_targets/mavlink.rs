@@ -2,7 +2,7 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use windhover::io::mavlink::frame::{SigningKey, verify};
+use windhover::io::mavlink::packet::{SigningKey, verify};
 
 fuzz_target!(|data: &[u8]| {
     assert!(verify(data, &SigningKey([7; 32])).is_err());

@@ -1,162 +1,163 @@
-//! The data card's task: keeps the store running, closes it when power goes, tells what it has to say.
+//! The data card's task: keeps the store running, closes it when power is about to fail, passes on its notices.
 
+use std::sync::Arc;
 use std::sync::mpsc::Receiver;
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::config::{Config, Part};
 use crate::io::clock::HostClock;
-use crate::io::device::Stop;
-use crate::io::store::{Recording, Store, StoreHandle, StoreNotice, StoreStatus};
+use crate::io::device::blocking;
+use crate::io::store::{Recording, Store, StoreNotice, StoreStatus};
 use windhover_base::time::Span;
 
-use super::brain::Board;
-use super::devices::Surroundings;
+use super::context::TaskContext;
 use super::events::Event;
+use super::flight_store::{FlightStore, StoreOrders};
 use super::health::CardFigures;
 use super::presence::PartState;
+use super::status::SharedStatus;
 use super::supervise::Heart;
 
-/// The store, while it runs; nothing while power is going. Copies are the same slot.
-#[derive(Clone, Debug, Default)]
-pub struct Slot(Arc<Mutex<Option<StoreHandle>>>);
-
-impl Slot {
-    /// The store, where it runs.
-    pub fn get(&self) -> Option<StoreHandle> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
-    }
-
-    fn set(&self, handle: Option<StoreHandle>) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = handle;
-    }
-}
-
-/// What the card's task listens to.
-#[derive(Clone, Debug, Default)]
-pub struct CardOrders {
-    /// The pipeline has said its last word.
-    pub last_word: Stop,
-    /// Power is going: close the flight and wait.
-    pub power_going: Arc<std::sync::atomic::AtomicBool>,
-}
-
-impl CardOrders {
-    fn power_goes(&self) -> bool {
-        self.power_going.load(std::sync::atomic::Ordering::Acquire)
-    }
-}
-
-/// How often the task looks round.
-const ROUND: Duration = Duration::from_millis(50);
+/// How often the task passes on what the store reports and shows its state.
+const ROUND: Duration = Duration::from_millis(100);
 /// Longest the flight is kept open for a pipeline that does not end.
-const LAST_WORD: Span = Span::from_ns(1_000_000_000);
+const PIPELINE_ENDS: Duration = Duration::from_secs(1);
 
-/// Starts the store into the slot before there is a pipeline, so that a flight begins with the first
-/// thing heard; `None` where nothing is to be kept.
-pub fn open(config: &Config, clock: HostClock, slot: &Slot) -> Option<Opened> {
-    // A configuration that was checked can be written.
-    let text = config.to_toml().unwrap_or_default();
-    let (store, notices) = config.store.enabled.then(|| Store::start(config, text, clock))?;
-    slot.set(Some(store.handle()));
-    Some(Opened { store, notices })
-}
-
-/// A store that was started, and what it has to tell.
-pub struct Opened {
+/// A store that was started, and what it reports.
+pub struct OpenStore {
     store: Store,
     notices: Receiver<StoreNotice>,
 }
 
-/// Keeps the store running until the pipeline has said its last word after the end was asked for.
-pub fn run(
-    config: &Config,
-    around: &Surroundings,
-    board: &Board,
-    (slot, mut opened): (&Slot, Option<Opened>),
-    orders: &CardOrders,
-    heart: &Heart,
-) {
-    if !config.store.enabled {
-        board
-            .with(|shown| shown.figures.card = CardFigures { state: "off".into(), ..CardFigures::default() });
-        around.presence.set(Part::Store, PartState::Delivers);
-        while !around.stop.asked() {
-            heart.beat();
-            std::thread::sleep(ROUND);
-        }
-        return;
+/// Starts the store before there is a pipeline, so that a flight begins with the first event; `None` where nothing
+/// is to be kept.
+pub fn open(config: &Config, clock: HostClock, flight_store: &FlightStore) -> Option<OpenStore> {
+    // A configuration that was checked can be written.
+    let text = config.to_toml().unwrap_or_default();
+    let (store, notices) = config.store.enabled.then(|| Store::start(config, text, clock))?;
+    flight_store.set(Some(store.handle()));
+    Some(OpenStore { store, notices })
+}
+
+/// Why a store is closed.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+enum Closing {
+    /// The end was asked for.
+    End,
+    /// Power is about to fail.
+    Power,
+}
+
+/// What the store's task works with.
+pub struct StoreTask {
+    /// The configuration.
+    pub config: Arc<Config>,
+    /// What every task is given.
+    pub context: TaskContext,
+    /// Where the card's state is shown.
+    pub status: SharedStatus,
+    /// Where the other tasks find the store.
+    pub flight_store: FlightStore,
+    /// What it is asked to do.
+    pub orders: StoreOrders,
+    /// Its heart.
+    pub heart: Heart,
+}
+
+/// Keeps the store running until the pipeline has handed over its last output after the end was asked for.
+pub async fn run(task: StoreTask, mut opened: Option<OpenStore>) {
+    if !task.config.store.enabled {
+        task.show_state("off");
+        task.context.presence.set(Part::Store, PartState::Delivers);
+        return task.heart.while_waiting(task.context.stop.cancelled()).await;
     }
-    while let Some(Opened { store, notices }) = opened.take().or_else(|| open(config, around.clock, slot)) {
-        let ended = attend(&store, &notices, around, board, orders, heart);
-        slot.set(None);
-        store.stop();
-        tell_all(&notices, around);
-        heart.beat();
-        if ended {
+    while let Some(OpenStore { store, mut notices }) = opened.take() {
+        let why = task.attend(&store, &mut notices).await;
+        task.close(store, notices).await;
+        if why == Closing::End {
             return;
         }
-        around.log.tell(Event::FlightClosed, "", "power is going: everything is on the card");
-        board.with(|shown| shown.figures.card.state = "closed".into());
-        while orders.power_goes() {
-            heart.beat();
-            if around.stop.asked() {
-                return;
+        task.context.log.tell(Event::FlightClosed, "", "power is going: everything is on the card");
+        task.show_state("closed");
+        let mut power = task.orders.power_going.subscribe();
+        let back = async { power.wait_for(|going| !going).await.is_ok() };
+        let back = task.context.stop.run_until_cancelled(back);
+        if task.heart.while_waiting(back).await.is_none() {
+            return;
+        }
+        let (config, clock, store) =
+            (Arc::clone(&task.config), task.context.clock, task.flight_store.clone());
+        opened = blocking(move || open(&config, clock, &store)).await;
+    }
+}
+
+impl StoreTask {
+    /// Attends to a running store until it is to be closed.
+    async fn attend(&self, store: &Store, notices: &mut Receiver<StoreNotice>) -> Closing {
+        let handle = store.handle();
+        let mut power = self.orders.power_going.subscribe();
+        let mut round = tokio::time::interval(ROUND);
+        round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
+        let mut end = std::pin::pin!(self.end());
+        loop {
+            tokio::select! {
+                () = &mut end => return Closing::End,
+                Ok(_) = power.wait_for(|going| *going), if !self.context.stop.is_cancelled() => {
+                    return Closing::Power;
+                }
+                _ = round.tick() => {
+                    self.heart.beat();
+                    self.report(notices);
+                    self.show(&handle.status());
+                }
             }
-            std::thread::sleep(ROUND);
         }
     }
-}
 
-/// Attends to a running store; whether the end was asked for (else power is going).
-fn attend(
-    store: &Store,
-    notices: &Receiver<StoreNotice>,
-    around: &Surroundings,
-    board: &Board,
-    orders: &CardOrders,
-    heart: &Heart,
-) -> bool {
-    let handle = store.handle();
-    let mut end = None;
-    loop {
-        heart.beat();
-        tell_all(notices, around);
-        show(&handle.status(), around, board);
-        if around.stop.asked() {
-            let now = around.clock.now();
-            if orders.last_word.asked() || now - *end.get_or_insert(now) > LAST_WORD {
-                return true;
-            }
-        } else if orders.power_goes() {
-            return false;
+    /// Waits until the end was asked for and the pipeline has handed over everything.
+    async fn end(&self) {
+        self.context.stop.cancelled().await;
+        let _ = tokio::time::timeout(PIPELINE_ENDS, self.orders.pipeline_done.cancelled()).await;
+    }
+
+    /// Closes the flight; waits for the card.
+    async fn close(&self, store: Store, notices: Receiver<StoreNotice>) {
+        self.flight_store.set(None);
+        let closed = blocking(move || {
+            store.stop();
+            notices
+        });
+        self.report(&mut closed.await);
+        self.heart.beat();
+    }
+
+    fn report(&self, notices: &mut Receiver<StoreNotice>) {
+        for notice in notices.try_iter() {
+            let event = Event::Card { name: notice.name(), warning: notice.is_warning() };
+            self.context.log.tell(event, "card", notice.to_string());
         }
-        std::thread::sleep(ROUND);
     }
-}
 
-fn tell_all(notices: &Receiver<StoreNotice>, around: &Surroundings) {
-    for notice in notices.try_iter() {
-        let event = Event::Card { name: notice.name(), warning: notice.is_warning() };
-        around.log.tell(event, "card", notice.to_string());
+    fn show_state(&self, state: &str) {
+        self.status.with(|status| status.figures.card.state = state.into());
     }
-}
 
-fn show(status: &StoreStatus, around: &Surroundings, board: &Board) {
-    let (state, part) = match &status.recording {
-        Recording::Starting => ("starting", PartState::Open),
-        Recording::On => ("ok", PartState::Delivers),
-        Recording::Stopped(_) => ("stopped", PartState::Down("stopped".into())),
-        Recording::Off => ("off", PartState::Down("off".into())),
-    };
-    if around.presence.get(Part::Store) != part {
-        around.presence.set(Part::Store, part);
+    fn show(&self, store: &StoreStatus) {
+        let (state, part) = match &store.recording {
+            Recording::Starting => ("starting", PartState::Open),
+            Recording::On => ("ok", PartState::Delivers),
+            Recording::Stopped(_) => ("stopped", PartState::Down("stopped".into())),
+            Recording::Off => ("off", PartState::Down("off".into())),
+        };
+        if self.context.presence.get(Part::Store) != part {
+            self.context.presence.set(Part::Store, part);
+        }
+        let figures = CardFigures {
+            state: state.into(),
+            free_mb: store.free_mb.map(|mb| mb as f64),
+            sync_p99: (store.fsync_p99_ms > 0.0).then(|| Span::from_ms(store.fsync_p99_ms)),
+            dropped: store.dropped_messages,
+        };
+        self.status.with(|status| status.figures.card = figures);
     }
-    let figures = CardFigures {
-        state: state.into(),
-        free_mb: status.free_mb.map(|mb| mb as f64),
-        sync_p99: (status.fsync_p99_ms > 0.0).then(|| Span::from_ms(status.fsync_p99_ms)),
-        dropped: status.dropped_messages,
-    };
-    board.with(|shown| shown.figures.card = figures);
 }

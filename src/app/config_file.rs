@@ -36,17 +36,32 @@ pub enum ConfigFileError {
     },
 }
 
+/// A configuration, and the terrain that it names.
+#[derive(Clone, Debug)]
+pub struct Loaded {
+    /// The configuration.
+    pub config: Config,
+    /// Its terrain tile, where it names one.
+    pub terrain: Option<Arc<Tile>>,
+}
+
 /// Reads and checks a configuration file.
 pub fn load(path: &Path) -> Result<Config, ConfigFileError> {
+    load_all(path).map(|loaded| loaded.config)
+}
+
+/// Reads and checks a configuration file and what it names. Blocks: a tile takes seconds to read.
+pub fn load_all(path: &Path) -> Result<Loaded, ConfigFileError> {
     let text = std::fs::read_to_string(path)
         .map_err(|source| ConfigFileError::Unreadable { path: path.to_owned(), source })?;
     let config =
         Config::parse(&text).map_err(|source| ConfigFileError::Invalid { path: path.to_owned(), source })?;
-    if let Some(terrain) = &config.ground.terrain {
+    let terrain = config.ground.terrain.as_ref().map(|terrain| {
         io::terrain::load(Path::new(terrain))
-            .map_err(|source| ConfigFileError::Terrain { path: path.to_owned(), source })?;
-    }
-    Ok(config)
+            .map_err(|source| ConfigFileError::Terrain { path: path.to_owned(), source })
+    });
+    let terrain = terrain.transpose()?.map(Arc::new);
+    Ok(Loaded { config, terrain })
 }
 
 /// The terrain tile of a configuration. `None` where it names none, or where it cannot be read:

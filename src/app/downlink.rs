@@ -1,37 +1,39 @@
 //! The link's task: ground stations over QUIC, and the vehicles as MAVLink beside it.
 //!
-//! The pipeline's task hands records and outputs to a [`Downlink`], which never waits; this task, with a
-//! runtime of its own, does the rest. It lives on without a card, without stations, without keys.
+//! The pipeline's task hands records and outputs to a [`Downlink`], which never waits; this task does the
+//! rest. It lives on without a card, without stations, without keys.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
+use tokio::task::JoinSet;
 
 use crate::config::Config;
 use crate::io::clock::HostClock;
+use crate::io::device::blocking;
 use crate::io::link::{
-    Backlog, EarlyRecords, LinkEvent, LinkHandle, LinkStatus, PayloadLink, PayloadSettings, Picture,
-    StoreBacklog,
+    Backlog, EarlyRecords, LinkError, LinkEvent, LinkHandle, LinkStatus, PayloadLink, PayloadSettings,
+    Picture, StoreBacklog,
 };
-use crate::io::mavlink::MavlinkSender;
+use crate::io::mavlink::{self, MavlinkSender};
 use crate::io::records::Record;
 use windhover_base::msg::{Event, EventBody, FramePayload, Output};
-use windhover_base::time::{Span, UtcTime};
+use windhover_base::time::UtcTime;
 
-use super::brain::Board;
-use super::card::Slot;
-use super::devices::Surroundings;
+use super::context::TaskContext;
 use super::events::Event as OperatorEvent;
+use super::flight_store::FlightStore;
+use super::status::SharedStatus;
 use super::supervise::Heart;
 
-/// How often the task looks round.
-const ROUND: Duration = Duration::from_millis(100);
+/// How often the task shows the link's state.
+const ROUND: Duration = Duration::from_millis(250);
 /// Pause before a link that could not be opened is tried again.
-const AGAIN: Span = Span::from_ns(10_000_000_000);
+const AGAIN: Duration = Duration::from_secs(10);
 /// How long the link waits for the card at the start.
-const CARD: Span = Span::from_ns(2_000_000_000);
+const CARD: Duration = Duration::from_secs(2);
 /// A clock that reads less was never set: 2020-01-01.
 const CLOCK_SET_UNIX_NS: i64 = 1_577_836_800_000_000_000;
 
@@ -89,12 +91,16 @@ impl Downlink {
         }
     }
 
-    /// Takes what MAVLink and thumbnails need of an output.
-    pub fn output(&self, output: &Output) {
-        let mut lines = self.lines();
-        if let Some(mavlink) = &mut lines.mavlink {
+    /// Gives MAVLink what it needs of an output.
+    pub fn mavlink(&self, output: &Output) {
+        if let Some(mavlink) = &mut self.lines().mavlink {
             mavlink.output(output);
         }
+    }
+
+    /// Makes a thumbnail's picture of what was seen in a frame that was kept for it.
+    pub fn picture(&self, output: &Output) {
+        let mut lines = self.lines();
         let Output::Detections { frame, markers, features, .. } = output else { return };
         let Some(of) = lines.frame.take_if(|of| of.index == *frame) else { return };
         if let Some(link) = &lines.link {
@@ -103,55 +109,56 @@ impl Downlink {
     }
 }
 
+/// What the link's task works with.
+pub struct LinkTask {
+    /// The configuration.
+    pub config: Arc<Config>,
+    /// What every task is given.
+    pub context: TaskContext,
+    /// Where the link's state is shown.
+    pub status: SharedStatus,
+    /// Where back-fill comes from.
+    pub flight_store: FlightStore,
+    /// The pipeline's side.
+    pub downlink: Downlink,
+    /// Its heart.
+    pub heart: Heart,
+}
+
 /// Serves stations until the end is asked for.
-pub fn run(
-    config: &Config,
-    around: &Surroundings,
-    board: &Board,
-    slot: &Slot,
-    downlink: &Downlink,
-    heart: &Heart,
-) {
-    let fault =
-        |why: &dyn std::fmt::Display| around.log.tell(OperatorEvent::LinkFault, "link", why.to_string());
-    if config.mavlink.enabled {
-        match MavlinkSender::open(config) {
-            Ok(sender) => downlink.lines().mavlink = Some(sender),
-            Err(error) => fault(&error),
+pub async fn run(task: LinkTask) {
+    let mut beside = JoinSet::new();
+    if task.config.mavlink.enabled {
+        beside.spawn(send_mavlink(task.downlink.clone(), task.context.clock, every(&task.config)));
+        task.open_mavlink().await;
+    }
+    while !task.context.stop.is_cancelled() {
+        if !task.config.link.enabled {
+            task.show("off");
+            task.heart.while_waiting(task.context.stop.cancelled()).await;
+            continue;
+        }
+        match task.open().await {
+            Ok((link, handle, events)) => {
+                let stop = watch::Sender::new(false);
+                let serving = tokio::spawn(link.run(stop.subscribe()));
+                task.attend(&handle, events).await;
+                stop.send_replace(true);
+                let _ = serving.await;
+            }
+            Err(error) => {
+                task.show("fault");
+                task.fault(&error);
+                let pause = task.context.stop.run_until_cancelled(tokio::time::sleep(AGAIN));
+                task.heart.while_waiting(pause).await;
+            }
         }
     }
-    let runtime = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
-        Ok(runtime) => runtime,
-        Err(error) => return fault(&error),
-    };
-    let task = Task { config, around, board, slot, downlink, heart };
-    runtime.block_on(async {
-        if config.mavlink.enabled {
-            let every = Duration::from_secs_f64(1.0 / config.mavlink.rate_hz);
-            tokio::spawn(send_mavlink(downlink.clone(), around.clock, every));
-        }
-        while !around.stop.asked() {
-            if !config.link.enabled {
-                task.word("off");
-                task.rounds(None).await;
-                continue;
-            }
-            match task.open().await {
-                Ok((link, handle, events)) => {
-                    let stop = watch::Sender::new(false);
-                    let serving = tokio::spawn(link.run(stop.subscribe()));
-                    task.rounds(Some((&handle, events))).await;
-                    stop.send_replace(true);
-                    let _ = serving.await;
-                }
-                Err(error) => {
-                    task.word("fault");
-                    fault(&error);
-                    task.wait(AGAIN).await;
-                }
-            }
-        }
-    });
+}
+
+/// Time between two rounds of MAVLink messages.
+fn every(config: &Config) -> Duration {
+    Duration::from_secs_f64(1.0 / config.mavlink.rate_hz)
 }
 
 async fn send_mavlink(downlink: Downlink, clock: HostClock, every: Duration) {
@@ -159,7 +166,13 @@ async fn send_mavlink(downlink: Downlink, clock: HostClock, every: Duration) {
     tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     loop {
         tick.tick().await;
+        let names = downlink.lines().mavlink.as_mut().and_then(|mavlink| mavlink.unresolved(clock.now()));
+        let addresses = match names {
+            Some(names) => Some(blocking(move || mavlink::look_up(&names)).await),
+            None => None,
+        };
         if let Some(mavlink) = &mut downlink.lines().mavlink {
+            addresses.into_iter().for_each(|addresses| mavlink.send_to(addresses));
             mavlink.send(clock.now());
         }
     }
@@ -167,51 +180,30 @@ async fn send_mavlink(downlink: Downlink, clock: HostClock, every: Duration) {
 
 type Opened = (PayloadLink, LinkHandle, mpsc::Receiver<LinkEvent>);
 
-struct Task<'a> {
-    config: &'a Config,
-    around: &'a Surroundings,
-    board: &'a Board,
-    slot: &'a Slot,
-    downlink: &'a Downlink,
-    heart: &'a Heart,
-}
+impl LinkTask {
+    fn fault(&self, why: &dyn std::fmt::Display) {
+        self.context.log.tell(OperatorEvent::LinkFault, "link", why.to_string());
+    }
 
-impl Task<'_> {
-    fn word(&self, word: impl Into<String>) {
+    fn show(&self, word: impl Into<String>) {
         let word = word.into();
-        self.board.with(|shown| shown.figures.link = word);
+        self.status.with(|status| status.figures.link = word);
     }
 
-    /// One look round: shows life.
-    async fn round(&self) {
-        self.heart.beat();
-        tokio::time::sleep(ROUND).await;
-    }
-
-    /// Waits for what takes as long as the card does, showing life meanwhile.
-    async fn while_beating<T>(&self, work: impl Future<Output = T>) -> T {
-        let mut work = std::pin::pin!(work);
-        loop {
-            tokio::select! {
-                done = &mut work => return done,
-                () = self.round() => {}
-            }
+    async fn open_mavlink(&self) {
+        let config = Arc::clone(&self.config);
+        match blocking(move || MavlinkSender::open(&config)).await {
+            Ok(sender) => self.downlink.lines().mavlink = Some(sender),
+            Err(error) => self.fault(&error),
         }
     }
 
-    /// Looks round for a while, or until the end is asked for.
-    async fn wait(&self, length: Span) {
-        let end = self.around.clock.now() + length;
-        while !self.around.stop.asked() && self.around.clock.now() < end {
-            self.round().await;
-        }
-    }
-
-    async fn open(&self) -> Result<Opened, crate::io::link::LinkError> {
+    async fn open(&self) -> Result<Opened, LinkError> {
         let (deep, run, flight) = self.identity().await;
         let one_run = deep.is_some();
         let settings = PayloadSettings::from_config(&self.config.link);
-        let opened = PayloadLink::open(&settings, run, &flight, deep)?;
+        // Keys are read from files.
+        let opened = blocking(move || PayloadLink::open(&settings, run, &flight, deep)).await?;
         let mut lines = self.downlink.lines();
         // A store that closed its flight meanwhile stays another's.
         self.downlink.one_run.fetch_and(one_run, Ordering::Relaxed);
@@ -225,17 +217,15 @@ impl Task<'_> {
 
     /// Which run this is: the store's, where the card answers soon, else one of its own.
     async fn identity(&self) -> (Option<Arc<dyn Backlog>>, u32, String) {
-        let end = self.around.clock.now() + CARD;
-        while self.config.store.enabled && self.slot.get().is_none() && self.around.clock.now() < end {
-            self.round().await;
+        let store = tokio::time::timeout(CARD, self.flight_store.opened());
+        if self.config.store.enabled
+            && let Ok(store) = self.heart.while_waiting(store).await
+        {
+            let opening = blocking(move || StoreBacklog::open(store));
+            let (backlog, run, flight) = self.heart.while_waiting(opening).await;
+            return (Some(Arc::new(backlog)), run, flight);
         }
-        if let Some(store) = self.slot.get() {
-            let opening = tokio::task::spawn_blocking(move || StoreBacklog::open(store));
-            if let Ok((backlog, run, flight)) = self.while_beating(opening).await {
-                return (Some(Arc::new(backlog)), run, flight);
-            }
-        }
-        let now = self.around.clock.now().ns();
+        let now = self.context.clock.now().ns();
         // Nanoseconds of the start, folded: no two starts share them.
         let run = (now as u64 ^ (now as u64 >> 32)) as u32 | 0x8000_0000;
         let dated = now >= CLOCK_SET_UNIX_NS;
@@ -243,15 +233,18 @@ impl Task<'_> {
         (None, run, flight)
     }
 
-    /// Looks round until the end is asked for: events to the operator, how the link does on the board.
-    async fn rounds(&self, mut link: Option<(&LinkHandle, mpsc::Receiver<LinkEvent>)>) {
-        while !self.around.stop.asked() {
-            self.round().await;
-            if let Some((handle, events)) = &mut link {
-                while let Ok(event) = events.try_recv() {
-                    self.tell(&event);
+    /// Passes the link's events to the operator and shows its state, until the end is asked for.
+    async fn attend(&self, handle: &LinkHandle, mut events: mpsc::Receiver<LinkEvent>) {
+        let mut round = tokio::time::interval(ROUND);
+        round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
+        loop {
+            tokio::select! {
+                () = self.context.stop.cancelled() => return,
+                Some(event) = events.recv() => self.tell(&event),
+                _ = round.tick() => {
+                    self.heart.beat();
+                    self.show(describe(&handle.status()));
                 }
-                self.word(describe(&handle.status()));
             }
         }
     }
@@ -268,7 +261,7 @@ impl Task<'_> {
             LinkEvent::KeysUnusable { why } => (LinkFault, "link", why.clone()),
             LinkEvent::Unresolved { address, why } => (LinkFault, "link", format!("{address}: {why}")),
         };
-        self.around.log.tell(what, about, words);
+        self.context.log.tell(what, about, words);
     }
 }
 

@@ -1,8 +1,62 @@
-//! What changes when the configuration is read again, and what takes a restart.
+//! The configuration read again: what changes then, and what takes a restart.
 
 use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
+use tokio::task::JoinHandle;
+
+use super::config_file::{self, ConfigFileError, Loaded};
 use crate::config::Config;
+use crate::io::device::blocking;
+
+/// A configuration file that is read on a thread for what blocks, as often as it is asked for.
+#[derive(Debug)]
+pub struct Reloading {
+    path: PathBuf,
+    running: Option<JoinHandle<Result<Loaded, ConfigFileError>>>,
+    /// Asked for once more while it was read: it may have changed since.
+    again: bool,
+}
+
+impl Reloading {
+    /// Of a file; nothing is read yet.
+    pub fn new(path: &Path) -> Self {
+        Self { path: path.to_owned(), running: None, again: false }
+    }
+
+    /// Has the file read; once more afterwards where it is being read.
+    pub fn ask(&mut self) {
+        if self.running.is_some() {
+            self.again = true;
+            return;
+        }
+        let path = self.path.clone();
+        self.running = Some(tokio::spawn(blocking(move || config_file::load_all(&path))));
+    }
+
+    /// Whether the file is being read.
+    pub fn reads(&self) -> bool {
+        self.running.is_some()
+    }
+
+    /// Waits until the file was read; for ever where nobody asked for it. Nothing is lost where the future is dropped.
+    pub async fn read(&mut self) -> Result<Loaded, ConfigFileError> {
+        let Some(running) = &mut self.running else { return std::future::pending().await };
+        let read = running.await;
+        self.running = None;
+        if std::mem::take(&mut self.again) {
+            self.ask();
+        }
+        match read {
+            Ok(read) => read,
+            Err(error) => match error.try_into_panic() {
+                Ok(panic) => std::panic::resume_unwind(panic),
+                // The runtime is being shut down.
+                Err(_) => std::future::pending().await,
+            },
+        }
+    }
+}
 
 /// Keys that change in flight. A table's name stands for all its keys.
 const CHANGEABLE: [&str; 9] = [

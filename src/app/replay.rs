@@ -6,15 +6,17 @@ use std::thread;
 use std::time::Duration;
 
 use super::config_file;
+use super::sink::Outlets;
+use super::sinks::FlightFile;
 use crate::config::{Config, ConfigError};
 use crate::io::capture::{CaptureItem, CaptureReader, attached_config};
 use crate::io::clock::HostClock;
 use crate::io::mcap_read::ReadError;
-use crate::io::mcap_write::{McapWriter, WriteError};
-use crate::io::records::{Recorder, topic};
-use crate::pipeline::{Pipeline, Ticks};
+use crate::io::mcap_write::WriteError;
+use crate::io::records::OutputEncoder;
+use crate::pipeline::Pipeline;
 use crate::pixels::{self, DecodedFrame, FrameFault};
-use windhover_base::msg::{Event, EventBody, Output};
+use windhover_base::msg::{EventBody, Output, TimedOutput};
 use windhover_base::time::{MonoTime, Span};
 
 /// Events read and frames decoded ahead of the pipeline.
@@ -91,13 +93,13 @@ pub fn replay(
     watch: &mut dyn FnMut(Step<'_>),
 ) -> Result<Summary, ReplayError> {
     let reader = CaptureReader::open(recording)?;
-    let mut run = Run::new(config, realtime);
+    let mut run = Run::new(config, out, realtime);
     let want_rgb = run.pipeline.wants_rgb();
     let (sender, receiver) = sync_channel(AHEAD);
     thread::scope(|scope| {
         scope.spawn(move || read_ahead(reader, want_rgb, &sender));
         // By value: a flight that cannot be written ends the reader too, which waits for room.
-        run.all(receiver, out, watch)
+        run.all(receiver, watch)
     })?;
     if run.summary.events == 0 {
         return Err(ReplayError::Nothing { path: recording.to_owned() });
@@ -135,45 +137,36 @@ fn read_ahead(mut reader: CaptureReader, want_rgb: bool, sender: &SyncSender<Ahe
     }
 }
 
-struct Run<'a> {
-    config: &'a Config,
+struct Run {
     pipeline: Pipeline,
-    recorder: Recorder,
-    outputs: Vec<Output>,
+    outlets: Outlets<FlightFile>,
+    outputs: Vec<TimedOutput>,
     summary: Summary,
     clock: HostClock,
     started: MonoTime,
     pace: Option<Pace>,
     first: Option<MonoTime>,
-    last: MonoTime,
-    ticks: Ticks,
 }
 
-impl<'a> Run<'a> {
-    fn new(config: &'a Config, realtime: bool) -> Self {
+impl Run {
+    fn new(config: &Config, out: Option<&Path>, realtime: bool) -> Self {
         let clock = HostClock::start();
+        // A configuration that was checked can be written.
+        let text = config.to_toml().unwrap_or_default();
+        let file = out.map(|path| FlightFile::new(path.to_owned(), text, config.camera.clone()));
         Self {
-            config,
             pipeline: Pipeline::with_terrain(config, config_file::terrain_of(config)),
-            recorder: Recorder::new(config),
+            outlets: Outlets::new(OutputEncoder::new(&config.target), file.into_iter().collect()),
             outputs: Vec::new(),
             summary: Summary::default(),
             clock,
             started: clock.now(),
             pace: realtime.then(Pace::default),
             first: None,
-            last: MonoTime::default(),
-            ticks: Ticks::default(),
         }
     }
 
-    fn all(
-        &mut self,
-        receiver: Receiver<Ahead>,
-        out: Option<&Path>,
-        watch: &mut dyn FnMut(Step<'_>),
-    ) -> Result<(), ReplayError> {
-        let mut writer = None;
+    fn all(&mut self, receiver: Receiver<Ahead>, watch: &mut dyn FnMut(Step<'_>)) -> Result<(), ReplayError> {
         for ahead in receiver {
             let (item, prepared, (done, total)) = match ahead {
                 Ahead::Warning(words) => {
@@ -183,74 +176,38 @@ impl<'a> Run<'a> {
                 Ahead::Item(item, prepared, progress) => (item, prepared, progress),
             };
             let t = item.raw.log_time;
-            if let (None, Some(path)) = (&writer, out) {
-                writer = Some(self.begin(path, t)?);
-            }
             watch(Step::Progress(done, total));
-            if let Some(writer) = &mut writer
-                && !topic::is_output(&item.raw.channel.topic)
-            {
-                writer.copy(&item.raw)?;
-            }
+            self.outlets.sinks.iter_mut().try_for_each(|file| file.copy(&item.raw))?;
             let Some(event) = item.event else { continue };
             if let Some(pace) = &mut self.pace {
                 pace.wait_until(t, &self.clock);
             }
-            for tick in self.ticks.until(t) {
-                let event = Event { t_recv: tick, seq: event.seq, body: EventBody::Tick };
-                self.pipeline.handle(&event, &mut self.outputs);
-                self.deliver(tick, writer.as_mut(), watch)?;
-            }
             self.count(t, &event.body);
             self.pipeline.handle_prepared(&event, prepared, &mut self.outputs);
-            self.deliver(t, writer.as_mut(), watch)?;
+            self.deliver(watch)?;
         }
         self.pipeline.finish(&mut self.outputs);
-        self.deliver(self.last, writer.as_mut(), watch)?;
-        if let Some(writer) = writer {
-            writer.finish()?;
-        }
+        self.deliver(watch)?;
+        self.outlets.sinks.drain(..).try_for_each(FlightFile::finish)?;
         Ok(())
-    }
-
-    fn begin(&self, path: &Path, t: MonoTime) -> Result<FlightWriter, ReplayError> {
-        let text = self.config.to_toml().unwrap_or_default();
-        let mut writer = McapWriter::create(path, &text, t)?;
-        for record in self.recorder.opening(t) {
-            writer.write(&record)?;
-        }
-        Ok(writer)
     }
 
     fn count(&mut self, t: MonoTime, body: &EventBody) {
         let first = *self.first.get_or_insert(t);
-        self.last = t;
         self.summary.recorded = t - first;
         self.summary.events += 1;
         self.summary.frames += u64::from(matches!(body, EventBody::Frame(_)));
     }
 
-    fn deliver(
-        &mut self,
-        t: MonoTime,
-        mut writer: Option<&mut FlightWriter>,
-        watch: &mut dyn FnMut(Step<'_>),
-    ) -> Result<(), ReplayError> {
-        let mut records = Vec::new();
-        for output in self.outputs.drain(..) {
-            watch(Step::Output(&output));
-            if let Some(writer) = writer.as_deref_mut() {
-                self.recorder.output(&output, t, &mut records);
-                for record in records.drain(..) {
-                    writer.write(&record)?;
-                }
-            }
+    fn deliver(&mut self, watch: &mut dyn FnMut(Step<'_>)) -> Result<(), ReplayError> {
+        for timed in self.outputs.drain(..) {
+            watch(Step::Output(&timed.output));
+            self.outlets.output(&timed);
         }
+        self.outlets.sinks.iter_mut().try_for_each(FlightFile::check)?;
         Ok(())
     }
 }
-
-type FlightWriter = McapWriter<std::io::BufWriter<std::fs::File>>;
 
 /// Holds a replay to the pace at which it was recorded.
 #[derive(Default)]

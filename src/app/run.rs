@@ -1,17 +1,21 @@
 //! `windhover run`: start the graph, watch over it, end it cleanly.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
-use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::runtime::Runtime;
 
-use super::config_file::{self, ConfigFileError};
+use super::config_file::{ConfigFileError, Loaded};
+use super::context::TaskContext;
 use super::events::Event;
 use super::log::{self, Log};
+use super::reload::Reloading;
+use super::signals::{Asked, Signals};
+use super::supervise::{Supervisor, running_task};
 use super::topology::{self, Graph};
 use super::watch::Watch;
-use crate::config::Config;
 use crate::io::clock::HostClock;
+use crate::io::device::panics_are_caught;
 use crate::io::notify::ServiceManager;
 
 /// Why the daemon ended other than by being asked to.
@@ -41,14 +45,56 @@ const ENDING: Duration = Duration::from_millis(1_600);
 /// `TimeoutStopSec`.
 const WRITING: Duration = Duration::from_millis(2_400);
 
+/// Threads of the runtime that poll tasks. One is enough for what they do; with two a task that copies a frame or
+/// encrypts a packet delays no other task's stamp.
+const WORKERS: usize = 2;
+
+/// Threads at most for what blocks: opening and closing devices, reading files, thumbnails, back-fill. Those that hang
+/// make their tasks silent.
+const BLOCKING: usize = 32;
+
+/// The runtime, and the signals from the moment it was made.
+#[derive(Debug)]
+pub struct Prepared {
+    runtime: Runtime,
+    signals: Signals,
+}
+
+/// Makes the runtime and takes the signals over: the first thing that the program does where it is to be the daemon,
+/// so that a signal of its first millisecond is answered like any other.
+pub fn prepare() -> std::io::Result<Prepared> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(WORKERS)
+        .max_blocking_threads(BLOCKING)
+        .thread_name("runtime")
+        .enable_all()
+        .build()?;
+    let signals = {
+        let _entered = runtime.enter();
+        Signals::new()?
+    };
+    Ok(Prepared { runtime, signals })
+}
+
 /// Runs until asked to end.
-pub fn run(config_path: &Path) -> Result<(), RunError> {
-    let config = config_file::load(config_path)?;
+pub fn run(prepared: Prepared, config_path: &Path) -> Result<(), RunError> {
+    let Prepared { runtime, mut signals } = prepared;
+    let result = runtime.block_on(daemon(config_path, &mut signals));
+    // Whoever still reads a slow file is left behind.
+    runtime.shutdown_background();
+    result
+}
+
+async fn daemon(path: &Path, signals: &mut Signals) -> Result<(), RunError> {
+    let mut reloading = Reloading::new(path);
+    let Some(loaded) = first_load(&mut reloading, signals).await? else { return Ok(()) };
     let clock = HostClock::start();
-    let (log, log_thread) = log::start(&config.log, clock);
-    tell_of_panics(&log);
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let result = runtime.block_on(daemon(config_path.to_owned(), config, clock, &log));
+    let (log, log_thread) = log::start(&loaded.config.log, clock);
+    report_panics(&log);
+    log.tell_with(Event::Started, "", "", |line| {
+        line.with("version", env!("CARGO_PKG_VERSION")).with("config", path.display().to_string())
+    });
+    let result = fly(loaded, reloading, signals, clock, &log).await;
     log.tell(
         Event::Stopped,
         "",
@@ -61,70 +107,84 @@ pub fn run(config_path: &Path) -> Result<(), RunError> {
     result
 }
 
-/// A panic is told with its place before it unwinds. The camera's thread catches its own: the V4L2
-/// library panics where a device vanishes.
-fn tell_of_panics(log: &Log) {
+/// Reads the configuration; `None` where the end was asked for meanwhile.
+async fn first_load(
+    reloading: &mut Reloading,
+    signals: &mut Signals,
+) -> Result<Option<Loaded>, ConfigFileError> {
+    reloading.ask();
+    loop {
+        tokio::select! {
+            loaded = reloading.read() => match loaded {
+                // A signal asked for it once more meanwhile.
+                _ if reloading.reads() => {}
+                loaded => return loaded.map(Some),
+            },
+            asked = signals.next() => match asked {
+                Asked::End(_) => return Ok(None),
+                Asked::Reload => reloading.ask(),
+            },
+        }
+    }
+}
+
+/// A panic is reported with its place before it unwinds, unless it is caught.
+fn report_panics(log: &Log) {
     let log = log.clone();
     std::panic::set_hook(Box::new(move |panic| {
-        let thread = std::thread::current();
-        let name = thread.name().unwrap_or("unnamed");
-        if name != topology::CAMERA.name {
-            log.tell(Event::TaskFailed, name, panic.to_string());
+        if !panics_are_caught() {
+            log.tell(Event::TaskFailed, &running_task(), panic.to_string());
         }
     }));
 }
 
-/// Signals the daemon listens to.
-struct Signals {
-    terminate: Signal,
-    interrupt: Signal,
-    hang_up: Signal,
-}
-
-impl Signals {
-    fn new() -> std::io::Result<Self> {
-        Ok(Self {
-            terminate: signal(SignalKind::terminate())?,
-            interrupt: signal(SignalKind::interrupt())?,
-            hang_up: signal(SignalKind::hangup())?,
-        })
-    }
-}
-
-async fn daemon(path: PathBuf, config: Config, clock: HostClock, log: &Log) -> Result<(), RunError> {
-    let mut signals = Signals::new()?;
-    log.tell_with(Event::Started, "", "", |line| {
-        line.with("version", env!("CARGO_PKG_VERSION")).with("config", path.display().to_string())
-    });
-    let graph = topology::start(&config, clock, log)?;
-    let mut watch = Watch::new(path, config, graph);
+/// Runs the task graph; this is the health task, which hears signals and strokes the watchdog.
+async fn fly(
+    loaded: Loaded,
+    mut reloading: Reloading,
+    signals: &mut Signals,
+    clock: HostClock,
+    log: &Log,
+) -> Result<(), RunError> {
+    let config = loaded.config.clone();
+    let Graph { context, status, orders, power, mut tasks } = topology::start(loaded, clock, log)?;
+    let mut watch = Watch::new(config, context.clone(), status, orders, power);
     let mut round = tokio::time::interval(ROUND);
     round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     let (why, result) = loop {
         tokio::select! {
-            _ = signals.terminate.recv() => break ("SIGTERM", Ok(())),
-            _ = signals.interrupt.recv() => break ("SIGINT", Ok(())),
-            _ = signals.hang_up.recv() => watch.reload(),
-            _ = round.tick() => if let Err(failed) = watch.look_round() {
-                break ("a task failed", Err(RunError::TaskFailed(failed)));
+            asked = signals.next() => match asked {
+                Asked::End(signal) => break (signal, Ok(())),
+                Asked::Reload => {
+                    watch.reloading();
+                    reloading.ask();
+                }
             },
+            task = tasks.ended() => {
+                log.tell(Event::TaskFailed, task, "ended by itself");
+                break ("a task failed", Err(RunError::TaskFailed(task)));
+            }
+            news = watch.power_news() => watch.power(news),
+            read = reloading.read() => watch.reload(read.map(|loaded| loaded.config)),
+            _ = round.tick() => watch.look_round(&tasks),
         }
     };
-    let written = end(watch.into_graph(), log, why);
+    let written = end(&mut tasks, &context, why).await;
     result.and(if written { Ok(()) } else { Err(RunError::NotWritten) })
 }
 
 /// Ends the tasks: devices first, then what waits is handled, then the card is flushed; whether it was.
-fn end(mut graph: Graph, log: &Log, why: &str) -> bool {
+async fn end(tasks: &mut Supervisor, context: &TaskContext, why: &str) -> bool {
     ServiceManager.stopping(&format!("stopping: {why}"));
-    log.tell(Event::Stopping, "", why);
-    graph.around.stop.ask();
-    let mut late = graph.tasks.join(ENDING);
+    context.log.tell(Event::Stopping, "", why);
+    context.stop.cancel();
+    context.events.wake();
+    let mut late = tasks.join(ENDING).await;
     if late.contains(&topology::STORE.name) {
-        late = graph.tasks.join(WRITING);
+        late = tasks.join(WRITING).await;
     }
     for task in &late {
-        log.tell(Event::TaskSilent, task, "did not end in time");
+        context.log.tell(Event::TaskSilent, task, "did not end in time");
     }
     !late.contains(&topology::STORE.name)
 }

@@ -1,9 +1,11 @@
-//! Tasks as threads with a name, a restart rule and a heartbeat, and who of them answers.
+//! Tasks with a name, a restart rule and a heartbeat, and which of them answer.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
-use std::thread::JoinHandle;
 use std::time::Duration;
+
+use tokio::sync::oneshot;
+use tokio::task::JoinSet;
 
 use crate::io::clock::HostClock;
 use windhover_base::time::{MonoTime, Span};
@@ -31,11 +33,14 @@ impl Restart {
 /// A task as the topology lists it. A task of either rule that panics ends the process.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct TaskRule {
-    /// Its name: of its thread, in the log, in the configuration.
+    /// Its name: in the log, and of its thread where it has one.
     pub name: &'static str,
     /// What happens when it cannot go on.
     pub restart: Restart,
 }
+
+/// How often a task that waits beats.
+const BEAT: Duration = Duration::from_millis(250);
 
 /// A task's heartbeat. Copies are the same heart.
 #[derive(Clone, Debug)]
@@ -57,48 +62,86 @@ impl Heart {
         self.last_ns.store(self.clock.now().ns(), Ordering::Relaxed);
     }
 
+    /// Waits, and beats meanwhile.
+    pub async fn while_waiting<T>(&self, work: impl Future<Output = T>) -> T {
+        let mut work = std::pin::pin!(work);
+        loop {
+            self.beat();
+            if let Ok(done) = tokio::time::timeout(BEAT, &mut work).await {
+                return done;
+            }
+        }
+    }
+
     /// How long ago the task last answered.
     pub fn silence(&self) -> Span {
         self.clock.now() - MonoTime::from_ns(self.last_ns.load(Ordering::Relaxed))
     }
 }
 
+tokio::task_local! {
+    /// Name of the task that runs here.
+    static NAME: &'static str;
+}
+
+/// Name of the task that runs on the calling thread: of an async task, else of the thread.
+pub fn running_task() -> String {
+    let thread = || std::thread::current().name().unwrap_or("unnamed").to_owned();
+    NAME.try_with(|name| (*name).to_owned()).unwrap_or_else(|_| thread())
+}
+
 struct Task {
     rule: TaskRule,
     heart: Heart,
-    thread: Option<JoinHandle<()>>,
+    id: tokio::task::Id,
 }
 
-/// All tasks.
+/// All tasks, on the runtime and on threads of their own.
 pub struct Supervisor {
     clock: HostClock,
+    running: JoinSet<()>,
     tasks: Vec<Task>,
 }
 
 impl Supervisor {
     /// No tasks yet.
-    pub const fn new(clock: HostClock) -> Self {
-        Self { clock, tasks: Vec::new() }
+    pub fn new(clock: HostClock) -> Self {
+        Self { clock, running: JoinSet::new(), tasks: Vec::new() }
     }
 
-    /// Starts a task on a thread of its own; `body` beats the heart it is given.
-    pub fn spawn(
+    /// Starts a task on the runtime; `body` beats the heart it is given and does nothing that blocks.
+    pub fn spawn<F>(&mut self, rule: TaskRule, body: impl FnOnce(Heart) -> F)
+    where
+        F: Future<Output = ()> + Send + 'static,
+    {
+        let heart = Heart::new(self.clock);
+        let task = NAME.scope(rule.name, body(heart.clone()));
+        self.keep(rule, heart, task);
+    }
+
+    /// Starts a task that computes or blocks, on a thread of its own; `body` beats the heart it is given.
+    pub fn spawn_thread(
         &mut self,
         rule: TaskRule,
         body: impl FnOnce(Heart) + Send + 'static,
     ) -> std::io::Result<()> {
         let heart = Heart::new(self.clock);
-        let thread = std::thread::Builder::new().name(rule.name.to_owned()).spawn({
-            let heart = heart.clone();
-            move || body(heart)
+        let beating = heart.clone();
+        // Dropped when the body returns and when it panics.
+        let (running, ended) = oneshot::channel::<()>();
+        std::thread::Builder::new().name(rule.name.to_owned()).spawn(move || {
+            let _running = running;
+            body(beating);
         })?;
-        self.tasks.push(Task { rule, heart, thread: Some(thread) });
+        self.keep(rule, heart, async move {
+            let _ = ended.await;
+        });
         Ok(())
     }
 
-    /// Watches the heart of a task that runs elsewhere (in a runtime of its own).
-    pub fn watch(&mut self, rule: TaskRule, heart: Heart) {
-        self.tasks.push(Task { rule, heart, thread: None });
+    fn keep(&mut self, rule: TaskRule, heart: Heart, task: impl Future<Output = ()> + Send + 'static) {
+        let id = self.running.spawn(task).id();
+        self.tasks.push(Task { rule, heart, id });
     }
 
     /// Tasks that have not answered for longer than `limit`, and for how long.
@@ -107,31 +150,26 @@ impl Supervisor {
         silences.filter(|(_, silence)| *silence > limit).collect()
     }
 
-    /// Tasks whose thread has ended.
-    pub fn ended(&self) -> Vec<TaskRule> {
-        let ended = |task: &&Task| task.thread.as_ref().is_some_and(JoinHandle::is_finished);
-        self.tasks.iter().filter(ended).map(|task| task.rule).collect()
-    }
-
-    /// Waits for the threads to end, until `patience` is over; names of those that did not.
-    pub fn join(&mut self, patience: Duration) -> Vec<&'static str> {
-        let limit = self.clock.now() + Span::from_s(patience.as_secs_f64());
-        while self.clock.now() < limit && self.tasks.iter().any(runs) {
-            std::thread::sleep(Duration::from_millis(5));
-        }
-        let late = self.tasks.iter().filter(|task| runs(task)).map(|task| task.rule.name).collect();
-        for task in self.tasks.iter_mut().filter(|task| !runs(task)) {
-            if let Some(thread) = task.thread.take() {
-                // A panic was told when it happened.
-                let _ = thread.join();
+    /// Waits until a task ends, by itself or by a panic; its name. For ever where there is none.
+    pub async fn ended(&mut self) -> &'static str {
+        loop {
+            let id = match self.running.join_next_with_id().await {
+                Some(Ok((id, ()))) => id,
+                Some(Err(panicked)) => panicked.id(),
+                None => std::future::pending().await,
+            };
+            if let Some(at) = self.tasks.iter().position(|task| task.id == id) {
+                return self.tasks.swap_remove(at).rule.name;
             }
         }
-        late
     }
-}
 
-fn runs(task: &Task) -> bool {
-    task.thread.as_ref().is_some_and(|thread| !thread.is_finished())
+    /// Waits for the tasks to end, until `patience` is over; names of those that did not.
+    pub async fn join(&mut self, patience: Duration) -> Vec<&'static str> {
+        let limit = tokio::time::Instant::now() + patience;
+        while !self.tasks.is_empty() && tokio::time::timeout_at(limit, self.ended()).await.is_ok() {}
+        self.tasks.iter().map(|task| task.rule.name).collect()
+    }
 }
 
 #[cfg(test)]
@@ -140,23 +178,32 @@ mod tests {
 
     const RULE: TaskRule = TaskRule { name: "test", restart: Restart::EndsProcess };
 
-    #[test]
-    fn a_task_that_hangs_is_silent_and_one_that_panics_has_ended() {
-        let clock = HostClock::start();
-        let mut tasks = Supervisor::new(clock);
+    #[tokio::test]
+    async fn a_task_that_hangs_is_silent_and_one_that_panics_has_ended() {
+        let mut tasks = Supervisor::new(HostClock::start());
         let (sender, receiver) = std::sync::mpsc::channel::<()>();
         tasks
-            .spawn(RULE, move |heart| {
+            .spawn_thread(RULE, move |heart| {
                 heart.beat();
                 let _ = receiver.recv();
             })
             .expect("a thread");
         assert!(tasks.silent(Span::from_s(5.0)).is_empty());
-        std::thread::sleep(Duration::from_millis(30));
+        tokio::time::sleep(Duration::from_millis(30)).await;
         assert_eq!(tasks.silent(Span::from_ms(10.0)).first().map(|s| s.0), Some("test"));
-        assert_eq!(tasks.join(Duration::from_millis(10)), ["test"]);
-        assert!(tasks.ended().is_empty());
+        assert_eq!(tasks.join(Duration::from_millis(10)).await, ["test"]);
         drop(sender);
-        assert!(tasks.join(Duration::from_secs(2)).is_empty());
+        assert!(tasks.join(Duration::from_secs(2)).await.is_empty());
+
+        let named = TaskRule { name: "named", ..RULE };
+        tasks.spawn(RULE, |_| std::future::pending());
+        tasks.spawn(named, |_| async {
+            assert_eq!(running_task(), "named");
+            panic!("as a task does that fails");
+        });
+        assert_eq!(tasks.ended().await, "named");
+        tasks.spawn_thread(named, |_| panic!("as a thread does that fails")).expect("a thread");
+        assert_eq!(tasks.ended().await, "named");
+        assert_eq!(tasks.join(Duration::from_millis(10)).await, ["test"]);
     }
 }

@@ -1,45 +1,73 @@
 //! The whole task graph on one page.
 //!
 //! ```text
-//!   gps, pps ─┐                         ┌─► store   (card: flights, index)
-//!   compass ──┼─► inbox ─► pipeline ────┼─► link    (ground stations, MAVLink)
-//!   camera ───┘                         └─► board ◄── health (health line, watchdog, signals, power)
+//!   gps, pps ─┐                                  ┌─► store   (card: flights, index)
+//!   compass ──┼─► event queue ─► pipeline ───────┼─► link    (ground stations, MAVLink)
+//!   camera ───┘                                  └─► status ◄── health (health line, watchdog, signals)
+//!   power ─────────────────────────────────────────────────────► health
 //!                         every task ─────► log     (journal, file)
 //! ```
 //!
+//! Tasks of the one runtime, which has two workers. They wait by readiness and never block:
+//!
+//! | task | waits for | restart rule |
+//! |---|---|---|
+//! | gps, compass | their line's descriptor | open the device again, waiting ¼ s to 5 s |
+//! | pps | the pulse device's descriptor | the same |
+//! | camera | the V4L2 queue's descriptor, or the thread that plays a recording | the same |
+//! | power | the GPIO line's descriptor, a second's timer | the same |
+//! | store | notices of the store, the pipeline's end, power going | opens the card again; the daemon flies on without |
+//! | link | its socket | calls again; the daemon flies on without |
+//! | health | signals, the end of any task, a quarter-second timer | is the main thread; nothing restarts it |
+//!
+//! Threads of their own, and why:
+//!
+//! | thread | why |
+//! |---|---|
+//! | pipeline | computes for milliseconds a frame. Ends the process where it fails: a filter in an unknown state is not repaired |
+//! | store-encode | computes JPEG |
+//! | store-write, store-keep, index | `fdatasync` and directory calls block as long as the card does |
+//! | log | a terminal, a pipe or a disk can stall |
+//! | recording | reads image files where the camera is a recording; it stands in for the driver |
+//! | runtime's threads for blocking work, 32 at most | open and close devices (a UART drains, a camera ends its stream); read configuration, terrain, keys and sysfs; thumbnails; back-fill from the card; start and stop the store |
+//!
+//! The main thread strokes the watchdog and answers signals, and runs nothing else: a configuration and its terrain
+//! are read on a thread for blocking work, at the start and on SIGHUP.
+//!
 //! | channel | holds | when full |
 //! |---|---|---|
-//! | inbox, frames | `daemon.frame_queue` frames, 16 in a burst of half a second | the oldest but the next one is dropped and recorded as dropped |
-//! | inbox, reads | 8192 reads of the lines | the oldest is dropped and recorded as dropped |
+//! | event queue, frames | `daemon.frame_queue` frames, 16 in a burst of half a second | the oldest but the next one is dropped and recorded as dropped |
+//! | event queue, reads | 8192 reads of the lines | the oldest is dropped and recorded as dropped |
+//! | recording to camera | 12 frames, as a driver's buffers | the recording waits |
 //! | store | see `io::store` | what does not fit is dropped and counted; the pipeline never waits |
 //! | link | see `io::link` | the oldest estimate goes first; what was missed is sent later |
-//! | log | 512 lines | the line is dropped and counted |
-//!
-//! | task | restart rule |
-//! |---|---|
-//! | gps, pps, compass, camera | open the device again, waiting ¼ s to 5 s |
-//! | pipeline | ends the process: a filter in an unknown state is not repaired |
-//! | store | opens the card again; the daemon flies on without |
-//! | link | calls again; the daemon flies on without |
-//! | health | is the main thread: signals, health, watchdog |
+//! | power to health, power to store, store to link | the newest value | a newer value replaces it |
+//! | log | see `app::log` | the line is dropped and counted |
 //!
 //! Every task beats its heart at least once a second while it works; the watchdog is stroked only while
-//! all do. A panic in any task ends the process, and the service manager starts it again.
+//! all do. A panic in any task ends the process, and the service manager starts it again. The end is a
+//! cancellation token: the device tasks are dropped where they wait, the pipeline handles what is queued, the
+//! store closes the flight.
 
 use std::sync::Arc;
 
-use crate::config::Config;
-use crate::io::clock::HostClock;
-use crate::io::device::Stop;
+use tokio_util::sync::CancellationToken;
 
-use super::brain::{self, Board};
-use super::card::{self, CardOrders, Slot};
-use super::devices::{self, Surroundings};
-use super::downlink::{self, Downlink};
-use super::inbox::Inbox;
+use crate::io::clock::HostClock;
+
+use super::card::{self, StoreTask};
+use super::config_file::Loaded;
+use super::context::TaskContext;
+use super::devices;
+use super::downlink::{self, Downlink, LinkTask};
+use super::event_queue::EventQueue;
+use super::flight_store::{FlightStore, StoreOrders};
 use super::log::Log;
-use super::outlets::Outlets;
+use super::outlets;
+use super::pipeline_task::{self, Parts};
+use super::power_task::{self, PowerView};
 use super::presence::Presence;
+use super::status::SharedStatus;
 use super::supervise::{Restart, Supervisor, TaskRule};
 
 /// The GPS line.
@@ -54,66 +82,69 @@ pub const PIPELINE: TaskRule = TaskRule { name: "pipeline", restart: Restart::En
 pub const STORE: TaskRule = TaskRule { name: "store", restart: Restart::Retries };
 /// The receiver's pulse, where one is configured.
 pub const PPS: TaskRule = TaskRule { name: "pps", restart: Restart::Retries };
+/// Supply, temperature, and the line that tells of power going.
+pub const POWER: TaskRule = TaskRule { name: "power", restart: Restart::Retries };
 /// The wireless link.
 pub const LINK: TaskRule = TaskRule { name: "link", restart: Restart::Retries };
 
 /// The running graph, as its health task sees it.
 pub struct Graph {
     /// What every task was given.
-    pub around: Surroundings,
-    /// Figures and health, shared with the pipeline's task.
-    pub board: Board,
-    /// What the card's task listens to.
-    pub orders: CardOrders,
+    pub context: TaskContext,
+    /// Figures and health, shared with the other tasks.
+    pub status: SharedStatus,
+    /// What the store's task is asked to do.
+    pub orders: StoreOrders,
+    /// What the power task reads.
+    pub power: PowerView,
     /// The tasks.
     pub tasks: Supervisor,
 }
 
 /// Starts every task.
-pub fn start(config: &Config, clock: HostClock, log: &Log) -> std::io::Result<Graph> {
-    let around = Surroundings {
+pub fn start(loaded: Loaded, clock: HostClock, log: &Log) -> std::io::Result<Graph> {
+    let (config, terrain) = (Arc::new(loaded.config), loaded.terrain);
+    let context = TaskContext {
         clock,
         began: clock.now(),
-        stop: Stop::default(),
+        stop: CancellationToken::new(),
         log: log.clone(),
         presence: Presence::default(),
-        inbox: Arc::new(Inbox::new(config.daemon.frame_queue)),
+        events: Arc::new(EventQueue::new(config.daemon.frame_queue)),
     };
-    let board = Board::default();
-    board.with(|shown| shown.figures.link = "off".into());
+    let status = SharedStatus::default();
+    status.with(|status| status.figures.link = "off".into());
+    let (flight_store, orders) = (FlightStore::default(), StoreOrders::default());
+    let downlink = Downlink::new(&config);
     let mut tasks = Supervisor::new(clock);
 
-    let (slot, orders) = (Slot::default(), CardOrders::default());
-    let downlink = Downlink::new(config);
-    {
-        let (config, around, board) = (config.clone(), around.clone(), board.clone());
-        let (slot, downlink) = (slot.clone(), downlink.clone());
-        tasks.spawn(LINK, move |heart| downlink::run(&config, &around, &board, &slot, &downlink, &heart))?;
+    tasks.spawn(LINK, |heart| {
+        let (config, context, status) = (Arc::clone(&config), context.clone(), status.clone());
+        let (flight_store, downlink) = (flight_store.clone(), downlink.clone());
+        downlink::run(LinkTask { config, context, status, flight_store, downlink, heart })
+    });
+    let opened = card::open(&config, clock, &flight_store);
+    tasks.spawn(STORE, |heart| {
+        let (config, context, status) = (Arc::clone(&config), context.clone(), status.clone());
+        let (flight_store, orders) = (flight_store.clone(), orders.clone());
+        card::run(StoreTask { config, context, status, flight_store, orders, heart }, opened)
+    });
+    tasks.spawn_thread(PIPELINE, {
+        let (config, context, status) = (Arc::clone(&config), context.clone(), status.clone());
+        let outlets = outlets::of_daemon(&config, &flight_store, &downlink);
+        let orders = orders.clone();
+        move |heart| {
+            let parts = Parts { config, terrain, context, status, flight_store, outlets, orders, heart };
+            pipeline_task::run(parts);
+        }
+    })?;
+    let (readings, power) = power_task::parts(&config.power);
+    tasks.spawn(POWER, |heart| power_task::run(readings, context.clone(), heart));
+    if let Some(device) = config.gps.pps_device.clone() {
+        tasks.spawn(PPS, |heart| devices::pulses(device, context.clone(), heart));
     }
-    {
-        let (config, around, board) = (config.clone(), around.clone(), board.clone());
-        let (slot, orders) = (slot.clone(), orders.clone());
-        let opened = card::open(&config, clock, &slot);
-        tasks.spawn(STORE, move |heart| {
-            card::run(&config, &around, &board, (&slot, opened), &orders, &heart);
-        })?;
-    }
-    {
-        let (config, around, board) = (config.clone(), around.clone(), board.clone());
-        let (outlets, orders) = (Outlets::new(&config, slot, downlink), orders.clone());
-        tasks.spawn(PIPELINE, move |heart| brain::run(&config, &around, &board, outlets, &orders, &heart))?;
-    }
-    if config.gps.pps_device.is_some() {
-        let (config, around) = (config.clone(), around.clone());
-        tasks.spawn(PPS, move |heart| devices::pulses(&config, &around, &heart))?;
-    }
-    for (rule, device) in [
-        (GPS, devices::gps as fn(&Config, &Surroundings, &super::supervise::Heart)),
-        (COMPASS, devices::compass),
-        (CAMERA, devices::camera),
-    ] {
-        let (config, around) = (config.clone(), around.clone());
-        tasks.spawn(rule, move |heart| device(&config, &around, &heart))?;
-    }
-    Ok(Graph { around, board, orders, tasks })
+    tasks.spawn(GPS, |heart| devices::gps(Arc::clone(&config), context.clone(), heart));
+    tasks.spawn(COMPASS, |heart| devices::compass(Arc::clone(&config), context.clone(), heart));
+    tasks.spawn(CAMERA, |heart| devices::camera(Arc::clone(&config), context.clone(), heart));
+    Ok(Graph { context, status, orders, power, tasks })
 }

@@ -1,35 +1,36 @@
-//! The health task's round: readiness, watchdog, power, reload.
+//! The health task's work: readiness, watchdog, power, a configuration read again. Nothing here blocks.
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 
-use super::config_file;
+use super::config_file::ConfigFileError;
+use super::context::TaskContext;
 use super::events::Event;
+use super::flight_store::StoreOrders;
+use super::power_task::{PowerView, Supply};
 use super::presence::Presence;
 use super::reload;
-use super::topology::Graph;
-use crate::config::Config;
+use super::status::SharedStatus;
+use super::supervise::Supervisor;
+use crate::config::{Config, PowerConfig};
 use crate::io::clock::HostClock;
 use crate::io::notify::ServiceManager;
-use crate::io::power::{PowerReader, PowerState, PowerWatch};
-use crate::io::power_line::PowerLine;
-use crate::io::process;
+use crate::io::power::{PowerState, PowerWatch};
 use windhover_base::msg::Source;
 use windhover_base::time::{MonoTime, Span};
 
 /// Everything the health task keeps.
 pub(super) struct Watch {
-    path: PathBuf,
     config: Config,
-    graph: Graph,
+    context: TaskContext,
+    status: SharedStatus,
+    orders: StoreOrders,
+    power: PowerView,
     ready: bool,
-    began: MonoTime,
     missing: String,
     silent: BTreeSet<&'static str>,
-    power: PowerReader,
-    power_line: Option<PowerLine>,
     power_watch: PowerWatch,
+    /// What the last reading means, the line left aside.
+    judged: PowerState,
     power_state: PowerState,
     second: Option<MonoTime>,
     processor: Span,
@@ -38,19 +39,32 @@ pub(super) struct Watch {
 /// Not being ready is worth a line only after devices had time to be opened.
 const SETTLING: Span = Span::from_ns(3_000_000_000);
 
+/// News of the power task.
+pub(super) enum PowerNews {
+    /// Supply and temperature were read again.
+    Supply(Supply),
+    /// The line that tells of power going may have changed.
+    Line,
+}
+
 impl Watch {
-    pub(super) fn new(path: PathBuf, config: Config, graph: Graph) -> Self {
-        let (power, power_watch) = power(&config);
+    pub(super) fn new(
+        config: Config,
+        context: TaskContext,
+        status: SharedStatus,
+        orders: StoreOrders,
+        power: PowerView,
+    ) -> Self {
         Self {
-            path,
-            began: graph.around.clock.now(),
-            graph,
+            context,
+            status,
+            orders,
+            power,
             ready: false,
             missing: String::new(),
             silent: BTreeSet::new(),
-            power,
-            power_line: config.power.going_line.clone().map(PowerLine::new),
-            power_watch,
+            power_watch: power_watch(&config.power),
+            judged: PowerState::Good,
             power_state: PowerState::Good,
             second: None,
             processor: HostClock::processor_time(),
@@ -58,32 +72,18 @@ impl Watch {
         }
     }
 
-    pub(super) fn into_graph(self) -> Graph {
-        self.graph
-    }
-
-    /// One round; the name of a task that ended though nobody asked it to.
-    pub(super) fn look_round(&mut self) -> Result<(), &'static str> {
-        if let Some(task) = self.graph.tasks.ended().first() {
-            self.graph.around.log.tell(Event::TaskFailed, task.name, "ended by itself");
-            return Err(task.name);
-        }
-        if self.all_answer() {
+    /// One round: strokes the watchdog while every task answers.
+    pub(super) fn look_round(&mut self, tasks: &Supervisor) {
+        if self.all_answer(tasks) {
             ServiceManager.alive();
         }
         self.look_for_readiness();
-        let now = self.graph.around.clock.now();
-        if self.second.is_none_or(|last| now - last >= Span::from_s(1.0)) {
-            let since = self.second.replace(now).map(|last| now - last);
-            self.each_second(since);
-        }
-        Ok(())
     }
 
-    fn all_answer(&mut self) -> bool {
-        let log = &self.graph.around.log;
+    fn all_answer(&mut self, tasks: &Supervisor) -> bool {
+        let log = &self.context.log;
         let limit = Span::from_s(self.config.daemon.answer_within_s);
-        let silences = self.graph.tasks.silent(limit);
+        let silences = tasks.silent(limit);
         for (name, silence) in &silences {
             self.silent.insert(name);
             log.tell(Event::TaskSilent, name, format!("has not answered for {:.1} s", silence.s()));
@@ -98,80 +98,94 @@ impl Watch {
     }
 
     fn look_for_readiness(&mut self) {
-        let around = &self.graph.around;
-        let missing = Presence::words(&around.presence.missing(&self.config.daemon.optional));
-        let estimating = self.graph.board.with(|shown| shown.health.is_some());
+        let context = &self.context;
+        let missing = Presence::words(&context.presence.missing(&self.config.daemon.optional));
+        let estimating = self.status.with(|shown| shown.health.is_some());
         if missing.is_empty() && estimating {
             if !std::mem::replace(&mut self.ready, true) {
-                let after = around.clock.now() - self.began;
-                around.log.tell(Event::Ready, "", format!("after {:.1} s", after.s()));
+                let after = context.clock.now() - context.began;
+                context.log.tell(Event::Ready, "", format!("after {:.1} s", after.s()));
                 ServiceManager.ready("ready");
             }
-        } else if !self.ready && missing != self.missing && around.clock.now() - self.began > SETTLING {
-            around.log.tell(Event::NotReady, "", format!("waiting: {missing}"));
+        } else if !self.ready && missing != self.missing && context.clock.now() - context.began > SETTLING {
+            context.log.tell(Event::NotReady, "", format!("waiting: {missing}"));
         } else {
             return;
         }
         self.missing = missing;
     }
 
-    fn each_second(&mut self, since: Option<Span>) {
-        let mut reading = self.power.read();
-        reading.line_set |= self.power_line();
+    /// Waits for news of the power task.
+    pub(super) async fn power_news(&mut self) -> PowerNews {
+        tokio::select! {
+            Ok(()) = self.power.supply.changed() => {
+                PowerNews::Supply(self.power.supply.borrow_and_update().clone())
+            }
+            Ok(()) = self.power.line.changed() => PowerNews::Line,
+            // The power task has ended, which ends the process.
+            else => std::future::pending().await,
+        }
+    }
+
+    /// Takes news of the power task in.
+    pub(super) fn power(&mut self, news: PowerNews) {
+        if let PowerNews::Supply(supply) = news {
+            self.supply(&supply);
+        }
+        let line_set = *self.power.line.borrow_and_update();
+        let state = if line_set { PowerState::Going } else { self.judged };
+        self.orders.power_going.send_if_modified(|going| {
+            let goes = state == PowerState::Going;
+            std::mem::replace(going, goes) != goes
+        });
+        if state == std::mem::replace(&mut self.power_state, state) {
+            return;
+        }
+        let supply = self.power.supply.borrow();
+        let reading = &supply.reading;
+        let what = match reading.voltage_v {
+            _ if line_set || reading.line_set => "the line that tells of it is set".to_owned(),
+            Some(volts) => format!("{volts:.2} V"),
+            None => "mains off".to_owned(),
+        };
+        match state {
+            PowerState::Going => {
+                self.context.log.tell(Event::PowerGoing, "", format!("{what}: closing the segment"));
+            }
+            PowerState::Good => self.context.log.tell(Event::PowerBack, "", what),
+        }
+    }
+
+    /// Takes a second's reading in.
+    fn supply(&mut self, supply: &Supply) {
+        let reading = &supply.reading;
+        let now = self.context.clock.now();
+        let since = self.second.replace(now).map(|last| now - last);
         let used = HostClock::processor_time();
         let share = since.map(|since| (used - self.processor).s() / since.s() * 100.0);
         self.processor = used;
         let hot = reading.temperature_c.is_some_and(|c| c > self.config.power.hot_c);
-        let state = self.power_watch.judge(&reading);
-        self.graph.board.with(|shown| {
-            let figures = &mut shown.figures;
+        self.judged = self.power_watch.judge(reading);
+        let going = self.judged == PowerState::Going || *self.power.line.borrow();
+        self.status.with(|status| {
+            let figures = &mut status.figures;
             figures.temperature_c = reading.temperature_c;
             figures.voltage_v = reading.voltage_v;
             figures.cpu_percent = share;
-            figures.memory_mb = process::resident_mb();
-            figures.warn = hot || state == PowerState::Going;
+            figures.memory_mb = supply.memory_mb;
+            figures.warn = hot || going;
         });
-        let log = &self.graph.around.log;
         if hot && let Some(celsius) = reading.temperature_c {
-            log.tell(Event::Hot, "", format!("{celsius:.1} °C; limit {:.0}", self.config.power.hot_c));
+            let limit = self.config.power.hot_c;
+            self.context.log.tell(Event::Hot, "", format!("{celsius:.1} °C; limit {limit:.0}"));
         }
-        self.graph.orders.power_going.store(state == PowerState::Going, Ordering::Release);
-        if state != std::mem::replace(&mut self.power_state, state) {
-            let what = match reading.voltage_v {
-                _ if reading.line_set => "the line that tells of it is set".to_owned(),
-                Some(volts) => format!("{volts:.2} V"),
-                None => "mains off".to_owned(),
-            };
-            match state {
-                PowerState::Going => log.tell(Event::PowerGoing, "", format!("{what}: closing the segment")),
-                PowerState::Good => log.tell(Event::PowerBack, "", what),
-            }
-        }
-        self.status();
-    }
-
-    /// Whether the GPIO line that tells of power going is active; one that cannot be read is told.
-    fn power_line(&mut self) -> bool {
-        let Some(line) = &mut self.power_line else { return false };
-        let log = &self.graph.around.log;
-        match line.read() {
-            Ok(reading) => {
-                if reading.opened {
-                    log.tell(Event::DeviceUp, "power_line", "read once a second");
-                }
-                reading.set
-            }
-            Err(fault) => {
-                log.tell(Event::DeviceDown, "power_line", fault.to_string());
-                false
-            }
-        }
+        self.show_status();
     }
 
     /// One line for `systemctl status`.
-    fn status(&self) {
+    fn show_status(&self) {
         let text = if self.ready {
-            let health = self.graph.board.with(|shown| shown.health.clone()).unwrap_or_default();
+            let health = self.status.with(|shown| shown.health.clone()).unwrap_or_default();
             let rate =
                 |&source: &Source| format!("{} {:.1} Hz", source.name(), health.source(source).rate_hz);
             let rates: Vec<String> = Source::ALL.iter().map(rate).collect();
@@ -180,38 +194,37 @@ impl Watch {
                 targets.map(|(t, h)| format!("{} {}", t.name, h.last.status.name())).collect();
             format!("{}; {}", rates.join(", "), targets.join(", "))
         } else {
-            let around = &self.graph.around;
-            format!("waiting: {}", Presence::words(&around.presence.missing(&self.config.daemon.optional)))
+            let context = &self.context;
+            format!("waiting: {}", Presence::words(&context.presence.missing(&self.config.daemon.optional)))
         };
         ServiceManager.status(&text);
     }
 
-    /// Reads the configuration again: what can change changes, the rest is told.
-    pub(super) fn reload(&mut self) {
+    /// A configuration is being read again.
+    pub(super) fn reloading(&self) {
         ServiceManager.reloading();
-        let log = &self.graph.around.log;
-        log.reopen();
-        match config_file::load(&self.path) {
+        self.context.log.reopen();
+    }
+
+    /// The configuration was read again: what can change changes, the rest is reported.
+    pub(super) fn reload(&mut self, read: Result<Config, ConfigFileError>) {
+        let log = &self.context.log;
+        match read {
             Err(error) => log.tell(Event::ReloadRefused, "", format!("{error}; the old one stays")),
             Ok(read) => {
                 let told = reload::differences(&self.config, &read);
-                log.tell(
-                    Event::Reloaded,
-                    "",
-                    match told.now.as_slice() {
-                        [] => "nothing that can change in flight has changed".to_owned(),
-                        changes => changes.join(", "),
-                    },
-                );
+                let changes = match told.now.as_slice() {
+                    [] => "nothing that can change in flight has changed".to_owned(),
+                    changes => changes.join(", "),
+                };
+                log.tell(Event::Reloaded, "", changes);
                 if !told.restart.is_empty() {
                     log.tell(Event::NeedsRestart, "", told.restart.join(", "));
                 }
                 self.config = reload::merged(&self.config, &read);
                 log.set_level(self.config.log.level);
-                (self.power, self.power_watch) = power(&self.config);
-                // The old request ends first: a line is given to one reader.
-                self.power_line = None;
-                self.power_line = self.config.power.going_line.clone().map(PowerLine::new);
+                self.power_watch = power_watch(&self.config.power);
+                self.power.settings.send_replace(self.config.power.clone());
             }
         }
         if self.ready {
@@ -220,10 +233,6 @@ impl Watch {
     }
 }
 
-fn power(config: &Config) -> (PowerReader, PowerWatch) {
-    let power = &config.power;
-    let path = |file: &Option<String>| file.as_ref().map(PathBuf::from);
-    let reader =
-        PowerReader::new(Path::new(&power.sysfs), path(&power.voltage_file), path(&power.going_file));
-    (reader, PowerWatch::new(power.low_voltage_v, power.on_mains_off))
+fn power_watch(power: &PowerConfig) -> PowerWatch {
+    PowerWatch::new(power.low_voltage_v, power.on_mains_off)
 }

@@ -18,7 +18,8 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
-    run::run(&args.config).map_err(|error| match error {
+    let prepared = run::prepare().map_err(|error| CliError::failed(RunError::Start(error)))?;
+    run::run(prepared, &args.config).map_err(|error| match error {
         RunError::Config(error) => CliError::config(error),
         error => CliError::failed(error),
     })

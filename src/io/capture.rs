@@ -4,15 +4,11 @@ use std::collections::BinaryHeap;
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
-use std::sync::Arc;
-
-use prost::Message as _;
 
 use super::mcap_read::{self, McapReader, RawMessage, ReadError};
 use super::mcap_write::{CONFIG_ATTACHMENT, McapWriter, WriteError};
-use super::proto::{foxglove, host_time, windhover};
-use super::records::{self, FRAME_NUMBER_KEY, IN_SEQUENCE, topic, warm};
-use windhover_base::msg::{Delivery, Event, EventBody, FrameEncoding, FramePayload, Source};
+use super::records::{self, EventDecoder, FRAME_NUMBER_KEY, IN_SEQUENCE, KeptMessage};
+use windhover_base::msg::{Event, EventBody};
 use windhover_base::time::{MonoTime, Span};
 
 /// Messages are put in order of their log time over this span: writers of several threads do not
@@ -22,11 +18,6 @@ const REORDER: Span = Span::from_ns(1_000_000_000);
 const REORDER_BYTES: usize = 1 << 28;
 /// Memory of a message beside its bytes, near enough for a limit.
 const MESSAGE_COST: usize = 256;
-
-/// Whether a topic is of events.
-fn is_event(topic: &str) -> bool {
-    Source::on_topic(topic).is_some() || [topic::SOURCE_EVENT, topic::WARM_START].contains(&topic)
-}
 
 /// One message of a capture: as recorded, and as the event it stands for, if any.
 #[derive(Clone, Debug)]
@@ -45,7 +36,7 @@ pub struct CaptureReader {
     newest: MonoTime,
     read: u64,
     seq: u64,
-    frames: u32,
+    decoder: EventDecoder,
     warnings: Vec<String>,
 }
 
@@ -88,7 +79,7 @@ impl CaptureReader {
             newest: MonoTime::from_ns(i64::MIN),
             read: 0,
             seq: 0,
-            frames: 0,
+            decoder: EventDecoder::default(),
             warnings: Vec::new(),
         })
     }
@@ -124,72 +115,13 @@ impl CaptureReader {
     }
 
     fn body(&mut self, raw: &RawMessage) -> Result<Option<EventBody>, prost::DecodeError> {
-        let topic = raw.channel.topic.as_str();
-        if let Some(source) = Source::on_topic(topic) {
-            return self.delivered(source, raw).map(Some);
-        }
-        Ok(match topic {
-            topic::WARM_START => {
-                let told = warm::state(&windhover::WarmState::decode(&raw.data[..])?);
-                told.map(|state| EventBody::Warm(Box::new(state)))
-            }
-            topic::SOURCE_EVENT => source_event(&windhover::SourceEvent::decode(&raw.data[..])?),
-            _ => None,
-        })
-    }
-
-    fn delivered(&mut self, source: Source, raw: &RawMessage) -> Result<EventBody, prost::DecodeError> {
-        if source.delivers() == Delivery::Bytes {
-            let data = windhover::SerialBytes::decode(&raw.data[..])?.data;
-            return Ok(EventBody::Bytes { source, data });
-        }
-        // A frame that does not even decode as a message still counts as one.
         let numbered = raw.channel.metadata.get(FRAME_NUMBER_KEY).is_some_and(|v| v == IN_SEQUENCE);
-        let index = if numbered { raw.sequence } else { self.frames };
-        self.frames = index.saturating_add(1);
-        Ok(EventBody::Frame(frame(raw, index)?))
-    }
-}
-
-/// A frame out of either image schema.
-fn frame(raw: &RawMessage, index: u32) -> Result<FramePayload, prost::DecodeError> {
-    if raw.channel.schema.name == "foxglove.RawImage" {
-        let image = foxglove::RawImage::decode(&raw.data[..])?;
-        return Ok(FramePayload {
-            index,
-            t_exposure: host_time(image.timestamp.as_ref()),
-            encoding: records::encoding_of_raw(&image.encoding),
-            width: image.width,
-            height: image.height,
-            stride: image.step,
-            data: Arc::from(image.data),
-        });
-    }
-    let image = foxglove::CompressedImage::decode(&raw.data[..])?;
-    let encoding = match image.format.to_ascii_lowercase().as_str() {
-        "jpeg" | "jpg" => FrameEncoding::Jpeg,
-        "png" => FrameEncoding::Png,
-        _ => FrameEncoding::Unknown,
-    };
-    Ok(FramePayload {
-        index,
-        t_exposure: host_time(image.timestamp.as_ref()),
-        encoding,
-        width: 0,
-        height: 0,
-        stride: 0,
-        data: Arc::from(image.data),
-    })
-}
-
-fn source_event(event: &windhover::SourceEvent) -> Option<EventBody> {
-    let source = Source::named(&event.source)?;
-    match event.what.as_str() {
-        "dropped" => Some(EventBody::Dropped { source, count: event.count }),
-        "pulse" => Some(EventBody::Pulse),
-        "up" => Some(EventBody::SourceUp(source)),
-        "down" => Some(EventBody::SourceDown(source)),
-        _ => None,
+        self.decoder.body(&KeptMessage {
+            topic: &raw.channel.topic,
+            schema: &raw.channel.schema.name,
+            frame_number: numbered.then_some(raw.sequence),
+            data: &raw.data,
+        })
     }
 }
 
@@ -202,7 +134,7 @@ impl Iterator for CaptureReader {
                 || self.waiting.peek().is_some_and(|first| self.newest - first.raw.log_time >= REORDER);
             if !due && let Some(raw) = self.reader.next() {
                 // Others may be dated by other clocks than what was heard.
-                if is_event(&raw.channel.topic) {
+                if records::is_event(&raw.channel.topic) {
                     self.newest = self.newest.max(raw.log_time);
                 }
                 self.waiting_bytes += raw.data.len() + MESSAGE_COST;

@@ -1,28 +1,20 @@
-//! What every device thread has in common: what it tells, how it fails, how it waits before it tries again.
+//! What every device task has in common: what it reports, how it fails, how it waits.
 
+use std::cell::Cell;
 use std::fmt;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::fs::File;
+use std::io;
+use std::ops::{Deref, DerefMut};
+use std::os::fd::AsRawFd;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::time::Duration;
+
+use tokio::io::Interest;
+use tokio::io::unix::AsyncFd;
+use tokio::task::spawn_blocking;
 
 use windhover_base::msg::FramePayload;
 use windhover_base::time::MonoTime;
-
-/// Asks threads to end. Copies are the same switch.
-#[derive(Clone, Debug, Default)]
-pub struct Stop(Arc<AtomicBool>);
-
-impl Stop {
-    /// Asks for the end.
-    pub fn ask(&self) {
-        self.0.store(true, Ordering::Release);
-    }
-
-    /// Whether the end was asked for.
-    pub fn asked(&self) -> bool {
-        self.0.load(Ordering::Acquire)
-    }
-}
 
 /// Why a device does not deliver.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
@@ -121,7 +113,7 @@ pub enum NoteKind {
     PlayedOut,
 }
 
-/// What a device thread tells.
+/// What a device task reports.
 #[derive(Clone, Debug)]
 pub enum Report {
     /// The device is open; the text says as what.
@@ -134,12 +126,120 @@ pub enum Report {
     Down(Fault),
     /// Something to know about a device that delivers; `count` things of the kind.
     Note(NoteKind, u32, String),
-    /// The thread is alive.
+    /// The task answers.
     Beat,
 }
 
-/// How long a thread sleeps at a time, so that it answers while it waits.
-pub(super) const NAP: Duration = Duration::from_millis(100);
+/// Where a device task's reports go. The call returns at once.
+pub type Reports<'a> = &'a (dyn Fn(Report) + Sync);
+
+/// How often a task that waits reports that it answers.
+const BEAT: Duration = Duration::from_millis(250);
+
+/// Waits for `ready` and reports meanwhile that the task answers.
+pub(super) async fn wait_for<T>(ready: impl Future<Output = T>, reports: Reports<'_>) -> T {
+    let mut ready = std::pin::pin!(ready);
+    loop {
+        reports(Report::Beat);
+        if let Ok(value) = tokio::time::timeout(BEAT, &mut ready).await {
+            return value;
+        }
+    }
+}
+
+/// Does work that can block on a thread for such work. A panic of the work is a panic of the caller.
+pub async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
+    match spawn_blocking(work).await {
+        Ok(value) => value,
+        Err(error) => match error.try_into_panic() {
+            Ok(panic) => resume_unwind(panic),
+            // The runtime is being shut down: nothing of it runs on.
+            Err(_) => std::future::pending().await,
+        },
+    }
+}
+
+thread_local! {
+    static PANICS_CAUGHT: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Whether a panic of this thread is caught: then it is no failure of the program.
+pub fn panics_are_caught() -> bool {
+    PANICS_CAUGHT.get()
+}
+
+/// Does work in which a library may panic where a device vanishes; `None` where it did.
+pub(super) fn catch_panics<T>(work: impl FnOnce() -> T) -> Option<T> {
+    let before = PANICS_CAUGHT.replace(true);
+    let result = catch_unwind(AssertUnwindSafe(work));
+    PANICS_CAUGHT.set(before);
+    result.ok()
+}
+
+/// A device that owns its descriptor.
+///
+/// # Safety
+///
+/// `as_raw_fd` gives the same open descriptor for as long as the value lives.
+pub(super) unsafe trait OwnsDescriptor: AsRawFd {}
+
+// SAFETY: a file owns its descriptor and closes it when it is dropped.
+unsafe impl OwnsDescriptor for File {}
+
+/// Has the runtime wait on a device.
+pub(super) fn register<D: OwnsDescriptor>(device: D, interest: Interest) -> io::Result<AsyncFd<D>> {
+    // SAFETY: what `OwnsDescriptor` promises is what is asked for, and the device lives as long as what is returned.
+    Ok(unsafe { AsyncFd::register_with_interest(device, interest) }?)
+}
+
+/// An open device. Closing one can block (a line waits until its output is sent, a camera until its stream has
+/// ended) and a driver's library may panic, so it is closed on a thread for such work and a panic is caught there.
+#[derive(Debug)]
+pub(super) struct Opened<T: Send + 'static>(Option<T>);
+
+impl<T: Send + 'static> Opened<T> {
+    pub(super) const fn new(device: T) -> Self {
+        Self(Some(device))
+    }
+
+    /// The device itself.
+    pub(super) fn into_inner(mut self) -> Option<T> {
+        self.0.take()
+    }
+
+    /// Closes the device and waits until it is closed.
+    pub(super) async fn close(mut self) {
+        let device = self.0.take();
+        blocking(move || close(device)).await;
+    }
+}
+
+fn close<T>(device: T) {
+    let _ = catch_panics(|| drop(device));
+}
+
+impl<T: Send + 'static> Deref for Opened<T> {
+    type Target = T;
+
+    fn deref(&self) -> &T {
+        self.0.as_ref().expect("open until it is closed or dropped")
+    }
+}
+
+impl<T: Send + 'static> DerefMut for Opened<T> {
+    fn deref_mut(&mut self) -> &mut T {
+        self.0.as_mut().expect("open until it is closed or dropped")
+    }
+}
+
+impl<T: Send + 'static> Drop for Opened<T> {
+    /// Where the task is cancelled: closes the device without waiting for it.
+    fn drop(&mut self) {
+        if let Some(device) = self.0.take() {
+            spawn_blocking(move || close(device));
+        }
+    }
+}
 
 /// Waits between attempts: a quarter of a second, doubled each time, five seconds at most.
 #[derive(Debug)]
@@ -160,16 +260,16 @@ impl Backoff {
         self.next = Self::FIRST;
     }
 
-    /// Waits in naps, answering, until the time is over or the end is asked for.
-    pub(super) fn wait(&mut self, stop: &Stop, tell: &dyn Fn(Report)) {
-        let mut left = self.next;
-        self.next = (self.next * 2).min(Self::LONGEST);
-        while !left.is_zero() && !stop.asked() {
-            tell(Report::Beat);
-            let nap = left.min(NAP);
-            std::thread::sleep(nap);
-            left -= nap;
-        }
+    /// Waits before the next attempt.
+    pub(super) async fn wait(&mut self, reports: Reports<'_>) {
+        wait_for(tokio::time::sleep(self.lengthen()), reports).await;
+    }
+
+    /// The wait that is due; the one after it is twice as long.
+    fn lengthen(&mut self) -> Duration {
+        let wait = self.next;
+        self.next = (wait * 2).min(Self::LONGEST);
+        wait
     }
 }
 
@@ -193,18 +293,28 @@ mod tests {
     #[test]
     fn waiting_grows_and_starts_again() {
         let mut backoff = Backoff::new();
-        let stop = Stop::default();
-        stop.ask();
-        let waits: Vec<Duration> = (0..7)
-            .map(|_| {
-                let wait = backoff.next;
-                backoff.wait(&stop, &|_| {});
-                wait
-            })
-            .collect();
+        let waits: Vec<Duration> = (0..7).map(|_| backoff.lengthen()).collect();
         assert!(waits.windows(2).all(|w| w[0] <= w[1]));
-        assert_eq!(waits[6], Backoff::LONGEST);
+        assert_eq!((waits[0], waits[6]), (Backoff::FIRST, Backoff::LONGEST));
         backoff.reset();
-        assert_eq!(backoff.next, Backoff::FIRST);
+        assert_eq!(backoff.lengthen(), Backoff::FIRST);
+    }
+
+    #[tokio::test]
+    async fn a_device_is_closed_off_the_workers_and_its_panics_are_caught() {
+        struct Device(std::sync::mpsc::Sender<std::thread::ThreadId>);
+        impl Drop for Device {
+            fn drop(&mut self) {
+                let _ = self.0.send(std::thread::current().id());
+                assert!(panics_are_caught());
+                panic!("the driver gave up");
+            }
+        }
+        let (sender, closed) = std::sync::mpsc::channel();
+        Opened::new(Device(sender.clone())).close().await;
+        assert_ne!(closed.recv(), Ok(std::thread::current().id()));
+        drop(Opened::new(Device(sender)));
+        assert_ne!(closed.recv(), Ok(std::thread::current().id()));
+        assert!(!panics_are_caught());
     }
 }

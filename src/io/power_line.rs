@@ -1,74 +1,116 @@
-//! A GPIO line that tells of power going, read through its chip's character device (Linux `/dev/gpiochipN`).
+//! A GPIO line that tells of power going, watched through its chip's character device (Linux `/dev/gpiochipN`).
+
+use std::convert::Infallible;
+use std::time::Duration;
 
 use gpiocdev::Request;
-use gpiocdev::line::Value;
+use gpiocdev::line::{EdgeDetection, Value};
+use tokio::io::Interest;
 
-use super::device::{Fault, FaultKind};
+use super::device::{
+    Backoff, Fault, FaultKind, OwnsDescriptor, Report, Reports, blocking, register, wait_for,
+};
 use crate::config::GoingLine;
 
-/// The line: requested when it is read first, and again after it was lost.
-#[derive(Debug)]
-pub struct PowerLine {
-    line: GoingLine,
-    request: Option<Request>,
+/// How often a line is read whose controller raises no interrupts.
+const READING: Duration = Duration::from_secs(1);
+
+/// The line as it was given to this program.
+enum Requested {
+    /// Its controller reports edges.
+    Edges(Request),
+    /// Its controller raises no interrupts for it: the line is read now and then.
+    Level(Request),
 }
 
-/// What reading the line gave.
-#[derive(Clone, PartialEq, Eq, Debug)]
-pub struct LineReading {
-    /// Whether the line is active.
-    pub set: bool,
-    /// Whether the line was requested just now.
-    pub opened: bool,
-}
+// SAFETY: a request owns the descriptor that the kernel gave for it until it is dropped.
+unsafe impl OwnsDescriptor for Request {}
 
-impl PowerLine {
-    /// The line as configured.
-    pub const fn new(line: GoingLine) -> Self {
-        Self { line, request: None }
-    }
-
-    /// Reads the line: one system call, a few more where it has to be requested.
-    pub fn read(&mut self) -> Result<LineReading, Fault> {
-        let opened = self.request.is_none();
-        let request = match self.request.take() {
-            Some(request) => request,
-            None => self.request()?,
+/// Watches the line for ever; `active` gets its level whenever it may have changed, and `false` where it is lost.
+pub async fn run(line: &GoingLine, reports: Reports<'_>, active: &(dyn Fn(bool) + Sync)) -> Infallible {
+    let mut backoff = Backoff::new();
+    loop {
+        let asked = line.clone();
+        let fault = match blocking(move || request(&asked)).await {
+            Ok(requested) => {
+                backoff.reset();
+                match watch(line, requested, reports, active).await {
+                    Ok(never) => match never {},
+                    Err(error) => fault(line, &error),
+                }
+            }
+            Err(fault) => fault,
         };
-        let value = request.value(self.line.line).map_err(|error| self.fault(&error))?;
-        self.request = Some(request);
-        Ok(LineReading { set: value == Value::Active, opened })
+        active(false);
+        reports(Report::Down(fault));
+        backoff.wait(reports).await;
     }
+}
 
-    fn request(&self) -> Result<Request, Fault> {
-        // The library folds its errors into one; the plain system call tells a missing chip from a forbidden one.
-        std::fs::File::open(&self.line.chip).map_err(|error| Fault::from_io(&self.line.chip, &error))?;
-        let mut builder = Request::builder();
-        builder.on_chip(&self.line.chip).with_consumer("windhover").with_line(self.line.line).as_input();
-        if self.line.active_low {
-            builder.as_active_low();
+async fn watch(
+    line: &GoingLine,
+    requested: Requested,
+    reports: Reports<'_>,
+    active: &(dyn Fn(bool) + Sync),
+) -> gpiocdev::Result<Infallible> {
+    let level = |request: &Request| -> gpiocdev::Result<()> {
+        active(request.value(line.line)? == Value::Active);
+        Ok(())
+    };
+    match requested {
+        Requested::Edges(request) => {
+            let request = register(request, Interest::READABLE)?;
+            reports(Report::Up("waits for its edges".into()));
+            loop {
+                level(request.get_ref())?;
+                // Cleared first: an edge that comes from here on wakes again.
+                wait_for(request.readable(), reports).await?.clear_ready();
+                while request.get_ref().has_edge_event()? {
+                    request.get_ref().read_edge_event()?;
+                }
+            }
         }
-        builder.request().map_err(|error| self.fault(&error))
+        Requested::Level(request) => {
+            reports(Report::Up("its controller reports no edges: read once a second".into()));
+            loop {
+                level(&request)?;
+                wait_for(tokio::time::sleep(READING), reports).await;
+            }
+        }
     }
+}
 
-    fn fault(&self, error: &gpiocdev::Error) -> Fault {
-        let device = format!("{} line {}", self.line.chip, self.line.line);
-        Fault::new(FaultKind::Unsuitable, &device, error.to_string())
+fn request(line: &GoingLine) -> Result<Requested, Fault> {
+    // The library folds its errors into one; the plain system call tells a missing chip from a forbidden one.
+    std::fs::File::open(&line.chip).map_err(|error| Fault::from_io(&line.chip, &error))?;
+    let mut builder = Request::builder();
+    builder.on_chip(&line.chip).with_consumer("windhover").with_line(line.line).as_input();
+    if line.active_low {
+        builder.as_active_low();
     }
+    if let Ok(request) = builder.clone().with_edge_detection(EdgeDetection::BothEdges).request() {
+        return Ok(Requested::Edges(request));
+    }
+    builder.request().map(Requested::Level).map_err(|error| fault(line, &error))
+}
+
+fn fault(line: &GoingLine, error: &gpiocdev::Error) -> Fault {
+    let device = format!("{} line {}", line.chip, line.line);
+    Fault::new(FaultKind::Unsuitable, &device, error.to_string())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn fault(chip: &str) -> FaultKind {
+    fn kind(chip: &str) -> Option<FaultKind> {
         let line = GoingLine { chip: chip.into(), line: 3, active_low: true };
-        PowerLine::new(line).read().expect_err("no such line").kind
+        request(&line).err().map(|fault| fault.kind)
     }
 
     #[test]
-    fn what_is_no_gpio_chip_is_told_and_tried_again() {
-        assert_eq!(fault("/dev/gpiochip99"), FaultKind::Missing);
-        assert_eq!(fault("/dev/null"), FaultKind::Unsuitable);
+    fn what_is_no_gpio_chip_is_reported() {
+        assert_eq!(kind("/dev/gpiochip99"), Some(FaultKind::Missing));
+        assert_eq!(kind("/dev/null"), Some(FaultKind::Unsuitable));
     }
 }

@@ -1,13 +1,16 @@
 //! Pulse per second: the kernel's stamps of a receiver's pulse (Linux `/dev/ppsN`, RFC 2783).
 
+use std::convert::Infallible;
 use std::fs::File;
+use std::io;
 use std::os::fd::AsFd;
 use std::time::Duration;
 
 use rustix::ioctl::{Ioctl, IoctlOutput, Opcode, ioctl, opcode};
+use tokio::io::Interest;
 
 use super::clock::HostClock;
-use super::device::{Backoff, Fault, FaultKind, Report, Stop};
+use super::device::{Backoff, Fault, FaultKind, Report, Reports, blocking, register, wait_for};
 use windhover_base::time::MonoTime;
 
 /// `struct pps_ktime` of linux/pps.h.
@@ -54,61 +57,59 @@ unsafe impl Ioctl for PpsFetch {
     }
 }
 
-/// Watches a pulse line until the end is asked for. Runs on the calling thread; `pulse` gets the host
-/// time of each rising edge.
-pub fn run(device: &str, clock: HostClock, stop: &Stop, tell: &dyn Fn(Report), pulse: &dyn Fn(MonoTime)) {
+/// Watches a pulse line for ever; `pulse` gets the host time of each rising edge.
+pub async fn run(
+    device: &str,
+    clock: HostClock,
+    reports: Reports<'_>,
+    pulse: &(dyn Fn(MonoTime) + Sync),
+) -> Infallible {
     let mut backoff = Backoff::new();
-    while !stop.asked() {
-        let fault = match File::open(device) {
+    loop {
+        let path = device.to_owned();
+        let fault = match blocking(move || File::open(path)).await {
             Ok(file) => {
-                tell(Report::Up(format!("pulses of {device}")));
+                reports(Report::Up(format!("pulses of {device}")));
                 backoff.reset();
-                match watch(&file, device, clock, stop, tell, pulse) {
-                    Some(fault) => fault,
-                    None => return,
+                match watch(file, clock, reports, pulse).await {
+                    Ok(never) => match never {},
+                    Err(error) => Fault::new(FaultKind::Unplugged, device, error.to_string()),
                 }
             }
             Err(error) => Fault::from_io(device, &error),
         };
-        tell(Report::Down(fault));
-        backoff.wait(stop, tell);
+        reports(Report::Down(fault));
+        backoff.wait(reports).await;
     }
 }
 
-fn watch(
-    file: &File,
-    device: &str,
+/// Until the line is lost. The kernel wakes whoever waits at every edge; before Linux 6.14 it also says at any time that
+/// the device can be read, so only a wake-up counts (epoll's edge trigger, which the runtime asks for).
+async fn watch(
+    file: File,
     clock: HostClock,
-    stop: &Stop,
-    tell: &dyn Fn(Report),
-    pulse: &dyn Fn(MonoTime),
-) -> Option<Fault> {
-    let mut last = None;
-    while !stop.asked() {
-        tell(Report::Beat);
-        match fetch(file) {
-            Ok(fetched) => {
-                let edge = fetched.assert;
-                let new = last.replace(fetched.assert_sequence).is_some_and(|s| s != fetched.assert_sequence);
-                if new && let (Ok(sec), Ok(nsec)) = (u64::try_from(edge.sec), u32::try_from(edge.nsec)) {
-                    pulse(clock.from_realtime(Duration::new(sec, nsec)));
-                }
-            }
-            Err(rustix::io::Errno::TIMEDOUT | rustix::io::Errno::INTR) => {}
-            Err(error) => {
-                return Some(Fault::new(FaultKind::Unplugged, device, error.to_string()));
-            }
+    reports: Reports<'_>,
+    pulse: &(dyn Fn(MonoTime) + Sync),
+) -> io::Result<Infallible> {
+    // What is no pulse line says so here.
+    let mut last = fetch(&file)?.assert_sequence;
+    let line = register(file, Interest::READABLE)?;
+    loop {
+        // Cleared first: an edge that comes from here on wakes again.
+        wait_for(line.readable(), reports).await?.clear_ready();
+        let edge = fetch(line.get_ref())?;
+        let new = std::mem::replace(&mut last, edge.assert_sequence) != edge.assert_sequence;
+        if new && let (Ok(sec), Ok(nsec)) = (u64::try_from(edge.assert.sec), u32::try_from(edge.assert.nsec))
+        {
+            pulse(clock.from_realtime(Duration::new(sec, nsec)));
         }
     }
-    None
 }
 
-/// Waits half a second at most for the next edge.
-fn fetch(file: &File) -> rustix::io::Result<PpsFetch> {
-    let timeout = PpsTime { sec: 0, nsec: 500_000_000, flags: 0 };
-    let request = PpsFetch { timeout, ..PpsFetch::default() };
+/// The latest edge, at once: a time-out of zero does not wait.
+fn fetch(file: &File) -> io::Result<PpsFetch> {
     // SAFETY: see the implementation of `Ioctl` above; the file is open for the whole call.
-    unsafe { ioctl(file.as_fd(), request) }
+    Ok(unsafe { ioctl(file.as_fd(), PpsFetch::default()) }?)
 }
 
 #[cfg(test)]
@@ -122,18 +123,18 @@ mod tests {
         assert_eq!(PPS_FETCH, 0xc008_70a4);
     }
 
-    #[test]
-    fn what_is_no_pulse_line_is_told() {
-        use std::cell::Cell;
-        let stop = Stop::default();
-        let fault = Cell::new(None);
-        let tell = |report| {
-            if let Report::Down(told) = report {
-                fault.set(Some(told));
-                stop.ask();
+    #[tokio::test]
+    async fn what_is_no_pulse_line_is_reported() {
+        let (sender, mut faults) = tokio::sync::mpsc::unbounded_channel();
+        let reports = move |report| {
+            if let Report::Down(fault) = report {
+                let _ = sender.send(fault);
             }
         };
-        run("/dev/null", HostClock::start(), &stop, &tell, &|_| {});
-        assert_eq!(fault.take().map(|f| f.kind), Some(FaultKind::Unplugged));
+        let kind = tokio::select! {
+            fault = faults.recv() => fault.map(|fault| fault.kind),
+            never = run("/dev/null", HostClock::start(), &reports, &|_| {}) => match never {},
+        };
+        assert_eq!(kind, Some(FaultKind::Unplugged));
     }
 }

@@ -1,40 +1,40 @@
 //! The one path from events to outputs, live and in replay.
 //!
 //! [`Pipeline::handle`] takes what was heard, in the order it was heard, and appends what follows
-//! from it. It reads no clock: time is what the events say, so a replay of the same events gives the
-//! same outputs to the last bit.
+//! from it. It reads no clock: time is what the events say, and so are the ticks at which time-outs are
+//! looked at, so a replay of the same events gives the same outputs to the last bit.
 
 mod lines;
 mod monitor;
 mod site;
 mod ticks;
 
-pub use ticks::{TICK, Ticks};
+pub use ticks::next_tick;
 
 use std::sync::Arc;
 
 use crate::config::Config;
 use crate::pixels::{self, DecodedFrame, FrameFault};
-use lines::{CompassLine, GpsLine};
+use lines::Lines;
 use monitor::{Monitor, notice};
 use site::SiteFinder;
+use ticks::Ticks;
 use windhover_base::geo::{Geodetic, Tile};
 use windhover_base::msg::{
-    AttitudeSample, Event, EventBody, FrameObservations, FramePayload, FramePrediction, GnssEpoch,
-    MarkerDetection, MarkerId, NoticeKind, Output, Source, Stamped, TargetEstimate, TrackStatus, WarmFilter,
-    WarmSite, WarmState,
+    AttitudeSample, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload, FramePrediction,
+    GnssEpoch, MarkerDetection, MarkerId, Measurement, NoticeKind, Output, Source, Stamped, TargetEstimate,
+    TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
 };
 use windhover_base::settings::MarkerKind;
 use windhover_base::time::{MonoTime, Span};
 use windhover_detect::tracking::FrameDetector;
-use windhover_estimate::{Estimator, EstimatorOutput, PaperEstimator};
+use windhover_estimate::{Estimator, PaperEstimator};
 
 /// Events in, outputs out.
 pub struct Pipeline {
     config: Config,
     want_rgb: bool,
-    gps: GpsLine,
-    compass: CompassLine,
+    lines: Lines,
     detector: FrameDetector,
     observations: FrameObservations,
     prediction: FramePrediction,
@@ -43,9 +43,12 @@ pub struct Pipeline {
     /// An earlier run's filter, until there is one to continue it.
     warm: Option<WarmFilter>,
     monitor: Monitor,
+    ticks: Ticks,
+    /// Time of the last event or tick.
+    now: MonoTime,
     last_exposure: Option<MonoTime>,
-    epochs: Vec<Stamped<GnssEpoch>>,
-    samples: Vec<Stamped<AttitudeSample>>,
+    outputs: Vec<Output>,
+    measured: Vec<Measurement>,
     estimated: Vec<EstimatorOutput>,
     papered: Vec<TargetEstimate>,
 }
@@ -68,8 +71,7 @@ impl Pipeline {
         Self {
             config: config.clone(),
             want_rgb: wants_rgb(config),
-            gps: GpsLine::new(config),
-            compass: CompassLine::new(config),
+            lines: Lines::new(&config.gps, &config.compass),
             detector: FrameDetector::new(&config.detector, &config.target, &config.camera.intrinsics),
             observations: FrameObservations::default(),
             prediction: FramePrediction::default(),
@@ -77,9 +79,11 @@ impl Pipeline {
             estimators: None,
             warm: None,
             monitor: Monitor::new(config),
+            ticks: Ticks::default(),
+            now: MonoTime::default(),
             last_exposure: None,
-            epochs: Vec::new(),
-            samples: Vec::new(),
+            outputs: Vec::new(),
+            measured: Vec::new(),
             estimated: Vec::new(),
             papered: Vec::new(),
         }
@@ -90,18 +94,62 @@ impl Pipeline {
         let estimators = self.estimators.as_ref()?;
         Some(WarmState {
             site: estimators.site,
-            arrivals: self.gps.arrivals(),
+            arrivals: self.lines.gps.arrivals(),
             filter: estimators.joint.warm_state(),
         })
     }
 
-    /// Takes an event; appends what follows from it.
-    pub fn handle(&mut self, event: &Event, out: &mut Vec<Output>) {
+    /// Takes an event; appends what follows from it and from the time that passed before it.
+    pub fn handle(&mut self, event: &Event, out: &mut Vec<TimedOutput>) {
         self.handle_prepared(event, None, out);
+    }
+
+    /// The latest tick that is due at `now`; `None` where it was made already. Where nothing arrives, an
+    /// [`EventBody::Tick`] of this time lets time pass.
+    pub fn tick_due(&mut self, now: MonoTime) -> Option<MonoTime> {
+        self.ticks.due(now)
     }
 
     /// As [`Self::handle`], with the event's frame already decoded elsewhere.
     pub fn handle_prepared(
+        &mut self,
+        event: &Event,
+        prepared: Option<Result<DecodedFrame, FrameFault>>,
+        out: &mut Vec<TimedOutput>,
+    ) {
+        let mut outputs = std::mem::take(&mut self.outputs);
+        for t in self.ticks.until(event.t_recv) {
+            self.tick(t, event.seq, &mut outputs);
+            self.pass_on(t, &mut outputs, out);
+        }
+        if !matches!(event.body, EventBody::Tick) {
+            self.event(event, prepared, &mut outputs);
+            self.pass_on(event.t_recv, &mut outputs, out);
+        }
+        self.outputs = outputs;
+    }
+
+    /// What followed from what happened at `t`.
+    fn pass_on(&mut self, t: MonoTime, outputs: &mut Vec<Output>, out: &mut Vec<TimedOutput>) {
+        self.now = t;
+        out.extend(outputs.drain(..).map(|output| TimedOutput { t_cause: t, output }));
+    }
+
+    fn tick(&mut self, t: MonoTime, seq: u64, out: &mut Vec<Output>) {
+        self.monitor.advance(t, out);
+        for &source in Source::ALL {
+            if let Some(line) = self.lines.of(source) {
+                line.tick(t, seq, &mut self.measured);
+                self.take_measured(source, t, out);
+            }
+        }
+        if let Some(estimators) = &mut self.estimators {
+            estimators.joint.tick(t, &mut self.estimated);
+        }
+        self.take_estimated(t, out);
+    }
+
+    fn event(
         &mut self,
         event: &Event,
         prepared: Option<Result<DecodedFrame, FrameFault>>,
@@ -116,17 +164,9 @@ impl Pipeline {
                 self.frame(frame, decoded, event, out);
             }
             EventBody::Dropped { source, count } => self.monitor.dropped(*source, t, *count, out),
-            EventBody::Tick => {
-                self.gps.tick(t, event.seq, &mut self.epochs);
-                self.take_epochs(t, out);
-                if let Some(estimators) = &mut self.estimators {
-                    estimators.joint.tick(t, &mut self.estimated);
-                }
-                self.take_estimated(t, out);
-            }
-            EventBody::Pulse => self.gps.pulse(t),
+            EventBody::Pulse => self.lines.gps.pulse(t),
             EventBody::Warm(state) => self.resume(state),
-            EventBody::SourceUp(_) | EventBody::SourceDown(_) => {}
+            EventBody::Tick | EventBody::SourceUp(_) | EventBody::SourceDown(_) => {}
         }
     }
 
@@ -136,14 +176,19 @@ impl Pipeline {
     }
 
     /// The recording ends here: what was still held back follows.
-    pub fn finish(&mut self, out: &mut Vec<Output>) {
-        self.gps.finish(&mut self.epochs);
-        let t = self.epochs.last().map_or(self.last_exposure.unwrap_or_default(), |e| e.t_recv);
-        self.take_epochs(t, out);
+    pub fn finish(&mut self, out: &mut Vec<TimedOutput>) {
+        let mut outputs = std::mem::take(&mut self.outputs);
+        for &source in Source::ALL {
+            if let Some(line) = self.lines.of(source) {
+                line.finish(&mut self.measured);
+                self.take_measured(source, self.now, &mut outputs);
+            }
+        }
         if let Some(estimators) = &mut self.estimators {
             estimators.joint.finish(&mut self.estimated);
         }
-        self.take_estimated(t, out);
+        self.take_estimated(self.now, &mut outputs);
+        self.pass_on(self.now, &mut outputs, out);
     }
 
     /// Continues from what an earlier run of the same flight had learnt: site, clock fit, sensors' slow
@@ -152,40 +197,49 @@ impl Pipeline {
         if self.estimators.is_some() {
             return;
         }
-        self.gps.resume(&warm.arrivals);
+        self.lines.gps.resume(&warm.arrivals);
         self.finder.resume(warm.site);
         self.warm = warm.filter.clone().filter(WarmFilter::is_sound);
     }
 
     fn bytes(&mut self, source: Source, bytes: &[u8], event: &Event, out: &mut Vec<Output>) {
-        match source {
-            Source::Gps => self.gnss_bytes(bytes, event, out),
-            Source::Compass => self.compass_bytes(bytes, event, out),
-            Source::Camera => {}
-        }
+        let t = event.t_recv;
+        let Some(line) = self.lines.of(source) else { return };
+        line.push(bytes, t, event.seq, &mut self.measured);
+        let (refused, why) = lines::refused(line.counts());
+        self.monitor.refused(source, t, refused, &why, out);
+        self.take_measured(source, t, out);
     }
 
-    fn gnss_bytes(&mut self, bytes: &[u8], event: &Event, out: &mut Vec<Output>) {
-        self.gps.push(bytes, event.t_recv, event.seq, &mut self.epochs);
-        let (refused, why) = self.gps.refused();
-        self.monitor.refused(Source::Gps, event.t_recv, refused, &why, out);
-        self.take_epochs(event.t_recv, out);
-    }
-
-    fn take_epochs(&mut self, t: MonoTime, out: &mut Vec<Output>) {
-        for epoch in std::mem::take(&mut self.epochs) {
-            self.monitor.heard(Source::Gps, t, out);
-            self.monitor.fix(t, epoch.value.fix, epoch.value.sats, self.gps.clock_sigma(), out);
-            out.push(Output::Fix(epoch));
-            if self.estimators.is_none() {
-                self.settle(&epoch.value, t, out);
-            }
-            if let Some(estimators) = &mut self.estimators {
-                estimators.joint.gnss(&epoch, &mut self.estimated);
-                estimators.paper.gnss(&epoch, &mut self.papered);
+    fn take_measured(&mut self, source: Source, t: MonoTime, out: &mut Vec<Output>) {
+        for measurement in std::mem::take(&mut self.measured) {
+            self.monitor.heard(source, t, out);
+            match measurement {
+                Measurement::Gnss(epoch) => self.gnss(&epoch, t, out),
+                Measurement::Attitude(sample) => self.attitude(&sample, out),
             }
         }
         self.take_estimated(t, out);
+    }
+
+    fn gnss(&mut self, epoch: &Stamped<GnssEpoch>, t: MonoTime, out: &mut Vec<Output>) {
+        self.monitor.fix(t, epoch.value.fix, epoch.value.sats, self.lines.gps.clock_sigma(), out);
+        out.push(Output::Measured(Measurement::Gnss(*epoch)));
+        if self.estimators.is_none() {
+            self.settle(&epoch.value, t, out);
+        }
+        if let Some(estimators) = &mut self.estimators {
+            estimators.joint.gnss(epoch, &mut self.estimated);
+            estimators.paper.gnss(epoch, &mut self.papered);
+        }
+    }
+
+    fn attitude(&mut self, sample: &Stamped<AttitudeSample>, out: &mut Vec<Output>) {
+        out.push(Output::Measured(Measurement::Attitude(*sample)));
+        if let Some(estimators) = &mut self.estimators {
+            estimators.joint.attitude(sample, &mut self.estimated);
+            estimators.paper.attitude(sample, &mut self.papered);
+        }
     }
 
     fn settle(&mut self, epoch: &GnssEpoch, t: MonoTime, out: &mut Vec<Output>) {
@@ -210,21 +264,6 @@ impl Pipeline {
         }
         let paper = PaperEstimator::new(&rig, &filter, &settled.site);
         self.estimators = Some(Estimators { joint, paper, site: settled.warm });
-    }
-
-    fn compass_bytes(&mut self, bytes: &[u8], event: &Event, out: &mut Vec<Output>) {
-        self.compass.push(bytes, event.t_recv, event.seq, &mut self.samples);
-        let (refused, why) = self.compass.refused();
-        self.monitor.refused(Source::Compass, event.t_recv, refused, &why, out);
-        for sample in std::mem::take(&mut self.samples) {
-            self.monitor.heard(Source::Compass, event.t_recv, out);
-            out.push(Output::Attitude(sample));
-            if let Some(estimators) = &mut self.estimators {
-                estimators.joint.attitude(&sample, &mut self.estimated);
-                estimators.paper.attitude(&sample, &mut self.papered);
-            }
-        }
-        self.take_estimated(event.t_recv, out);
     }
 
     fn frame(
@@ -290,7 +329,8 @@ impl Pipeline {
             for target in 0..self.config.target.len() {
                 let frame = self.observations.frame;
                 let status = TrackStatus::Lost;
-                out.push(Output::Estimate(TargetEstimate { t_valid, frame, target, status, state: None }));
+                let lost = TargetEstimate { t_valid, frame, target, status, state: None };
+                out.push(Output::Estimator(EstimatorOutput::Estimate(lost)));
             }
             return;
         };
@@ -305,17 +345,9 @@ impl Pipeline {
 
     fn take_estimated(&mut self, t: MonoTime, out: &mut Vec<Output>) {
         for estimated in self.estimated.drain(..) {
-            match estimated {
-                EstimatorOutput::Estimate(estimate) => {
-                    self.monitor.estimate(&estimate, t, out);
-                    out.push(Output::Estimate(estimate));
-                }
-                EstimatorOutput::Smoothed(estimate) => out.push(Output::Smoothed(estimate)),
-                EstimatorOutput::Ownship(own) => out.push(Output::Ownship(own)),
-                EstimatorOutput::Fusion(result) => {
-                    self.monitor.disposition(result.disposition);
-                    out.push(Output::Fusion(result));
-                }
+            match &estimated {
+                EstimatorOutput::Estimate(estimate) => self.monitor.estimate(estimate, t, out),
+                EstimatorOutput::Fusion(result) => self.monitor.disposition(result.disposition),
                 EstimatorOutput::Anchored { moved_m: d } => {
                     let detail = format!(
                         "the receiver jumped for good: everything moved by {:.1} m north, {:.1} m east, {:.1} m down",
@@ -324,9 +356,11 @@ impl Pipeline {
                     out.push(notice(t, NoticeKind::FilterReset, None, detail));
                 }
                 EstimatorOutput::Reset { reason } => {
-                    out.push(notice(t, NoticeKind::FilterReset, None, reason.to_string()));
+                    out.push(notice(t, NoticeKind::FilterReset, None, (*reason).to_owned()));
                 }
+                EstimatorOutput::Smoothed(_) | EstimatorOutput::Ownship(_) => {}
             }
+            out.push(Output::Estimator(estimated));
         }
     }
 }

@@ -279,10 +279,16 @@ pub struct Daemon {
 
 impl Daemon {
     pub fn start(config: &Path, log: &Path) -> Self {
+        Self::start_under(config, log, None)
+    }
+
+    /// The same under a service manager that listens on a socket.
+    pub fn start_under(config: &Path, log: &Path, manager: Option<&Path>) -> Self {
         let file = File::options().create(true).append(true).open(log).expect("a log");
         let child = Command::new(env!("CARGO_BIN_EXE_windhover"))
             .args(["run", "--config"])
             .arg(config)
+            .envs(manager.map(|socket| ("NOTIFY_SOCKET", socket)))
             .stdin(Stdio::null())
             .stderr(file)
             .spawn()
@@ -320,6 +326,14 @@ impl Daemon {
             assert!(self.clock.now() < limit, "not in time: {what}; the log:\n{}", self.log());
             std::thread::sleep(Duration::from_millis(100));
         }
+    }
+
+    /// Whether the process has taken over these signals.
+    pub fn catches(&self, signals: &[Signal]) -> bool {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("it runs");
+        let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:")).expect("told by /proc");
+        let caught = u64::from_str_radix(caught.trim(), 16).expect("a mask");
+        signals.iter().all(|signal| caught & (1 << (signal.as_raw() - 1)) != 0)
     }
 
     pub fn signal(&self, signal: Signal) {

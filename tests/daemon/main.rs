@@ -3,6 +3,7 @@
 
 mod devices;
 mod harness;
+mod signals;
 mod warm;
 
 use std::process::Command;

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use windhover::config::Config;
 use windhover::pipeline::Pipeline;
 use windhover_base::geo::wrap_angle;
-use windhover_base::msg::{AttitudeSample, GnssEpoch, NoticeKind, Output, Stamped};
+use windhover_base::msg::{AttitudeSample, GnssEpoch, Measurement, NoticeKind, Output, Stamped, TimedOutput};
 use windhover_base::settings::CompassFormat;
 use windhover_base::time::{MonoTime, Span};
 use windhover_simulate::{Flight, FrameStorage, Sample, Scenario, SensorSuite, World};
@@ -22,11 +22,11 @@ fn config_of(scenario: &Scenario) -> Config {
 fn decoded(flight: Flight) -> Decoded {
     let mut pipeline = Pipeline::new(&config_of(flight.world().scenario()));
     let (mut outputs, mut fixes, mut attitudes) = (Vec::new(), Vec::new(), Vec::new());
-    let mut sort = |outputs: &mut Vec<Output>| {
-        for output in outputs.drain(..) {
-            match output {
-                Output::Fix(fix) => fixes.push(fix),
-                Output::Attitude(attitude) => attitudes.push(attitude),
+    let mut sort = |outputs: &mut Vec<TimedOutput>| {
+        for timed in outputs.drain(..) {
+            match timed.output {
+                Output::Measured(Measurement::Gnss(fix)) => fixes.push(fix),
+                Output::Measured(Measurement::Attitude(attitude)) => attitudes.push(attitude),
                 _ => {}
             }
         }
@@ -195,7 +195,7 @@ fn a_terrain_tile_that_is_missing_is_an_event_of_its_own() {
     }
     // Then it is said once, as what it is, and the datum is settled.
     let count = |kind: NoticeKind| {
-        outputs.iter().filter(|o| matches!(o, Output::Notice(notice) if notice.kind == kind)).count()
+        outputs.iter().filter(|o| matches!(&o.output, Output::Notice(notice) if notice.kind == kind)).count()
     };
     assert_eq!((count(NoticeKind::TerrainMissing), count(NoticeKind::DatumSet)), (1, 1));
 }

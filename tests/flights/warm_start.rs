@@ -5,8 +5,7 @@ use std::path::{Path, PathBuf};
 use windhover::config::Config;
 use windhover::io::capture::CaptureReader;
 use windhover::pipeline::Pipeline;
-use windhover_base::msg::Output;
-use windhover_base::msg::{Event, EventBody, TrackStatus, WarmState};
+use windhover_base::msg::{EstimatorOutput, Event, EventBody, Output, TrackStatus, WarmState};
 use windhover_base::time::{MonoTime, Span};
 
 fn capture() -> PathBuf {
@@ -25,13 +24,13 @@ fn events() -> Vec<Event> {
 fn outputs(pipeline: &mut Pipeline, events: &[Event]) -> Vec<Output> {
     let mut out = Vec::new();
     events.iter().for_each(|event| pipeline.handle(event, &mut out));
-    out
+    out.into_iter().map(|timed| timed.output).collect()
 }
 
 /// When the first estimate with `tracking` was true, and its heading sigma in rad.
 fn first_tracking(out: &[Output]) -> Option<(MonoTime, f64)> {
     out.iter().find_map(|o| match o {
-        Output::Estimate(e) if e.status == TrackStatus::Tracking => {
+        Output::Estimator(EstimatorOutput::Estimate(e)) if e.status == TrackStatus::Tracking => {
             let covariance = e.state?.covariance?;
             Some((e.t_valid, covariance[(2, 2)].sqrt()))
         }

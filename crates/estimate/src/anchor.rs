@@ -5,9 +5,11 @@
 
 use nalgebra::{Vector2, Vector3};
 
+use super::aid::gps_position::GpsPosition;
+use super::blocks::{Block, own};
 use super::core::Core;
-use super::ownship::ANYWHERE_VAR;
-use super::state::{State, at};
+use super::start::ANYWHERE_VAR;
+use super::state::State;
 
 /// Sigmas of the receiver's error within which a jump is one of its bias.
 const BIAS_SIGMAS: f64 = 5.0;
@@ -16,30 +18,32 @@ const SEEN_SHARE: f64 = 0.25;
 
 impl Core {
     /// Horizontal error of the receiver that the fix in `z` implies.
-    pub(super) fn receiver_error(&self) -> Vector2<f64> {
+    pub(crate) fn receiver_error(&self) -> Vector2<f64> {
         Vector2::new(self.z.residual[0], self.z.residual[1]) + self.state.own.gps_bias.xy()
     }
 
     /// After too many fixes in a row outside the gate: what the bias allows is its own, anything beyond
     /// is another place, believed once two fixes in a row (`before` is the error implied by the one
     /// before this) agree about it.
-    pub(super) fn follow_jump(&mut self, position: &Vector3<f64>, has_height: bool, before: &Vector2<f64>) {
+    pub(crate) fn follow_jump(&mut self, fix: &GpsPosition, before: &Vector2<f64>) {
         // Fusing it at low weight has moved the state.
-        self.expect_gps_position(position, has_height);
+        if !self.expect_aid(fix) {
+            return;
+        }
         let error = self.receiver_error();
         let allowed_m = BIAS_SIGMAS * (self.models.gps_bias_var[0] + self.models.gps_noise_var).sqrt();
         let bias_var: [f64; 3] = self.models.gps_bias_var.into();
         if error.norm() <= allowed_m {
             // The receiver's error has jumped: its bias is unknown again, position is not.
             self.state.rejections.gps_position = 0;
-            self.state.renew(at::GPS_BIAS, &bias_var.map(|v| v * BIAS_SIGMAS.powi(2)));
+            self.state.renew(own::GPS_BIAS, &bias_var.map(|v| v * BIAS_SIGMAS.powi(2)));
             return;
         }
         if !((error - before).norm() <= allowed_m) {
             return;
         }
         self.state.rejections.gps_position = 0;
-        let moved = Vector3::new(error.x, error.y, self.follow_height(&error, has_height));
+        let moved = Vector3::new(error.x, error.y, self.follow_height(&error, fix.has_height));
         let state = &mut self.state;
         state.translate(&moved);
         state.loosen(&bias_var);
@@ -47,23 +51,22 @@ impl Core {
         state.own.gps_bias.y = 0.0;
         state.anchored = Some((state.t, moved));
         // The innovation is zero now: this ties position, bias and all else that makes a fix together.
-        self.expect_gps_position(position, has_height);
-        self.fuse(None);
+        self.fuse_aid_as_it_is(fix);
     }
 
     /// How far down the scene moves along with the horizontal `error`. Height over the ground is seen
     /// wherever tags are: then it stays, and the receiver's vertical bias takes the jump.
     fn follow_height(&mut self, error: &Vector2<f64>, has_height: bool) -> f64 {
-        let (position, bias) = (at::POSITION + 2, at::GPS_BIAS + 2);
+        let (position, bias): (Block<1>, Block<1>) = (own::POSITION.part(2), own::GPS_BIAS.part(2));
         let bias_var = self.models.gps_bias_var[2];
         let residual = self.z.residual[2];
         let implied = residual + self.state.own.gps_bias.z;
-        let seen = self.state.cov.at(position, position) < SEEN_SHARE * bias_var;
+        let seen = self.state.cov.var(position) < SEEN_SHARE * bias_var;
         if has_height && !seen && implied.abs() > BIAS_SIGMAS * bias_var.sqrt() {
             self.state.own.gps_bias.z = 0.0;
             self.state.renew(position, &[ANYWHERE_VAR]);
             self.state.renew(bias, &[bias_var]);
-            // Where they lie was told from the height that has just been given up.
+            // Where they lie was read off the height that has just been given up.
             (0..self.state.features.len()).for_each(|slot| self.drop_feature(slot));
             return implied;
         }
@@ -82,14 +85,15 @@ impl State {
     /// Moves everything that has a place; nothing else changes.
     fn translate(&mut self, by: &Vector3<f64>) {
         self.own.position += by;
-        for target in self.targets.iter_mut().filter(|t| t.held) {
-            for axis in 0..2 {
-                target.mean[axis] += by[axis];
-                target.first_seen.1[axis] += by[axis];
+        let shift = |place: &mut [f64]| place.iter_mut().zip(by).for_each(|(x, by)| *x += by);
+        for target in self.targets.iter_mut().filter(|t| t.life.is_held()) {
+            shift(&mut target.mean[..2]);
+            if let Some(first) = target.life.first_mut() {
+                shift(&mut first.place);
             }
         }
         for feature in self.features.iter_mut().filter(|f| f.id.is_some()) {
-            (0..2).for_each(|axis| feature.mean[axis] += by[axis]);
+            shift(&mut feature.mean);
         }
     }
 
@@ -98,27 +102,28 @@ impl State {
     /// made absolute again.
     fn loosen(&mut self, bias_var: &[f64; 3]) {
         self.tie_places(-1.0);
-        self.renew(at::POSITION, &[ANYWHERE_VAR; 2]);
-        self.renew(at::GPS_BIAS, &bias_var[..2]);
+        let (place, bias): (Block<2>, Block<2>) = (own::POSITION.part(0), own::GPS_BIAS.part(0));
+        self.renew(place, &[ANYWHERE_VAR; 2]);
+        self.renew(bias, &[bias_var[0], bias_var[1]]);
         self.tie_places(1.0);
     }
 
     /// Adds `factor` times the helicopter's horizontal error to that of every target and feature.
     fn tie_places(&mut self, factor: f64) {
-        for slot in 0..self.targets.len() + self.features.len() {
-            let feature = slot.checked_sub(self.targets.len());
-            let start = match feature {
-                Some(i) if self.features[i].id.is_some() => self.feature_at(i),
-                None if self.targets[slot].held => self.target_at(slot),
-                _ => continue,
+        let layout = self.layout();
+        for (slot, place) in layout.places().enumerate() {
+            let in_use = match slot.checked_sub(layout.targets) {
+                Some(feature) => self.features[feature].id.is_some(),
+                None => self.targets[slot].life.is_held(),
             };
+            if !in_use {
+                continue;
+            }
             for axis in 0..2 {
-                let (to, from) = (start + axis, at::POSITION + axis);
+                let (to, from) = (place.column(axis), own::POSITION.column(axis));
                 self.cov.add_row_from(to, factor, from);
                 self.cov.add_column_from(to, factor, from);
-                for echo in self.echoes.iter_mut().chain([&mut self.probe]).filter(|e| e.live) {
-                    echo.cross.add_column_from(to, factor, from);
-                }
+                self.copies_in_use().for_each(|copy| copy.cross.add_column_from(to, factor, from));
             }
         }
     }

@@ -3,72 +3,92 @@
 use nalgebra::{Vector2, Vector3};
 
 use windhover_base::geo::{locate, wrap_angle};
-use windhover_base::msg::{Disposition, FusionSource, MarkerDetection, TrackStatus};
-use windhover_base::settings::TargetModel;
+use windhover_base::msg::{Disposition, FusionSource, MarkerDetection};
+use windhover_base::time::MonoTime;
 
+use super::blocks::TARGET;
 use super::core::Core;
-use super::learn::MOVING;
 use super::models::{Marker, Models};
-use super::state::{GUESSED_VAR, Own, Target, at};
-use super::track::{BLINK_S, started, started_again};
+use super::own::Own;
+use super::standstill::Standstill;
+use super::state::{GUESSED_VAR, State, Target};
+use super::track::{Certainty, Circumstances, Life, Sighting};
 
 impl Core {
     /// Starts a target from the markers of one frame: where they lie on the ground, with a wide
     /// prior that the same pixels then narrow, so that everything common with the helicopter's own
-    /// errors stands in the covariance.
-    pub(super) fn start_target(&mut self, index: usize, markers: &[MarkerDetection], before: Option<Target>) {
-        let Some((mean, heading_known)) = guess(&self.state.own, &self.models, index, markers) else {
+    /// errors stands in the covariance. One first seen before this frame is the same track, with its speed along the
+    /// heading since then.
+    pub(crate) fn start_target(
+        &mut self,
+        index: usize,
+        markers: &[MarkerDetection],
+        first: Option<Sighting>,
+    ) {
+        let Some((mut mean, heading_known)) = guess(&self.state.own, &self.models, index, markers) else {
             self.refuse(FusionSource::Marker, Disposition::Invalid);
             return;
         };
-        let start = self.state.target_at(index);
-        let moving = self.models.targets[index].model != TargetModel::Static;
-        let t = self.state.t;
-        self.state.targets[index] = match before {
-            Some(before) if moving => started_again(mean, t, &before),
-            Some(before) => Target { seen: before.seen + 1, ..started(mean, t) },
-            None => started(mean, t),
+        let (t, moves) = (self.state.t, self.models.targets[index].moves());
+        let target = &mut self.state.targets[index];
+        let life = match first {
+            Some(first) => target.life.started_again(first),
+            None => Life::started(Sighting { t, place: [mean[0], mean[1]] }),
+        };
+        if let Some(first) = first.filter(|_| moves) {
+            mean[3] = speed_since(&first, &mean, t).unwrap_or(mean[3]);
+        }
+        *target = Target {
+            mean,
+            life,
+            last_seen: t,
+            tied_since: t,
+            standstill: Standstill::MOVES,
+            ..Target::default()
         };
         self.state.learnt.target_q[index] = self.learning.start.target_q[index];
         let heading_var = if heading_known { 1.0 } else { UNKNOWN_HEADING.powi(2) };
-        let (speed_var, rate_var) = if moving { (9.0, 1.0) } else { (0.0, 0.0) };
-        self.state.renew(start, &[GUESSED_VAR, GUESSED_VAR, heading_var, speed_var, rate_var]);
+        let [speed_var, rate_var] = if moves { START_MOTION_VAR } else { [0.0; 2] };
+        let block = self.state.layout().target(index).all();
+        self.state.renew(block, &[GUESSED_VAR, GUESSED_VAR, heading_var, speed_var, rate_var]);
         self.fuse_first(index, markers);
         self.state.settle(index);
     }
 
-    /// Whether a believed track comes back into view with a heading too uncertain to linearise about.
-    pub(super) fn is_back_in_doubt(&self, index: usize) -> bool {
-        let (target, heading) = (&self.state.targets[index], self.state.target_at(index) + 2);
-        let away_s = (self.state.t - target.last_seen).s();
-        target.status != TrackStatus::Acquiring
-            && away_s > BLINK_S
-            && self.state.cov.at(heading, heading) > DOUBTFUL_HEADING.powi(2)
+    /// What a frame knows of a track beside its life.
+    pub(crate) fn circumstances(&self, index: usize) -> Circumstances {
+        let heading = self.state.layout().target(index).heading();
+        Circumstances {
+            away: self.state.t - self.state.targets[index].last_seen,
+            // A marker that cannot move is where it was, however long nobody looked.
+            lost_after: self.models.targets[index].moves().then_some(self.lost_after),
+            heading_doubtful: self.state.cov.var(heading) > DOUBTFUL_HEADING.powi(2),
+        }
     }
 
     /// A track that comes back elsewhere than expected, or as if from nowhere: place and heading are what its
     /// markers show, while speed and yaw rate are still about what they were. `false` where they show no heading.
-    pub(super) fn place_anew(&mut self, index: usize, markers: &[MarkerDetection]) -> bool {
+    pub(crate) fn place_anew(&mut self, index: usize, markers: &[MarkerDetection]) -> bool {
         let before = self.state.targets[index];
         let Some((mut mean, true)) = guess(&self.state.own, &self.models, index, markers) else {
             return false;
         };
         mean[3..].copy_from_slice(&before.mean[3..]);
-        let (s, t) = (self.state.target_at(index), self.state.t);
+        let (block, t) = (self.state.layout().target(index), self.state.t);
         let motion: [f64; 2] = std::array::from_fn(|k| {
-            self.state.cov.at(s + 3 + k, s + 3 + k) + ANEW_S * self.models.target_walks[k]
+            let column = block.motion().column(k);
+            self.state.cov.at(column, column) + ANEW_S * self.models.target_walks[k]
         });
         self.state.targets[index] = Target {
             mean,
-            placed_anew: true,
-            rejected: 0,
+            life: before.life.placed_anew(),
             last_seen: t,
-            started: t,
-            motion: MOVING,
+            tied_since: t,
+            standstill: Standstill::MOVES,
             ..before
         };
         self.state.learnt.target_q[index] = self.learning.start.target_q[index];
-        self.state.renew(s, &[GUESSED_VAR, GUESSED_VAR, 1.0, motion[0], motion[1]]);
+        self.state.renew(block.all(), &[GUESSED_VAR, GUESSED_VAR, 1.0, motion[0], motion[1]]);
         self.fuse_first(index, markers);
         self.state.settle(index);
         true
@@ -79,19 +99,42 @@ impl Core {
     fn fuse_first(&mut self, index: usize, markers: &[MarkerDetection]) {
         let mut gated = false;
         for detection in markers {
-            if let Some((t, marker)) = self.models.find(detection.marker)
-                && t == index
+            if let Some((target, marker)) = self.models.find(detection.marker)
+                && target == index
             {
-                self.fuse_marker(index, marker, detection, gated);
+                if gated {
+                    self.fuse_marker(index, marker, detection);
+                } else {
+                    self.fuse_first_marker(index, marker, detection);
+                }
                 gated = true;
             }
         }
     }
 }
 
+impl State {
+    /// What target `i` is after it was fused or started in a frame that shows it.
+    pub(crate) fn settle(&mut self, i: usize) {
+        let block = self.layout().target(i);
+        let certainty = Certainty::of(self.cov.sigma(block.heading(), 0), self.cov.sigma(block.speed(), 0));
+        self.targets[i].life = self.targets[i].life.settled(certainty);
+    }
+}
+
+/// Speed along the heading since a track was first seen; `None` where that is but a moment ago.
+fn speed_since(first: &Sighting, mean: &[f64; TARGET], t: MonoTime) -> Option<f64> {
+    let elapsed_s = (t - first.t).s();
+    let (s, c) = mean[2].sin_cos();
+    let along = (mean[0] - first.place[0]) * c + (mean[1] - first.place[1]) * s;
+    (elapsed_s > 0.01).then(|| along / elapsed_s)
+}
+
+/// Variances of speed and yaw rate at the start.
+const START_MOTION_VAR: [f64; 2] = [9.0, 1.0];
 /// How long a track that is placed anew may have driven as configured since its motion was known, s.
 const ANEW_S: f64 = 1.0;
-/// Heading sigma beyond which an update linearised about it is worth nothing, rad.
+/// Heading sigma beyond which an update linearised about it does not hold, rad.
 const DOUBTFUL_HEADING: f64 = 0.3;
 /// Heading quite unknown, one sigma of a uniform circle, rad.
 const UNKNOWN_HEADING: f64 = 1.8;
@@ -99,7 +142,7 @@ const UNKNOWN_HEADING: f64 = 1.8;
 const FARTHEST_M: f64 = 1_000.0;
 
 /// The ground point `above_m` over the ground seen at a pixel.
-pub(super) fn ground_point(
+pub(crate) fn ground_point(
     own: &Own,
     models: &Models,
     px: Vector2<f64>,
@@ -119,7 +162,7 @@ fn guess(
     models: &Models,
     index: usize,
     markers: &[MarkerDetection],
-) -> Option<([f64; at::TARGET], bool)> {
+) -> Option<([f64; TARGET], bool)> {
     let target = &models.targets[index];
     let mut first = None;
     let mut heading = None;

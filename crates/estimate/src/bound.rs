@@ -10,10 +10,11 @@ use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::MonoTime;
 
 use super::Site;
-use super::core::{AnyMeasurement, Core, Kind};
+use super::core::Core;
 use super::output::target_state;
-use super::ownship::start;
-use super::state::GRAVITY;
+use super::own::GRAVITY;
+use super::sources::{AnyMeasurement, Kind};
+use super::start::start;
 
 /// The truth at one instant.
 #[derive(Clone, PartialEq, Debug)]
@@ -84,11 +85,11 @@ impl Bound {
     /// The bound on a target's covariance at its reference point: north, east, heading, speed, yaw
     /// rate. `None` while it has not been seen.
     pub fn target(&self, target: usize) -> Option<SMatrix<f64, 5, 5>> {
-        let (state, start) = (&self.core.state, self.core.state.target_at(target));
+        let (state, block) = (&self.core.state, self.core.state.layout().target(target).all());
         let track = &state.targets[target];
-        let covariance = SMatrix::from_fn(|i, j| state.cov.at(start + i, start + j));
-        let told = target_state(&self.core.models, target, &track.mean, &covariance);
-        (state.alive && track.held).then_some(told.covariance).flatten()
+        let covariance = state.cov.block(block, block);
+        let at_reference = target_state(&self.core.models, target, &track.mean, &covariance);
+        (state.alive && track.life.is_held()).then_some(at_reference.covariance).flatten()
     }
 
     fn process(&mut self, t: MonoTime, truth: &BoundTruth) {

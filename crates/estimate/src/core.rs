@@ -1,76 +1,42 @@
 //! The filter proper: one state, one measurement after another in order of validity.
 
-use windhover_base::msg::{
-    AttitudeSample, Disposition, FrameObservations, FusionResult, FusionSource, GnssEpoch,
-};
+use windhover_base::msg::{Disposition, FusionResult, FusionSource};
 use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::{MonoTime, Span};
 
 use super::Site;
-use super::learn::{Learning, Learnt};
+use super::blocks::Layout;
+use super::fitted::{LEARN_RATIO, Learning, Learnt};
+use super::measurement::Measurement;
 use super::models::Models;
 use super::state::State;
-use super::update::{Measurement, Outcome, Workspace};
+use super::update::{Outcome, Workspace};
 
-/// Interval over which increments are looked at to learn intensities: long enough that they stand
+/// Interval over which increments are looked at to fit intensities: long enough that they stand
 /// out of the noise, short enough to be what the filter's memory sees.
 const LEARN_INTERVAL_MS: f64 = 400.0;
 
-/// A measurement of any source, in a form that is recycled.
-#[derive(Clone, Debug)]
-pub(super) struct AnyMeasurement {
-    pub(super) kind: Kind,
-    pub(super) gnss: GnssEpoch,
-    pub(super) attitude: AttitudeSample,
-    pub(super) frame: FrameObservations,
-}
-
-impl Default for AnyMeasurement {
-    /// With room for a frame, whatever it is first used for.
-    fn default() -> Self {
-        let frame = FrameObservations {
-            frame: 0,
-            markers: Vec::with_capacity(ROOM),
-            features: Vec::with_capacity(ROOM),
-        };
-        Self { kind: Kind::Nothing, gnss: GnssEpoch::default(), attitude: AttitudeSample::default(), frame }
-    }
-}
-
-/// Markers or features of a frame that fit without allocating.
-const ROOM: usize = 16;
-
-/// Which part of an [`AnyMeasurement`] counts.
-#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
-pub(super) enum Kind {
-    #[default]
-    Nothing,
-    Gnss,
-    Attitude,
-    Frame,
-}
-
 /// State, models and room for arithmetic.
 #[derive(Clone, Debug)]
-pub(super) struct Core {
-    pub(super) models: Models,
-    pub(super) learning: Learning,
-    pub(super) lost_after: Span,
-    pub(super) restart_after: u32,
+pub(crate) struct Core {
+    pub(crate) models: Models,
+    pub(crate) learning: Learning,
+    pub(crate) lost_after: Span,
+    pub(crate) restart_after: u32,
     /// How long delayed copies are kept.
-    pub(super) keep_copies: Span,
-    pub(super) state: State,
-    pub(super) work: Workspace,
-    pub(super) z: Measurement,
+    pub(crate) keep_copies: Span,
+    pub(crate) state: State,
+    pub(crate) work: Workspace,
+    pub(crate) z: Measurement,
     /// What became of measurements; filled only while `reporting`.
-    pub(super) results: Vec<FusionResult>,
-    pub(super) reporting: bool,
+    pub(crate) results: Vec<FusionResult>,
+    pub(crate) reporting: bool,
     /// For the bound: the mean is the truth, so innovations are taken as zero and nothing is gated.
-    pub(super) at_truth: bool,
+    pub(crate) at_truth: bool,
 }
 
 impl Core {
-    pub(super) fn new(rig: &Rig, estimator: &EstimatorConfig, site: &Site) -> Self {
+    pub(crate) fn new(rig: &Rig, estimator: &EstimatorConfig, site: &Site) -> Self {
         let models = Models::new(rig, estimator, site);
         let e = estimator;
         let start = Learnt {
@@ -88,10 +54,10 @@ impl Core {
             t_target: MonoTime::default(),
         };
         let lag_frames = (e.smoother_lag_ms * 1e-3 * rig.camera.fps).ceil() as usize;
-        let state =
-            State::new(rig.target.len(), e.features, (lag_frames * 3 / 2 + 6).min(MAX_ECHOES), start.clone());
+        let layout = Layout { targets: rig.target.len(), features: e.features };
+        let state = State::new(layout, (lag_frames * 3 / 2 + 6).min(MAX_COPIES), start.clone());
         Self {
-            work: Workspace::new(state.len()),
+            work: Workspace::new(layout.len()),
             z: Measurement::default(),
             models,
             learning: Learning {
@@ -110,28 +76,21 @@ impl Core {
         }
     }
 
-    /// Carries the state to `t` and fuses what was true then.
-    pub(super) fn process(&mut self, t: MonoTime, measurement: &AnyMeasurement) {
-        self.state.propagate(t, &self.models);
-        match measurement.kind {
-            Kind::Nothing => {}
-            Kind::Gnss => self.fuse_gnss(&measurement.gnss),
-            Kind::Attitude => self.fuse_attitude(&measurement.attitude),
-            Kind::Frame => self.fuse_frame(&measurement.frame),
-        }
-        self.state.learn(&self.models, &self.learning);
-    }
-
     /// Fuses what stands in `self.z` through the gate, and reports it.
-    pub(super) fn fuse_gated(&mut self, source: FusionSource) -> Outcome {
+    pub(crate) fn fuse_gated(&mut self, source: FusionSource) -> Outcome {
         let gate = (!self.at_truth).then_some(self.models.gates[self.z.m]);
         let outcome = self.fuse(gate);
         self.report(source, outcome);
         outcome
     }
 
+    /// Whether a measurement says something of the noise of good ones.
+    pub(crate) fn teaches(&self, outcome: &Outcome) -> bool {
+        self.learning.on && outcome.ratio < LEARN_RATIO
+    }
+
     /// Fuses what stands in `self.z`.
-    pub(super) fn fuse(&mut self, gate: Option<f64>) -> Outcome {
+    pub(crate) fn fuse(&mut self, gate: Option<f64>) -> Outcome {
         if self.at_truth {
             self.z.residual.fill(0.0);
         }
@@ -154,7 +113,7 @@ impl Core {
     }
 
     /// Reports a measurement that was not even tried.
-    pub(super) fn refuse(&mut self, source: FusionSource, disposition: Disposition) {
+    pub(crate) fn refuse(&mut self, source: FusionSource, disposition: Disposition) {
         if self.reporting {
             self.results.push(FusionResult {
                 t_valid: self.state.t,
@@ -169,4 +128,4 @@ impl Core {
 }
 
 /// Most delayed copies kept, whatever frame rate and lag are.
-const MAX_ECHOES: usize = 40;
+const MAX_COPIES: usize = 40;

@@ -2,64 +2,41 @@
 
 use std::collections::VecDeque;
 
-use nalgebra::Vector3;
-
 use crate::align::{History, Stamp};
 use windhover_base::geo::wrap_angle;
 use windhover_base::msg::{
-    AttitudeSample, Disposition, FrameObservations, FramePrediction, FusionResult, FusionSource, GnssEpoch,
-    Ownship, Stamped, TargetEstimate, WarmFilter,
+    AttitudeSample, Disposition, EstimatorOutput, FrameObservations, FramePrediction, FusionResult,
+    FusionSource, GnssEpoch, Stamped, WarmFilter,
 };
 use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::{MonoTime, Span};
 
 use super::Site;
-use super::core::{AnyMeasurement, Core, Kind};
-use super::ownship::start;
+use super::blocks::own;
+use super::core::Core;
+use super::sources::{AnyMeasurement, Kind};
+use super::start::start;
 use super::state::State;
-
-/// What the estimator tells.
-#[derive(Clone, PartialEq, Debug)]
-pub enum EstimatorOutput {
-    /// A target at a frame, as known when the frame had been looked at.
-    Estimate(TargetEstimate),
-    /// A target at an earlier frame, with what was measured up to the smoother's lag after it.
-    Smoothed(TargetEstimate),
-    /// The helicopter at a frame.
-    Ownship(Ownship),
-    /// What became of a measurement.
-    Fusion(FusionResult),
-    /// The receiver jumped for good: helicopter, targets and ground features moved along.
-    Anchored {
-        /// By how much, NED.
-        moved_m: Vector3<f64>,
-    },
-    /// The filter started again.
-    Reset {
-        /// Why.
-        reason: &'static str,
-    },
-}
 
 /// The joint filter with its history of measurements.
 #[derive(Clone, Debug)]
 pub struct Estimator {
-    pub(super) core: Core,
+    pub(crate) core: Core,
     history: History<AnyMeasurement, State>,
-    /// Compass readings heard before there was a state.
+    /// Compass readings that came before there was a state.
     compass: VecDeque<Stamped<AttitudeSample>>,
     /// Room to look ahead in.
     ahead: State,
     lag: Span,
     /// What the next start continues from.
     warm: Option<WarmFilter>,
-    /// Exposure time of the last frame whose smoothed estimate has been told.
+    /// Exposure time of the last frame whose smoothed estimate is out.
     smoothed_to: Option<MonoTime>,
-    /// Time of the last anchoring that has been told.
+    /// Time of the last anchoring that was reported.
     anchored: Option<MonoTime>,
 }
 
-/// Without any measurement for so long the state is worth nothing.
+/// Without any measurement for so long the state is given up.
 const SILENCE: Span = Span::from_ns(60_000_000_000);
 /// Farther ahead than this a frame is not foreseen, s.
 const FORESIGHT_S: f64 = 2.0;
@@ -116,7 +93,7 @@ impl Estimator {
             m.kind = Kind::Gnss;
             m.gnss = value;
         });
-        self.tell_smoothed(out);
+        self.emit_smoothed(out);
     }
 
     /// Takes a compass reading; `t_valid` has the configured latency taken off.
@@ -136,10 +113,10 @@ impl Estimator {
             m.kind = Kind::Attitude;
             m.attitude = value;
         });
-        self.tell_smoothed(out);
+        self.emit_smoothed(out);
     }
 
-    /// Takes what a frame showed, and tells one estimate a target and the helicopter's own state at
+    /// Takes what a frame showed, and gives one estimate a target and the helicopter's own state at
     /// the frame's exposure.
     pub fn frame(&mut self, frame: &Stamped<FrameObservations>, out: &mut Vec<EstimatorOutput>) {
         let (t, number) = (frame.t_valid, frame.value.frame);
@@ -165,22 +142,22 @@ impl Estimator {
         if taken.is_some() {
             out.push(EstimatorOutput::Ownship(state.ownship(&self.core.models, number, t)));
         }
-        self.tell_smoothed(out);
+        self.emit_smoothed(out);
     }
 
-    /// Lets time pass: tells smoothed estimates that are due, and starts again after a long silence.
+    /// Lets time pass: gives smoothed estimates that are due, and starts again after a long silence.
     pub fn tick(&mut self, now: MonoTime, out: &mut Vec<EstimatorOutput>) {
         if self.core.state.alive && now - self.core.state.t > SILENCE {
-            self.tell_smoothed_until(None, out);
+            self.emit_smoothed_until(None, out);
             self.reset("nothing was heard for a minute", out);
         } else {
-            self.tell_smoothed_until(Some(now - self.lag), out);
+            self.emit_smoothed_until(Some(now - self.lag), out);
         }
     }
 
-    /// Tells every smoothed estimate still owed: the flight is over.
+    /// Gives every smoothed estimate still owed: the flight is over.
     pub fn finish(&mut self, out: &mut Vec<EstimatorOutput>) {
-        self.tell_smoothed_until(None, out);
+        self.emit_smoothed_until(None, out);
     }
 
     /// What a frame exposed at `t` should show, into a recycled value.
@@ -202,21 +179,21 @@ impl Estimator {
     /// One line on what the filter believes of the sensors and of the intensities of motion.
     pub fn inside(&self) -> String {
         let (own, l) = (&self.core.state.own, &self.core.state.learnt);
-        let sigma = |i: usize| self.core.state.cov.at(i, i).max(0.0).sqrt();
+        let cov = &self.core.state.cov;
         let targets: Vec<String> =
             l.target_q.iter().map(|q| format!("{:.3}/{:.3}", q[0].sqrt(), q[1].sqrt())).collect();
         format!(
             "heading bias {:.2}±{:.2} deg, tilt gain {:.2}±{:.2}, tilt bias {:.2},{:.2}±{:.2} deg, delay {:.0}±{:.0} ms, \
              sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} force {:.2}/{:.2} targets {} pixels {:.2?} {:.2}",
             own.heading_bias.to_degrees(),
-            sigma(super::state::at::HEADING_BIAS).to_degrees(),
+            cov.sigma(own::HEADING_BIAS, 0).to_degrees(),
             own.tilt_gain,
-            sigma(super::state::at::TILT_GAIN),
+            cov.sigma(own::TILT_GAIN, 0),
             own.tilt_bias.x.to_degrees(),
             own.tilt_bias.y.to_degrees(),
-            sigma(super::state::at::TILT_BIAS).to_degrees(),
+            cov.sigma(own::TILT_BIAS, 0).to_degrees(),
             own.gps_delay_s * 1e3,
-            sigma(super::state::at::GPS_DELAY) * 1e3,
+            cov.sigma(own::GPS_DELAY, 0) * 1e3,
             l.heading_var.sqrt().to_degrees(),
             l.tilt_var.sqrt().to_degrees(),
             l.tilt_rate_q.sqrt(),
@@ -277,7 +254,7 @@ impl Estimator {
         }
         out.extend(self.core.results.drain(..).map(EstimatorOutput::Fusion));
         if let Some((t, moved_m)) = self.core.state.anchored
-            && self.anchored.is_none_or(|told| t > told)
+            && self.anchored.is_none_or(|reported| t > reported)
         {
             self.anchored = Some(t);
             out.push(EstimatorOutput::Anchored { moved_m });
@@ -302,33 +279,29 @@ impl Estimator {
         let core = &mut self.core;
         core.state.alive = false;
         core.state.own = Default::default();
-        core.state.targets.fill(Default::default());
-        core.state.features.fill(Default::default());
-        core.state.echoes.iter_mut().for_each(|echo| echo.live = false);
-        core.state.probe.live = false;
-        core.state.cov.fill(0.0);
+        core.state.clear();
         self.compass.clear();
         let t = core.state.t;
         self.history.restart(t, |_| {});
         out.push(EstimatorOutput::Reset { reason });
     }
 
-    fn tell_smoothed(&mut self, out: &mut Vec<EstimatorOutput>) {
-        self.tell_smoothed_until(Some(self.core.state.t - self.lag), out);
+    fn emit_smoothed(&mut self, out: &mut Vec<EstimatorOutput>) {
+        self.emit_smoothed_until(Some(self.core.state.t - self.lag), out);
     }
 
-    /// Tells the smoothed estimates of frames exposed no later than `until` (all of them for `None`)
-    /// that have not been told yet, in their order.
-    fn tell_smoothed_until(&mut self, until: Option<MonoTime>, out: &mut Vec<EstimatorOutput>) {
+    /// Gives the smoothed estimates of frames exposed no later than `until` (all of them for `None`)
+    /// that are not out yet, in their order.
+    fn emit_smoothed_until(&mut self, until: Option<MonoTime>, out: &mut Vec<EstimatorOutput>) {
         loop {
-            let told = self.smoothed_to;
-            let due = |t: MonoTime| until.is_none_or(|u| t <= u) && told.is_none_or(|s| t > s);
-            let echoes = self.core.state.echoes.iter().filter(|e| e.live && due(e.t));
-            let Some(echo) = echoes.min_by_key(|e| e.t) else { return };
+            let last = self.smoothed_to;
+            let due = |t: MonoTime| until.is_none_or(|u| t <= u) && last.is_none_or(|s| t > s);
+            let copies = self.core.state.copies.iter().filter(|copy| copy.in_use && due(copy.t));
+            let Some(copy) = copies.min_by_key(|copy| copy.t) else { return };
             for target in 0..self.core.state.targets.len() {
-                out.push(EstimatorOutput::Smoothed(echo.estimate(&self.core.models, target)));
+                out.push(EstimatorOutput::Smoothed(copy.estimate(&self.core.models, target)));
             }
-            self.smoothed_to = Some(echo.t);
+            self.smoothed_to = Some(copy.t);
         }
     }
 

@@ -4,102 +4,28 @@
 //! ([`Omitted`]); a derivative that differs anywhere else, or by more than the bound, fails. Seeds are the
 //! loop's own numbers and stand in every message.
 
-use std::sync::Arc;
-
 use nalgebra::{DMatrix, Matrix2, Rotation3, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::core::Core;
-use super::state::{GRAVITY, State, at};
-use super::vision::{target_point, view};
-use super::*;
-use windhover_base::geo::{Geodetic, Ground, Terrain, Tile, ned_from_body_321};
-use windhover_base::msg::{AttitudeSample, FeatureTrack, FixKind, GnssEpoch, MarkerDetection, TrackStatus};
-use windhover_base::settings::{EstimatorConfig, Rig};
-use windhover_base::time::{MonoTime, Span};
+use windhover_base::geo::{Ground, Tilt};
+use windhover_base::msg::{AttitudeSample, FixKind, GnssEpoch, MarkerDetection};
+use windhover_base::time::Span;
 
-/// A car with a tag and a disc, a rover, a tag on the ground; lever arms, lens and mount as crooked as a real one's.
-const RIG: &str = r#"
-[gps]
-device = "/dev/ttyS0"
-baud = 38400
-antenna_position_m = [0.4, -0.3, -0.6]
-[compass]
-device = "/dev/ttyS1"
-baud = 38400
-format = "tcm2"
-angles = "euler321"
-declination_deg = 0.0
-[camera]
-device = "/dev/video0"
-width = 1280
-height = 1024
-fps = 15.0
-[camera.intrinsics]
-fx = 1020.0
-fy = 1000.0
-cx = 640.0
-cy = 512.0
-distortion = [-0.2, 0.1, 0.001, -0.002, 0.0]
-[camera.mount]
-image_top = "forward"
-position_m = [0.2, 0.1, 0.3]
-roll_deg = 2.0
-pitch_deg = -3.0
-yaw_deg = 4.0
-[[target]]
-name = "car"
-model = "ackermann"
-wheelbase_m = 1.2
-[[target.marker]]
-kind = "apriltag"
-family = "36h11"
-id = 0
-size_m = 0.48
-yaw_deg = 20.0
-position_m = [0.8, -0.2, -0.5]
-[[target.marker]]
-kind = "disc"
-brightness = "dark"
-diameter_m = 0.2
-position_m = [-0.3, 0.2, -0.4]
-[[target]]
-name = "rover"
-model = "unicycle"
-[[target.marker]]
-kind = "apriltag"
-family = "36h11"
-id = 2
-size_m = 0.48
-position_m = [0.0, 0.0, -0.3]
-[[target]]
-name = "point"
-model = "static"
-[[target.marker]]
-kind = "apriltag"
-family = "36h11"
-id = 7
-size_m = 0.48
-position_m = [0.0, 0.0, 0.0]
-"#;
+use super::aid::feature::FeaturePixel;
+use super::aid::pixel::{target_point, view};
+use super::aid::{compass, gnss};
+use super::blocks::{Block, own};
+use super::core::Core;
+
+use scene::{difference, most, moved, random_core, slope};
+
+mod scene;
 
 /// Random states each derivative is taken at.
 const STATES: u64 = 40;
 /// Step of the differences, in each state's own unit.
 const STEP: f64 = 1e-4;
-
-/// Most of what is drawn below: the bounds of [`Omitted`] are made of these.
-mod most {
-    pub(super) const SPEED: f64 = 8.0;
-    pub(super) const RATE: f64 = 1.0;
-    pub(super) const FORCE: f64 = super::GRAVITY + 3.0;
-    pub(super) const DELAY_S: f64 = 0.15;
-    pub(super) const DRAG: f64 = 0.4;
-    pub(super) const ARM: f64 = 0.8;
-    /// Longest step of the prediction, s.
-    pub(super) const DT: f64 = 0.05;
-}
 
 /// Columns in which a derivative is left out, and the most that any of their entries is.
 struct Omitted {
@@ -111,116 +37,6 @@ struct Omitted {
 }
 
 const ALL_ROWS: std::ops::Range<usize> = 0..usize::MAX;
-
-fn three(first: usize) -> std::ops::Range<usize> {
-    first..first + 3
-}
-
-fn site(ground: Ground) -> Site {
-    Site { frame: frame(), ground, declination_rad: 0.0 }
-}
-
-fn frame() -> LocalFrame {
-    LocalFrame::new(Geodetic { lat_deg: 47.0, lon_deg: 8.0, height_m: 0.0 })
-}
-
-/// A slope that falls by some 8 % to the north and rises by 5 % to the east.
-fn slope() -> Ground {
-    let (step_deg, frame) = (0.01, frame());
-    let height = |row: usize, column: usize| {
-        let place = Geodetic {
-            lat_deg: 47.01 - step_deg * row as f64,
-            lon_deg: 7.99 + step_deg * column as f64,
-            height_m: 0.0,
-        };
-        let ned = frame.ned(place);
-        (-0.08 * ned.x + 0.05 * ned.y) as f32
-    };
-    let heights = (0..9).map(|i| height(i / 3, i % 3)).collect();
-    let tile = Tile::new((47.01, 7.99), [step_deg; 2], (3, 3), heights).expect("a whole tile");
-    Ground::Terrain(Arc::new(Terrain::new(Arc::new(tile), &frame, 0.0)))
-}
-
-/// A filter in a random state over its targets, which all lie in view; without covariance, so that fusing moves nothing.
-fn random_core(seed: u64, ground: Ground) -> Core {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let rig: Rig = toml::from_str(RIG).expect("the rig is valid");
-    let mut core = Core::new(&rig, &EstimatorConfig::default(), &site(ground));
-    let mut within = |most: f64| rng.random_range(-most..most);
-    let mut vector = |most: f64| Vector3::new(within(most), within(most), within(most));
-    let state = &mut core.state;
-    state.alive = true;
-    state.t = MonoTime::from_ns(1_000_000_000_000);
-    let own = &mut state.own;
-    own.position = vector(20.0);
-    own.velocity = vector(most::SPEED / 3f64.sqrt());
-    own.rate = vector(most::RATE / 3f64.sqrt());
-    own.force = Vector3::new(0.0, 0.0, -GRAVITY) + vector(3.0 / 3f64.sqrt());
-    own.gps_bias = vector(2.0);
-    own.heading_bias = within(0.1);
-    own.tilt_gain = 0.6 + within(0.5);
-    own.tilt_bias = Vector2::new(within(0.02), within(0.02));
-    own.gps_delay_s = within(most::DELAY_S);
-    own.drag_per_s = 0.2 + within(0.2);
-    own.ned_from_body = ned_from_body_321(within(3.1), within(0.2), within(0.2));
-    own.position.z = core.models.ground.down_m(own.position.x, own.position.y) - 12.0 + within(4.0);
-    let below = own.position;
-    for target in &mut state.targets {
-        target.held = true;
-        target.status = TrackStatus::Tracking;
-        target.seen = 100;
-        target.last_seen = state.t;
-        target.mean = [below.x + within(2.0), below.y + within(2.0), within(3.1), within(8.0), within(1.5)];
-    }
-    for (id, feature) in state.features.iter_mut().enumerate() {
-        feature.id = Some(id as u64);
-        feature.mean = [below.x + within(2.0), below.y + within(2.0)];
-    }
-    core
-}
-
-/// The state moved by a step along one column.
-fn moved(core: &Core, column: usize, by: f64) -> Core {
-    let mut core = core.clone();
-    let mut dx = vec![0.0; core.state.len()];
-    dx[column] = by;
-    core.state.inject(&dx);
-    core
-}
-
-/// The error state that leads from `from` to `to`: what `inject` would have to be given.
-fn difference(to: &State, from: &State) -> Vec<f64> {
-    let mut dx = vec![0.0; to.len()];
-    let (a, b) = (&to.own, &from.own);
-    let turn = (a.ned_from_body * b.ned_from_body.inverse()).scaled_axis();
-    let vectors = [
-        (at::POSITION, a.position - b.position),
-        (at::VELOCITY, a.velocity - b.velocity),
-        (at::ATTITUDE, turn),
-        (at::RATE, a.rate - b.rate),
-        (at::FORCE, a.force - b.force),
-        (at::GPS_BIAS, a.gps_bias - b.gps_bias),
-    ];
-    for (first, vector) in vectors {
-        dx[first..first + 3].copy_from_slice(vector.as_slice());
-    }
-    dx[at::HEADING_BIAS] = a.heading_bias - b.heading_bias;
-    dx[at::TILT_GAIN] = a.tilt_gain - b.tilt_gain;
-    dx[at::TILT_BIAS..at::TILT_BIAS + 2].copy_from_slice((a.tilt_bias - b.tilt_bias).as_slice());
-    dx[at::GPS_DELAY] = a.gps_delay_s - b.gps_delay_s;
-    dx[at::DRAG] = a.drag_per_s - b.drag_per_s;
-    for i in 0..to.targets.len() {
-        for k in 0..at::TARGET {
-            dx[to.target_at(i) + k] = to.targets[i].mean[k] - from.targets[i].mean[k];
-        }
-    }
-    for i in 0..to.features.len() {
-        for k in 0..at::FEATURE {
-            dx[to.feature_at(i) + k] = to.features[i].mean[k] - from.features[i].mean[k];
-        }
-    }
-    dx
-}
 
 /// Holds a linear model against differences: `got` rows by state columns.
 fn compare(
@@ -251,19 +67,19 @@ fn compare(
 /// F of one step of `dt` seconds, read off what it does to the covariance of a delayed copy with the present state: to
 /// each row `e_j` of the copy's it applies `Fᵀ`.
 fn transition(core: &Core, dt_s: f64) -> DMatrix<f64> {
-    let n = core.state.len();
+    let n = core.state.layout().len();
     let mut state = core.state.clone();
-    let rows = state.echoes[0].cross.rows();
+    let rows = state.copies[0].cross.rows();
     let mut f = DMatrix::zeros(n, n);
     for first in (0..n).step_by(rows) {
         state.copy_from(&core.state);
-        let copy = &mut state.echoes[0];
-        copy.live = true;
+        let copy = &mut state.copies[0];
+        copy.in_use = true;
         copy.cross.fill(0.0);
         (0..rows.min(n - first)).for_each(|i| copy.cross.set(i, first + i, 1.0));
         state.propagate(state.t + Span::from_s(dt_s), &core.models);
         for i in 0..rows.min(n - first) {
-            for (row, value) in state.echoes[0].cross.row(i).iter().enumerate() {
+            for (row, value) in state.copies[0].cross.row(i).iter().enumerate() {
                 f[(row, first + i)] = *value;
             }
         }
@@ -272,7 +88,7 @@ fn transition(core: &Core, dt_s: f64) -> DMatrix<f64> {
 }
 
 fn transition_by_differences(core: &Core, dt_s: f64) -> DMatrix<f64> {
-    let n = core.state.len();
+    let n = core.state.layout().len();
     let mut f = DMatrix::zeros(n, n);
     for column in 0..n {
         let after = |by: f64| {
@@ -292,8 +108,8 @@ fn motion_of_helicopter_targets_and_features() {
     // R exp(ω dt) moves by R J_r(ω dt) dω dt; the right Jacobian J_r is taken as one.
     let right_jacobian = Omitted {
         term: "right Jacobian of the turn in a step",
-        rows: three(at::ATTITUDE),
-        columns: three(at::RATE),
+        rows: own::ATTITUDE.range(),
+        columns: own::RATE.range(),
         at_most: 0.5 * most::RATE * most::DT * most::DT,
     };
     for seed in 0..STATES {
@@ -309,7 +125,7 @@ fn motion_of_helicopter_targets_and_features() {
 fn covariance_and_delayed_copies_move_by_the_same_f() {
     for seed in 0..STATES {
         let mut core = random_core(seed, Ground::Flat { down_m: 0.0 });
-        let (n, dt_s) = (core.state.len(), 0.04);
+        let (n, dt_s) = (core.state.layout().len(), 0.04);
         let f = transition(&core, dt_s);
         let after = |core: &Core| {
             let mut state = core.state.clone();
@@ -319,10 +135,8 @@ fn covariance_and_delayed_copies_move_by_the_same_f() {
         let mut rng = ChaCha8Rng::seed_from_u64(1_000 + seed);
         let root = DMatrix::from_fn(n, n, |_, _| rng.random_range(-0.3..0.3));
         let p = &root * root.transpose();
-        // Intensities of a car's yaw rate depend on the variance of its speed: the same with and without P.
-        for i in 0..core.state.targets.len() {
-            core.models.targets[i].max_curvature = None;
-        }
+        // A car's yaw rate walks as the variance of its speed allows: a rover's does with and without P.
+        core.models.targets[0].motion = core.models.targets[1].motion.clone();
         let noise = after(&core);
         (0..n).for_each(|i| (0..n).for_each(|j| core.state.cov.set(i, j, p[(i, j)])));
         compare("covariance", seed, &(after(&core) - noise), &(&f * p * f.transpose()), &[], 1e-9);
@@ -332,16 +146,16 @@ fn covariance_and_delayed_copies_move_by_the_same_f() {
 /// A measurement's H and residual: what stands in the workspace after it was fused.
 fn measured(core: &mut Core, fuse: &dyn Fn(&mut Core)) -> (DMatrix<f64>, Vec<f64>) {
     fuse(core);
-    let (n, z) = (core.state.len(), &core.z);
-    let h = DMatrix::from_fn(z.m, n, |component, column| z.derivative_by(component, column));
+    let (n, z) = (core.state.layout().len(), &core.z);
+    let h = DMatrix::from_fn(z.m, n, |component, column| z.derivative(component, column));
     (h, z.residual[..z.m].to_vec())
 }
 
 fn check_measurement(what: &str, seed: u64, core: &Core, omitted: &[Omitted], fuse: &dyn Fn(&mut Core)) {
     let (h, residual) = measured(&mut core.clone(), fuse);
     assert!(!residual.is_empty(), "{what}, seed {seed}: nothing was fused");
-    let mut wanted = DMatrix::zeros(residual.len(), core.state.len());
-    for column in 0..core.state.len() {
+    let mut wanted = DMatrix::zeros(residual.len(), core.state.layout().len());
+    for column in 0..core.state.layout().len() {
         let (_, more) = measured(&mut moved(core, column, STEP), fuse);
         let (_, less) = measured(&mut moved(core, column, -STEP), fuse);
         for row in 0..residual.len() {
@@ -360,24 +174,19 @@ fn gps_position() {
     let omitted = [
         Omitted {
             term: "½ τ² ∂a/∂v",
-            columns: three(at::VELOCITY),
+            columns: own::VELOCITY.range(),
             rows: ALL_ROWS,
             at_most: half_tau2 * DRAG,
         },
         Omitted {
             term: "τ and ½ τ² of attitude",
-            columns: three(at::ATTITUDE),
+            columns: own::ATTITUDE.range(),
             rows: ALL_ROWS,
             at_most: DELAY_S * RATE * ARM + half_tau2 * FORCE,
         },
-        Omitted { term: "τ R l×", columns: three(at::RATE), rows: ALL_ROWS, at_most: DELAY_S * ARM },
-        Omitted { term: "½ τ² R", columns: three(at::FORCE), rows: ALL_ROWS, at_most: half_tau2 },
-        Omitted {
-            term: "½ τ² v",
-            columns: at::DRAG..at::DRAG + 1,
-            rows: ALL_ROWS,
-            at_most: half_tau2 * SPEED,
-        },
+        Omitted { term: "τ R l×", columns: own::RATE.range(), rows: ALL_ROWS, at_most: DELAY_S * ARM },
+        Omitted { term: "½ τ² R", columns: own::FORCE.range(), rows: ALL_ROWS, at_most: half_tau2 },
+        Omitted { term: "½ τ² v", columns: own::DRAG.range(), rows: ALL_ROWS, at_most: half_tau2 * SPEED },
     ];
     let epoch = GnssEpoch {
         fix: FixKind::ThreeD,
@@ -389,7 +198,7 @@ fn gps_position() {
     };
     for seed in 0..STATES {
         let core = random_core(seed, Ground::Flat { down_m: 0.0 });
-        check_measurement("GPS position", seed, &core, &omitted, &|core| core.fuse_gnss(&epoch));
+        check_measurement("GPS position", seed, &core, &omitted, &|core| gnss::fuse(core, &epoch));
     }
 }
 
@@ -398,7 +207,7 @@ fn gps_velocity() {
     use most::{DELAY_S, DRAG};
     // Beside one: with a velocity known to 0.05 m/s, 3 mm/s.
     let omitted =
-        [Omitted { term: "τ c", columns: three(at::VELOCITY), rows: ALL_ROWS, at_most: DELAY_S * DRAG }];
+        [Omitted { term: "τ c", columns: own::VELOCITY.range(), rows: ALL_ROWS, at_most: DELAY_S * DRAG }];
     let epoch = GnssEpoch {
         fix: FixKind::ThreeD,
         vel_ned_mps: Some(Vector3::new(1.0, 2.0, 0.5)),
@@ -407,19 +216,19 @@ fn gps_velocity() {
     };
     for seed in 0..STATES {
         let core = random_core(seed, Ground::Flat { down_m: 0.0 });
-        check_measurement("GPS velocity", seed, &core, &omitted, &|core| core.fuse_gnss(&epoch));
+        check_measurement("GPS velocity", seed, &core, &omitted, &|core| gnss::fuse(core, &epoch));
     }
 }
 
 #[test]
 fn compass_heading_and_tilt() {
-    let tilt = Some(windhover_base::geo::Tilt { pitch: 0.02, roll: -0.05 });
+    let tilt = Some(Tilt { pitch: 0.02, roll: -0.05 });
     for seed in 0..STATES {
         let core = random_core(seed, Ground::Flat { down_m: 0.0 });
         let heading = AttitudeSample { heading: Some(1.0), heading_is_true: true, tilt: None };
-        check_measurement("heading", seed, &core, &[], &|core| core.fuse_attitude(&heading));
+        check_measurement("heading", seed, &core, &[], &|core| compass::fuse(core, &heading));
         let tilt = AttitudeSample { heading: None, heading_is_true: true, tilt };
-        check_measurement("tilt", seed, &core, &[], &|core| core.fuse_attitude(&tilt));
+        check_measurement("tilt", seed, &core, &[], &|core| compass::fuse(core, &tilt));
     }
 }
 
@@ -442,7 +251,7 @@ fn tag_corners_discs_and_features() {
     // Pixels per metre; the ground's slope is 8 %.
     let slope_of_a_cell = Omitted {
         term: "slope is that over a cell, not at the point",
-        columns: at::OWN..usize::MAX,
+        columns: own::LEN..usize::MAX,
         rows: ALL_ROWS,
         at_most: 1e-3,
     };
@@ -456,11 +265,13 @@ fn tag_corners_discs_and_features() {
             {
                 let seen = detection(&core, target, marker);
                 check_measurement(what, seed, &core, omitted, &|core| {
-                    core.fuse_marker(target, marker, &seen, true);
+                    core.fuse_marker(target, marker, &seen);
                 });
             }
-            let track = FeatureTrack { id: 3, px: Vector2::new(640.0, 512.0), sigma_px: 1.0 };
-            check_measurement("feature", seed, &core, omitted, &|core| core.fuse_feature(3, &track, true));
+            let pixel = FeaturePixel { slot: 3, px: Vector2::new(640.0, 512.0), sigma_px: 1.0 };
+            check_measurement("feature", seed, &core, omitted, &|core| {
+                pixel.fuse(core);
+            });
         }
     }
 }
@@ -468,27 +279,30 @@ fn tag_corners_discs_and_features() {
 /// Turning helicopter, velocity and everything seen about the vertical changes no pixel, whatever was fused before:
 /// the covariance is carried along so that no heading comes of it (`State::keep_heading_unobserved`).
 #[test]
-fn nothing_seen_tells_absolute_heading() {
+fn nothing_seen_shows_absolute_heading() {
     for seed in 0..STATES {
         let core = random_core(seed, Ground::Flat { down_m: 0.0 });
         let state = &core.state;
-        let mut turn = vec![0.0; state.len()];
-        let mut put = |first: usize, north: f64, east: f64| (turn[first], turn[first + 1]) = (-east, north);
-        put(at::POSITION, state.own.position.x, state.own.position.y);
-        put(at::VELOCITY, state.own.velocity.x, state.own.velocity.y);
+        let mut turn = vec![0.0; state.layout().len()];
+        let layout = state.layout();
+        let mut put = |place: Block<2>, north: f64, east: f64| {
+            turn[place.range()].copy_from_slice(&[-east, north]);
+        };
+        put(own::POSITION.part(0), state.own.position.x, state.own.position.y);
+        put(own::VELOCITY.part(0), state.own.velocity.x, state.own.velocity.y);
         for (i, target) in state.targets.iter().enumerate() {
-            put(state.target_at(i), target.mean[0], target.mean[1]);
+            put(layout.target(i).place(), target.mean[0], target.mean[1]);
         }
         for (i, feature) in state.features.iter().enumerate() {
-            put(state.feature_at(i), feature.mean[0], feature.mean[1]);
+            put(layout.feature(i), feature.mean[0], feature.mean[1]);
         }
-        turn[at::ATTITUDE + 2] = 1.0;
-        (0..state.targets.len()).for_each(|i| turn[state.target_at(i) + 2] = 1.0);
+        turn[own::TURN.column(0)] = 1.0;
+        (0..layout.targets).for_each(|i| turn[layout.target(i).heading().column(0)] = 1.0);
         let turn = nalgebra::DVector::from(turn);
         for target in 0..state.targets.len() {
             let seen = detection(&core, target, 0);
             let (h, _) = measured(&mut core.clone(), &|core| {
-                core.fuse_marker(target, 0, &seen, true);
+                core.fuse_marker(target, 0, &seen);
             });
             let pixels = (h * &turn).amax();
             assert!(pixels < 1e-8, "seed {seed}, target {target}: {pixels} px per radian");
@@ -501,14 +315,14 @@ fn nothing_seen_tells_absolute_heading() {
 fn delayed_copies_are_fused_like_states() {
     for seed in 0..STATES {
         let mut core = random_core(seed, Ground::Flat { down_m: 0.0 });
-        let n = core.state.len();
-        let copied = core.state.echoes[0].mean.len();
+        let n = core.state.layout().len();
+        let copied = core.state.copies[0].mean.len();
         let mut rng = ChaCha8Rng::seed_from_u64(2_000 + seed);
         let root = DMatrix::from_fn(n + copied, n + copied, |_, _| rng.random_range(-0.05..0.05));
         let p = &root * root.transpose();
         (0..n).for_each(|i| (0..n).for_each(|j| core.state.cov.set(i, j, p[(i, j)])));
-        let copy = &mut core.state.echoes[0];
-        copy.live = true;
+        let copy = &mut core.state.copies[0];
+        copy.in_use = true;
         for i in 0..copied {
             (0..n).for_each(|j| copy.cross.set(i, j, p[(n + i, j)]));
             (0..copied).for_each(|j| copy.cov.set(i, j, p[(n + i, n + j)]));
@@ -523,18 +337,18 @@ fn delayed_copies_are_fused_like_states() {
         }));
         let z = {
             let mut twin = core.clone();
-            twin.fuse_marker(target, marker, &seen, true);
+            twin.fuse_marker(target, marker, &seen);
             twin.z.clone()
         };
-        core.state.echoes.truncate(1);
-        let h = DMatrix::from_fn(z.m, n + copied, |i, j| if j < n { z.derivative_by(i, j) } else { 0.0 });
+        core.state.copies.truncate(1);
+        let h = DMatrix::from_fn(z.m, n + copied, |i, j| if j < n { z.derivative(i, j) } else { 0.0 });
         let r = DMatrix::from_fn(z.m, z.m, |i, j| z.noise[i][j]);
         let s = &h * &p * h.transpose() + r;
         let gain = &p * h.transpose() * s.try_inverse().expect("positive definite");
         let step = &gain * nalgebra::DVector::from_column_slice(&z.residual[..z.m]);
         let left = &p - &gain * &h * &p;
-        core.fuse_marker(target, marker, &seen, true);
-        let copy = &core.state.echoes[0];
+        core.fuse_marker(target, marker, &seen);
+        let copy = &core.state.copies[0];
         for i in 0..copied {
             assert!((copy.mean[i] - step[n + i]).abs() < 1e-6, "seed {seed}: mean {i}");
             for j in 0..copied {
@@ -554,7 +368,7 @@ fn attitude_errors_are_turns_about_the_axes_of_ned() {
     for seed in 0..STATES {
         let core = random_core(seed, Ground::Flat { down_m: 0.0 });
         for axis in 0..3 {
-            let turned = moved(&core, at::ATTITUDE + axis, 0.3).state.own.ned_from_body;
+            let turned = moved(&core, own::ATTITUDE.column(axis), 0.3).state.own.ned_from_body;
             let about =
                 Rotation3::from_axis_angle(&nalgebra::Unit::new_normalize(Vector3::ith(axis, 1.0)), 0.3);
             let wanted = about * core.state.own.ned_from_body;

@@ -2,32 +2,42 @@
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 pub mod align;
+mod aid;
 mod anchor;
 mod begin;
+mod blocks;
 mod bound;
 mod core;
+mod delayed;
 mod filter;
+mod fitted;
+mod frame;
 mod learn;
+mod learn_vehicle;
 mod matrix;
+mod measurement;
 mod models;
 mod motion;
 mod output;
-mod ownship;
+mod own;
 mod paper;
+mod resume;
 mod shape;
+mod sources;
+mod standstill;
+mod start;
 mod state;
 mod track;
 mod update;
-mod vision;
-mod warm;
 #[cfg(test)]
 mod jacobians;
 #[cfg(test)]
 mod tests;
 
 pub use bound::{Bound, BoundTruth};
-pub use filter::{Estimator, EstimatorOutput};
+pub use filter::Estimator;
 pub use paper::PaperEstimator;
+pub use windhover_base::msg::EstimatorOutput;
 
 use windhover_base::geo::{Ground, LocalFrame};
 

@@ -2,54 +2,115 @@
 
 #![expect(clippy::needless_range_loop, reason = "matrix arithmetic reads by its indices")]
 
+use nalgebra::SMatrix;
+
+use super::blocks::Block;
+
 /// Rows of equal length in one block.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Grid {
+pub(crate) struct Grid {
     cols: usize,
     data: Vec<f64>,
 }
 
 impl Grid {
-    pub(super) fn zeros(rows: usize, cols: usize) -> Self {
+    pub(crate) fn zeros(rows: usize, cols: usize) -> Self {
         Self { cols, data: vec![0.0; rows * cols] }
     }
 
-    pub(super) fn rows(&self) -> usize {
+    pub(crate) fn rows(&self) -> usize {
         self.data.len().checked_div(self.cols).unwrap_or(0)
     }
 
-    pub(super) fn row(&self, i: usize) -> &[f64] {
+    pub(crate) fn row(&self, i: usize) -> &[f64] {
         &self.data[i * self.cols..(i + 1) * self.cols]
     }
 
-    pub(super) fn row_mut(&mut self, i: usize) -> &mut [f64] {
+    pub(crate) fn row_mut(&mut self, i: usize) -> &mut [f64] {
         &mut self.data[i * self.cols..(i + 1) * self.cols]
     }
 
-    pub(super) fn at(&self, i: usize, j: usize) -> f64 {
+    pub(crate) fn at(&self, i: usize, j: usize) -> f64 {
         self.data[i * self.cols + j]
     }
 
-    pub(super) fn add(&mut self, i: usize, j: usize, value: f64) {
+    pub(crate) fn add(&mut self, i: usize, j: usize, value: f64) {
         self.data[i * self.cols + j] += value;
     }
 
-    pub(super) fn set(&mut self, i: usize, j: usize, value: f64) {
+    pub(crate) fn set(&mut self, i: usize, j: usize, value: f64) {
         self.data[i * self.cols + j] = value;
     }
 
-    pub(super) fn fill(&mut self, value: f64) {
+    /// Variance of one state.
+    pub(crate) fn var(&self, state: Block<1>) -> f64 {
+        self.at(state.column(0), state.column(0))
+    }
+
+    /// Standard deviation of component `i` of a block.
+    pub(crate) fn sigma<const N: usize>(&self, block: Block<N>, i: usize) -> f64 {
+        self.at(block.column(i), block.column(i)).max(0.0).sqrt()
+    }
+
+    /// What stands in the rows of one block and the columns of another.
+    pub(crate) fn block<const N: usize, const M: usize>(
+        &self,
+        rows: Block<N>,
+        columns: Block<M>,
+    ) -> SMatrix<f64, N, M> {
+        SMatrix::from_fn(|i, j| self.at(rows.column(i), columns.column(j)))
+    }
+
+    /// Adds to a block's own part.
+    pub(crate) fn add_square<const N: usize>(&mut self, block: Block<N>, value: &SMatrix<f64, N, N>) {
+        for i in 0..N {
+            for j in 0..N {
+                self.add(block.column(i), block.column(j), value[(i, j)]);
+            }
+        }
+    }
+
+    /// Adds to a block's diagonal.
+    pub(crate) fn add_diagonal<const N: usize>(&mut self, block: Block<N>, value: &[f64; N]) {
+        for (i, value) in value.iter().enumerate() {
+            self.add(block.column(i), block.column(i), *value);
+        }
+    }
+
+    /// Adds to the part that two blocks have in common, on both sides of the diagonal.
+    pub(crate) fn add_mixed<const N: usize, const M: usize>(
+        &mut self,
+        rows: Block<N>,
+        columns: Block<M>,
+        value: &SMatrix<f64, N, M>,
+    ) {
+        for i in 0..N {
+            for j in 0..M {
+                self.add(rows.column(i), columns.column(j), value[(i, j)]);
+                self.add(columns.column(j), rows.column(i), value[(i, j)]);
+            }
+        }
+    }
+
+    /// Sets a block's diagonal.
+    pub(crate) fn set_diagonal<const N: usize>(&mut self, block: Block<N>, value: &[f64; N]) {
+        for (i, value) in value.iter().enumerate() {
+            self.set(block.column(i), block.column(i), *value);
+        }
+    }
+
+    pub(crate) fn fill(&mut self, value: f64) {
         self.data.fill(value);
     }
 
     /// `row[to] += a row[from]`, `from` before `to`.
-    pub(super) fn add_row(&mut self, to: usize, a: f64, from: usize) {
+    pub(crate) fn add_row(&mut self, to: usize, a: f64, from: usize) {
         let (head, tail) = self.data.split_at_mut(to * self.cols);
         axpy(&mut tail[..self.cols], a, &head[from * self.cols..(from + 1) * self.cols]);
     }
 
     /// `row[to] += a row[from]`, whichever comes first.
-    pub(super) fn add_row_from(&mut self, to: usize, a: f64, from: usize) {
+    pub(crate) fn add_row_from(&mut self, to: usize, a: f64, from: usize) {
         let (low, high) = (to.min(from), to.max(from));
         let (head, tail) = self.data.split_at_mut(high * self.cols);
         let (low, high) = (&mut head[low * self.cols..][..self.cols], &mut tail[..self.cols]);
@@ -57,20 +118,20 @@ impl Grid {
     }
 
     /// `column[to] += a column[from]`
-    pub(super) fn add_column_from(&mut self, to: usize, a: f64, from: usize) {
+    pub(crate) fn add_column_from(&mut self, to: usize, a: f64, from: usize) {
         for row in self.data.chunks_exact_mut(self.cols) {
             row[to] += a * row[from];
         }
     }
 
     /// Copies without allocating where the sizes match.
-    pub(super) fn copy_from(&mut self, other: &Self) {
+    pub(crate) fn copy_from(&mut self, other: &Self) {
         self.cols = other.cols;
         self.data.clone_from(&other.data);
     }
 
     /// Transposes a square grid in place.
-    pub(super) fn transpose(&mut self) {
+    pub(crate) fn transpose(&mut self) {
         for i in 0..self.cols {
             for j in 0..i {
                 self.data.swap(i * self.cols + j, j * self.cols + i);
@@ -78,32 +139,37 @@ impl Grid {
         }
     }
 
-    /// Forgets everything about `len` states from `start`: their rows and columns of a square grid.
-    pub(super) fn forget(&mut self, start: usize, len: usize) {
-        for i in start..start + len {
+    /// Forgets everything about some states: their rows and columns of a square grid.
+    pub(crate) fn forget<const N: usize>(&mut self, block: Block<N>) {
+        for i in block.range() {
             self.row_mut(i).fill(0.0);
         }
+        self.forget_columns(block);
+    }
+
+    /// Sets columns to zero.
+    pub(crate) fn forget_columns<const N: usize>(&mut self, block: Block<N>) {
         for i in 0..self.rows() {
-            self.row_mut(i)[start..start + len].fill(0.0);
+            self.row_mut(i)[block.range()].fill(0.0);
         }
     }
 }
 
 /// `y += a x`
-pub(super) fn axpy(y: &mut [f64], a: f64, x: &[f64]) {
+pub(crate) fn axpy(y: &mut [f64], a: f64, x: &[f64]) {
     for (y, x) in y.iter_mut().zip(x) {
         *y += a * x;
     }
 }
 
 /// Most components of one measurement.
-pub(super) const MAX_MEASURED: usize = 8;
+pub(crate) const MAX_MEASURED: usize = 8;
 
 /// A small square matrix.
-pub(super) type Small = [[f64; MAX_MEASURED]; MAX_MEASURED];
+pub(crate) type Small = [[f64; MAX_MEASURED]; MAX_MEASURED];
 
 /// Lower Cholesky factor in place of the leading `m` rows; `false` where not positive definite.
-pub(super) fn cholesky(s: &mut Small, m: usize) -> bool {
+pub(crate) fn cholesky(s: &mut Small, m: usize) -> bool {
     for i in 0..m {
         for j in 0..=i {
             let mut sum = s[i][j];
@@ -124,7 +190,7 @@ pub(super) fn cholesky(s: &mut Small, m: usize) -> bool {
 }
 
 /// Solves `L y = b` in place.
-pub(super) fn forward(l: &Small, m: usize, b: &mut [f64; MAX_MEASURED]) {
+pub(crate) fn forward(l: &Small, m: usize, b: &mut [f64; MAX_MEASURED]) {
     for i in 0..m {
         for k in 0..i {
             b[i] -= l[i][k] * b[k];
@@ -135,7 +201,7 @@ pub(super) fn forward(l: &Small, m: usize, b: &mut [f64; MAX_MEASURED]) {
 
 /// The value that a chi-square variable of `m` degrees stays below with probability `p`, by the
 /// Wilson–Hilferty approximation (good to 1 % here).
-pub(super) fn chi_square_quantile(p: f64, m: usize) -> f64 {
+pub(crate) fn chi_square_quantile(p: f64, m: usize) -> f64 {
     let k = 2.0 / (9.0 * m as f64);
     m as f64 * (1.0 - k + normal_quantile(p) * k.sqrt()).powi(3)
 }

@@ -8,91 +8,86 @@ use windhover_base::settings::{EstimatorConfig, MarkerConfig, MarkerKind, Rig, T
 
 use super::Site;
 use super::matrix::chi_square_quantile;
+use super::motion::Motion;
 
 /// Correlation times.
 #[derive(Clone, Debug)]
-pub(super) struct Taus {
-    pub(super) rate_s: f64,
-    pub(super) force_s: f64,
-    pub(super) gps_bias_s: f64,
-}
-
-/// Intensities of the walks that are not learnt, units²/s.
-#[derive(Clone, Debug)]
-pub(super) struct Walks {
-    pub(super) velocity_q: f64,
-    pub(super) heading_bias_q: f64,
-    pub(super) tilt_gain_q: f64,
-    pub(super) tilt_bias_q: f64,
-    pub(super) gps_delay_q: f64,
-    pub(super) slip_q: f64,
+pub(crate) struct Taus {
+    pub(crate) rate_s: f64,
+    pub(crate) force_s: f64,
+    pub(crate) gps_bias_s: f64,
 }
 
 /// A marker in its vehicle's frame.
 #[derive(Clone, Debug)]
-pub(super) struct Marker {
-    pub(super) id: MarkerId,
+pub(crate) struct Marker {
+    pub(crate) id: MarkerId,
     /// Centre, forward-right-down, m.
-    pub(super) center: Vector3<f64>,
+    pub(crate) center: Vector3<f64>,
     /// A tag's corners in the order of [`windhover_base::msg::MarkerDetection::corners_px`].
-    pub(super) corners: Option<[Vector3<f64>; 4]>,
+    pub(crate) corners: Option<[Vector3<f64>; 4]>,
     /// Edge or diameter, m.
-    pub(super) size_m: f64,
+    pub(crate) size_m: f64,
     /// Where a tag's top points in the vehicle frame, rad.
-    pub(super) yaw: f64,
+    pub(crate) yaw: f64,
 }
 
 /// A target as configured.
 #[derive(Clone, Debug)]
-pub(super) struct TargetModels {
-    pub(super) model: TargetModel,
-    pub(super) reference_m: f64,
-    /// 1/m, of the tightest turn; `None` where the target may turn on the spot.
-    pub(super) max_curvature: Option<f64>,
-    pub(super) markers: Vec<Marker>,
+pub(crate) struct TargetModels {
+    /// As configured: the paper's estimator takes one kind only.
+    pub(crate) kind: TargetModel,
+    pub(crate) motion: Motion,
+    pub(crate) reference_m: f64,
+    pub(crate) markers: Vec<Marker>,
     /// Around the middle of its markers, what the vehicle may cover, m.
-    pub(super) radius_m: f64,
+    pub(crate) radius_m: f64,
+}
+
+impl TargetModels {
+    /// Whether it moves at all.
+    pub(crate) fn moves(&self) -> bool {
+        self.motion.model().moves()
+    }
 }
 
 /// Everything the filter computes with.
 #[derive(Clone, Debug)]
-pub(super) struct Models {
-    pub(super) frame: LocalFrame,
-    pub(super) ground: Ground,
-    pub(super) camera: CameraModel,
-    pub(super) image_px: (f64, f64),
-    pub(super) camera_from_body: Matrix3<f64>,
-    pub(super) camera_at: Vector3<f64>,
-    pub(super) antenna_at: Vector3<f64>,
-    pub(super) convention: TiltConvention,
-    pub(super) declination: f64,
-    pub(super) yaw_offset: f64,
-    pub(super) pitch_offset: f64,
-    pub(super) roll_offset: f64,
-    pub(super) gps_bias_var: Vector3<f64>,
-    pub(super) gps_noise_var: f64,
-    pub(super) gps_velocity_var: f64,
-    pub(super) gps_delay_var: f64,
-    pub(super) heading_bias_var: f64,
-    pub(super) tau: Taus,
-    pub(super) walk: Walks,
+pub(crate) struct Models {
+    pub(crate) frame: LocalFrame,
+    pub(crate) ground: Ground,
+    pub(crate) camera: CameraModel,
+    pub(crate) image_px: (f64, f64),
+    pub(crate) camera_from_body: Matrix3<f64>,
+    pub(crate) camera_at: Vector3<f64>,
+    pub(crate) antenna_at: Vector3<f64>,
+    pub(crate) convention: TiltConvention,
+    pub(crate) declination: f64,
+    pub(crate) yaw_offset: f64,
+    pub(crate) pitch_offset: f64,
+    pub(crate) roll_offset: f64,
+    pub(crate) gps_bias_var: Vector3<f64>,
+    pub(crate) gps_noise_var: f64,
+    pub(crate) gps_velocity_var: f64,
+    pub(crate) gps_delay_var: f64,
+    pub(crate) heading_bias_var: f64,
+    pub(crate) tau: Taus,
+    /// Intensity of a side slip, m²/s.
+    pub(crate) slip_q: f64,
     /// Intensities of a target's speed and yaw rate walks as configured.
-    pub(super) target_walks: [f64; 2],
-    pub(super) targets: Vec<TargetModels>,
-    pub(super) marker_var_px2: f64,
-    pub(super) feature_factor2: f64,
+    pub(crate) target_walks: [f64; 2],
+    pub(crate) targets: Vec<TargetModels>,
+    pub(crate) marker_var_px2: f64,
+    pub(crate) feature_factor2: f64,
     /// Chi-square gate by number of components.
-    pub(super) gates: [f64; 9],
+    pub(crate) gates: [f64; 9],
 }
-
-/// Steepest wheel angle of a car-like vehicle, rad: 40° is at the upper end of what is built.
-const MAX_STEER: f64 = 0.7;
 
 /// GPS height errs about twice as much as position: satellites are only above.
 const GPS_DOWN_FACTOR: f64 = 2.0;
 
 impl Models {
-    pub(super) fn new(rig: &Rig, estimator: &EstimatorConfig, site: &Site) -> Self {
+    pub(crate) fn new(rig: &Rig, estimator: &EstimatorConfig, site: &Site) -> Self {
         let Rig { gps, compass, camera, target } = rig;
         let mount = &camera.mount;
         let across = gps.bias_sigma_m.powi(2);
@@ -119,14 +114,7 @@ impl Models {
             gps_delay_var: (gps.latency_sigma_ms * 1e-3).powi(2),
             heading_bias_var: compass.heading_bias_sigma_deg.to_radians().powi(2),
             tau: Taus { rate_s: RATE_TAU_S, force_s: estimator.force_tau_s, gps_bias_s: gps.bias_tau_s },
-            walk: Walks {
-                velocity_q: VELOCITY_WALK.powi(2),
-                heading_bias_q: HEADING_BIAS_WALK.powi(2),
-                tilt_gain_q: TILT_GAIN_WALK.powi(2),
-                tilt_bias_q: TILT_BIAS_WALK.powi(2),
-                gps_delay_q: GPS_DELAY_WALK.powi(2),
-                slip_q: estimator.target_slip_walk.powi(2),
-            },
+            slip_q: estimator.target_slip_walk.powi(2),
             target_walks: [estimator.target_speed_walk.powi(2), estimator.target_yaw_rate_walk.powi(2)],
             targets: target.iter().enumerate().map(|(i, t)| target_models(i, t)).collect(),
             marker_var_px2: estimator.marker_noise_px.powi(2),
@@ -136,7 +124,7 @@ impl Models {
     }
 
     /// Which marker of which target a detection is of.
-    pub(super) fn find(&self, id: MarkerId) -> Option<(usize, usize)> {
+    pub(crate) fn find(&self, id: MarkerId) -> Option<(usize, usize)> {
         self.targets
             .iter()
             .enumerate()
@@ -146,28 +134,15 @@ impl Models {
 
 /// Correlation time of the helicopter's angular rate, s: a rotor's body answers within a second.
 const RATE_TAU_S: f64 = 1.0;
-/// Gusts and vibration straight into velocity, m/s per √s.
-const VELOCITY_WALK: f64 = 0.02;
-/// Wander of the compass's heading bias, rad per √s (a tenth of a degree over 100 s is 2e-4).
-const HEADING_BIAS_WALK: f64 = 3e-4;
-/// Wander of the share of tilt the compass reads, per √s.
-const TILT_GAIN_WALK: f64 = 0.005;
-/// Wander of the tilt bias, rad per √s.
-const TILT_BIAS_WALK: f64 = 3e-4;
-/// Wander of the GPS delay, s per √s.
-const GPS_DELAY_WALK: f64 = 2e-4;
-
 fn target_models(index: usize, config: &TargetConfig) -> TargetModels {
     let markers: Vec<Marker> =
         config.marker.iter().enumerate().map(|(m, marker)| marker_model(index, m, marker)).collect();
     let wheelbase = config.wheelbase_m.unwrap_or(0.0);
     let reach = markers.iter().map(|m| m.center.xy().norm() + m.size_m).fold(wheelbase, f64::max);
-    let max_curvature =
-        (config.model == TargetModel::Ackermann && wheelbase > 0.0).then(|| MAX_STEER.tan() / wheelbase);
     TargetModels {
-        model: config.model,
+        kind: config.model,
+        motion: Motion::new(config),
         reference_m: config.reference_m,
-        max_curvature,
         markers,
         radius_m: reach + 0.5,
     }

@@ -1,4 +1,4 @@
-//! From the state to what is told: reference point, covariance, geodetic position, expectation of a
+//! From the state to estimates: reference point, covariance, geodetic position, expectation of a
 //! frame.
 
 use nalgebra::{SMatrix, UnitQuaternion, Vector2, Vector3};
@@ -9,13 +9,15 @@ use windhover_base::msg::{
 };
 use windhover_base::time::MonoTime;
 
+use super::aid::pixel::{PointView, target_point, view};
+use super::blocks::{TARGET, TargetBlock, own};
+use super::delayed::DelayedCopy;
 use super::matrix::Grid;
 use super::models::Models;
-use super::state::{Echo, State, at};
-use super::vision::{target_point, view};
+use super::state::State;
 
 /// State and covariance at the reference point, `reference_m` ahead of the rear axle.
-pub(super) fn target_state(
+pub(crate) fn target_state(
     models: &Models,
     target: usize,
     mean: &[f64],
@@ -41,26 +43,28 @@ pub(super) fn target_state(
     }
 }
 
-fn block(cov: &Grid, start: usize) -> SMatrix<f64, 5, 5> {
-    SMatrix::from_fn(|i, j| 0.5 * (cov.at(start + i, start + j) + cov.at(start + j, start + i)))
+/// A target's own part of a covariance, made symmetric.
+fn symmetric(cov: &Grid, at: TargetBlock) -> SMatrix<f64, TARGET, TARGET> {
+    let block = cov.block(at.all(), at.all());
+    SMatrix::from_fn(|i, j| 0.5 * (block[(i, j)] + block[(j, i)]))
 }
 
 impl State {
     /// The estimate of a target at a frame, from the present state.
-    pub(super) fn estimate(&self, models: &Models, target: usize, frame: u32, t: MonoTime) -> TargetEstimate {
+    pub(crate) fn estimate(&self, models: &Models, target: usize, frame: u32, t: MonoTime) -> TargetEstimate {
         let track = &self.targets[target];
-        let known = self.alive && track.held && track.status != TrackStatus::Lost;
-        let status = if known { track.status } else { TrackStatus::Lost };
-        let state = known
-            .then(|| target_state(models, target, &track.mean, &block(&self.cov, self.target_at(target))));
+        let status = if self.alive { track.life.status() } else { TrackStatus::Lost };
+        let covariance = || symmetric(&self.cov, self.layout().target(target));
+        let state =
+            (status != TrackStatus::Lost).then(|| target_state(models, target, &track.mean, &covariance()));
         TargetEstimate { t_valid: t, frame, target, status, state }
     }
 
     /// The helicopter at a frame.
-    pub(super) fn ownship(&self, models: &Models, frame: u32, t: MonoTime) -> Ownship {
+    pub(crate) fn ownship(&self, models: &Models, frame: u32, t: MonoTime) -> Ownship {
         let own = &self.own;
         let place = models.frame.geodetic(&own.position);
-        let sigma = |first: usize| Vector3::from_fn(|i, _| self.cov.at(first + i, first + i).max(0.0).sqrt());
+        let sigma = |block| Vector3::from_fn(|i, _| self.cov.sigma(block, i));
         Ownship {
             t_valid: t,
             frame,
@@ -70,20 +74,20 @@ impl State {
             lat_deg: place.lat_deg,
             lon_deg: place.lon_deg,
             height_m: place.height_m,
-            position_sigma_m: sigma(at::POSITION),
-            attitude_sigma_rad: sigma(at::ATTITUDE),
+            position_sigma_m: sigma(own::POSITION),
+            attitude_sigma_rad: sigma(own::ATTITUDE),
         }
     }
 
     /// What a frame taken about now should show.
-    pub(super) fn expect(&self, models: &Models, expected: &mut FramePrediction) {
+    pub(crate) fn expect(&self, models: &Models, expected: &mut FramePrediction) {
         let camera = self.own.position + self.own.ned_from_body * models.camera_at;
         let height = models.ground.down_m(camera.x, camera.y) - camera.z;
-        let height_sigma = self.cov.at(at::POSITION + 2, at::POSITION + 2).max(0.0).sqrt();
+        let height_sigma = self.cov.sigma(own::POSITION, 2);
         expected.size_range_px = size_range(models, height, height_sigma);
-        let held = |t: &super::state::Target| t.held && t.status != TrackStatus::Lost;
-        expected.search = self.targets.iter().any(|t| !(held(t) && t.status == TrackStatus::Tracking));
-        for (i, target) in self.targets.iter().enumerate().filter(|(_, t)| held(t)) {
+        expected.search = self.targets.iter().any(|t| t.life.status() != TrackStatus::Tracking);
+        let known = |t: &super::state::Target| t.life.status() != TrackStatus::Lost;
+        for (i, target) in self.targets.iter().enumerate().filter(|(_, t)| known(t)) {
             let model = &models.targets[i];
             let (middle, _) = target_point(&target.mean, models, &middle_of(model));
             let scale = models.camera.fx / (middle - camera).norm().max(0.5);
@@ -113,15 +117,10 @@ impl State {
     }
 
     /// One-sigma of a marker's pixel (larger axis): `√λ(H P Hᵀ)`.
-    fn pixel_sigma(
-        &self,
-        target: usize,
-        models: &Models,
-        world: &Vector3<f64>,
-        seen: &super::vision::PointView,
-    ) -> f64 {
-        let s = self.target_at(target);
-        let index = [0, 1, 2, 6, 7, 8, s, s + 1, s + 2];
+    fn pixel_sigma(&self, target: usize, models: &Models, world: &Vector3<f64>, seen: &PointView) -> f64 {
+        let pose = self.layout().target(target).pose();
+        let blocks = [own::POSITION, own::ATTITUDE, pose];
+        let column = |i: usize| blocks[i / 3].column(i % 3);
         let mean = &self.targets[target].mean;
         let lever = Vector3::new(mean[1] - world.y, world.x - mean[0], 0.0);
         let [slope_n, slope_e] = models.ground.slope(mean[0], mean[1]);
@@ -131,21 +130,21 @@ impl State {
         h.set_column(6, &(seen.d_point * Vector3::new(1.0, 0.0, slope_n)));
         h.set_column(7, &(seen.d_point * Vector3::new(0.0, 1.0, slope_e)));
         h.set_column(8, &(seen.d_point * lever));
-        let p = SMatrix::<f64, 9, 9>::from_fn(|i, j| self.cov.at(index[i], index[j]));
+        let p = SMatrix::<f64, 9, 9>::from_fn(|i, j| self.cov.at(column(i), column(j)));
         let s: nalgebra::Matrix2<f64> = h * p * h.transpose();
         let (mean, half) = (0.5 * s.trace(), 0.5 * (s[(0, 0)] - s[(1, 1)]));
         (mean + half.hypot(s[(0, 1)])).max(0.0).sqrt()
     }
 }
 
-impl Echo {
+impl DelayedCopy {
     /// The smoothed estimate of a target.
-    pub(super) fn estimate(&self, models: &Models, target: usize) -> TargetEstimate {
+    pub(crate) fn estimate(&self, models: &Models, target: usize) -> TargetEstimate {
         let status = self.status[target];
-        let start = at::TARGET * target;
-        let state = (status != TrackStatus::Lost).then(|| {
-            target_state(models, target, &self.mean[start..start + at::TARGET], &block(&self.cov, start))
-        });
+        let at = TargetBlock::alone(target);
+        let mean = &self.mean[at.all().range()];
+        let state = (status != TrackStatus::Lost)
+            .then(|| target_state(models, target, mean, &symmetric(&self.cov, at)));
         TargetEstimate { t_valid: self.t, frame: self.frame, target, status, state }
     }
 }

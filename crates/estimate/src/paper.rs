@@ -1,11 +1,14 @@
-//! The paper's estimator (20)–(34), corrected (geometry.md): each frame alone, no memory but the frame
-//! before. It is kept to compare with.
+//! The paper's estimator, its equations (20)–(34) corrected: each frame alone, no memory but the frame before. It is
+//! kept to compare with.
+//!
+//! The paper, wherever it is cited here: "Unmanned Ground Vehicle State Estimation using an Unmanned Air Vehicle"
+//! (Center for Intelligent Machines and Robotics, University of Florida).
 //!
 //! Helicopter: the latest fix carried on by its own velocity, the latest compass reading. The first two
 //! markers of the configuration that are seen are put on the ground at their height; heading runs from
 //! the rear one to the front one; velocity is the difference of their midpoint to the frame before;
 //! `v = ẋ cos ψ + ẏ sin ψ`, `ω = (−ẋ sin ψ + ẏ cos ψ)/a` (34), with the midpoint a metres ahead of the
-//! rear axle.
+//! rear axle. As printed, (27) and (28) have the midpoint behind the axle, which turns the sign of ω.
 
 use nalgebra::{Rotation3, Vector2, Vector3};
 
@@ -17,8 +20,8 @@ use windhover_base::settings::{EstimatorConfig, Rig, TargetModel};
 use windhover_base::time::MonoTime;
 
 use super::Site;
+use super::aid::compass::true_heading;
 use super::models::Models;
-use super::ownship::true_heading;
 
 /// Shortest lever with which (34) gives a yaw rate, m; below it the heading's difference does.
 const SHORTEST_LEVER_M: f64 = 0.1;
@@ -114,7 +117,7 @@ impl PaperEstimator {
     /// The first two markers of the target that are seen, on the ground.
     fn pair(&self, target: usize, frame: &Stamped<FrameObservations>) -> Option<Pair> {
         let model = &self.models.targets[target];
-        if model.model != TargetModel::Ackermann {
+        if model.kind != TargetModel::Ackermann {
             return None;
         }
         let mut seen = model.markers.iter().enumerate().filter_map(|(index, marker)| {

@@ -1,20 +1,20 @@
-//! What a tag tells of its own pixels: four corners are eight numbers, of which place, heading and range explain
+//! What a tag shows of its own pixels: four corners are eight numbers, of which place, heading and range explain
 //! four. What is left over is noise, whatever the vehicle does.
 
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
-use super::update::Measurement;
+use super::measurement::Measurement;
 
 /// Unknowns of a rigid tag on the ground as seen from a helicopter of known attitude: north, east, heading, height.
 const RIGID: usize = 4;
 
 /// Components of a tag's innovation that no motion explains.
-pub(super) const LEFT: usize = 8 - RIGID;
+pub(crate) const LEFT: usize = 8 - RIGID;
 
 /// `min over x of (r − A x)ᵀ R⁻¹ (r − A x)`: the innovation of a tag's corners less what a shift of the tag, a turn or
-/// another range explains, chi-square with [`LEFT`] degrees where the noise is as told. `rigid` are the columns of `z`
-/// of these unknowns. `None` where the noise or the geometry is singular.
-pub(super) fn left_over(z: &Measurement, rigid: [usize; RIGID]) -> Option<f64> {
+/// another range explains, chi-square with [`LEFT`] degrees where the noise is as assumed. `rigid` are the columns of the
+/// error state of these unknowns. `None` where the noise or the geometry is singular.
+pub(crate) fn left_over(z: &Measurement, rigid: &[usize; RIGID]) -> Option<f64> {
     let mut information = SMatrix::<f64, RIGID, RIGID>::zeros();
     let mut seen = SVector::<f64, RIGID>::zeros();
     let mut squared = 0.0;
@@ -33,25 +33,24 @@ pub(super) fn left_over(z: &Measurement, rigid: [usize; RIGID]) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::blocks::Block;
     use super::*;
 
     /// A tag of 40 px seen from above at 1000 px to the unit and 10 m: corners off by `residual`, sigma 0.1 px.
     fn tag(residual: [f64; 8]) -> (Measurement, [usize; RIGID]) {
         let mut z = Measurement::default();
         z.begin(8);
-        let first = z.columns(0, RIGID);
+        let columns = z.touch(Block::<RIGID>::FIRST);
         for (i, (x, y)) in
             [(-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0)].into_iter().enumerate()
         {
             for (r, row) in [[100.0, 0.0, -y, x / 10.0], [0.0, 100.0, x, y / 10.0]].into_iter().enumerate() {
                 z.residual[2 * i + r] = residual[2 * i + r];
                 z.noise[2 * i + r][2 * i + r] = 0.01;
-                for (k, value) in row.into_iter().enumerate() {
-                    z.set(2 * i + r, first + k, value);
-                }
+                z.set(2 * i + r, columns, &nalgebra::RowVector4::from(row));
             }
         }
-        (z, std::array::from_fn(|k| first + k))
+        (z, std::array::from_fn(|k| Block::<RIGID>::FIRST.column(k)))
     }
 
     #[test]
@@ -63,7 +62,7 @@ mod tests {
             [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0],
         ] {
             let (z, rigid) = tag(residual);
-            assert!(left_over(&z, rigid).expect("regular") < 1e-9, "{residual:?}");
+            assert!(left_over(&z, &rigid).expect("regular") < 1e-9, "{residual:?}");
         }
     }
 
@@ -73,14 +72,14 @@ mod tests {
         let mut residual = [0.0; 8];
         residual[4] = 1.0;
         let (z, rigid) = tag(residual);
-        let left = left_over(&z, rigid).expect("regular");
+        let left = left_over(&z, &rigid).expect("regular");
         assert!((left - 50.0).abs() < 1e-6, "{left}");
     }
 
     #[test]
-    fn a_singular_tag_tells_nothing() {
+    fn a_singular_tag_shows_nothing() {
         let (mut z, rigid) = tag([1.0; 8]);
         z.scale_noise(0.0);
-        assert_eq!(left_over(&z, rigid), None);
+        assert_eq!(left_over(&z, &rigid), None);
     }
 }

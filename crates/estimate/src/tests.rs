@@ -3,9 +3,11 @@
 
 use nalgebra::{Matrix2, Vector3};
 
+use super::aid::pixel::{target_point, view};
+use super::blocks::{TARGET, own};
 use super::models::Models;
-use super::state::{Own, State, at};
-use super::vision::{target_point, view};
+use super::own::Own;
+use super::state::State;
 use super::*;
 use windhover_base::geo::{Geodetic, Tilt};
 use windhover_base::msg::{
@@ -96,7 +98,7 @@ impl Scene {
         Self { filter, models: Models::new(&rig, &estimator, &site), step: 0, rover: [-2.0, -3.0, 0.0] }
     }
 
-    fn truth(&self, target: usize) -> [f64; at::TARGET] {
+    fn truth(&self, target: usize) -> [f64; TARGET] {
         let t_s = f64::from(self.step) / 15.0;
         let [north, east, turned] = self.rover;
         match target {
@@ -158,8 +160,8 @@ impl Scene {
         out
     }
 
-    /// What is told of a target.
-    fn told(out: &[EstimatorOutput], target: usize) -> Vec<TargetEstimate> {
+    /// The estimates of a target.
+    fn estimates(out: &[EstimatorOutput], target: usize) -> Vec<TargetEstimate> {
         let of = |o: &EstimatorOutput| match o {
             EstimatorOutput::Estimate(e) if e.target == target => Some(*e),
             _ => None,
@@ -170,7 +172,7 @@ impl Scene {
     /// Every target is tracked where it is and as it moves.
     fn assert_right(&self, out: &[EstimatorOutput], after: &str) {
         for target in 0..3 {
-            let last = *Self::told(out, target).last().expect("frames were heard");
+            let last = *Self::estimates(out, target).last().expect("frames were taken");
             assert_eq!(last.status, TrackStatus::Tracking, "{after}: {last:?}");
             let state = last.state.expect("it is tracked");
             // The last frame was one step ago.
@@ -197,7 +199,7 @@ fn three_kinds_of_targets_at_once() {
     let mut scene = Scene::new();
     let out = scene.hear(60);
     scene.assert_right(&out, "the start");
-    let point = Scene::told(&out, 2).last().and_then(|e| e.state).expect("it is tracked");
+    let point = Scene::estimates(&out, 2).last().and_then(|e| e.state).expect("it is tracked");
     assert!(
         point.speed_mps == 0.0 && point.yaw_rate_radps == 0.0,
         "a static target has no motion: {point:?}"
@@ -211,13 +213,13 @@ fn numbers_gone_wrong_reset_the_filter_which_says_so_and_goes_on() {
         ("a velocity that is no number", |s| s.own.velocity.x = f64::NAN),
         ("an infinite bias", |s| s.own.gps_bias.y = f64::INFINITY),
         ("a position beyond reason", |s| s.own.position.x = 1e7),
-        ("a variance below zero", |s| s.cov.set(at::ATTITUDE, at::ATTITUDE, -1.0)),
-        ("a variance that is no number", |s| s.cov.set(at::DRAG, at::DRAG, f64::NAN)),
+        ("a variance below zero", |s| s.cov.set_diagonal(own::ATTITUDE, &[-1.0; 3])),
+        ("a variance that is no number", |s| s.cov.set_diagonal(own::DRAG, &[f64::NAN])),
         ("the first target's heading", |s| s.targets[0].mean[2] = f64::NAN),
         ("the second target's speed", |s| s.targets[1].mean[3] = f64::NEG_INFINITY),
         ("the third target's variance", |s| {
-            let place = s.target_at(2);
-            s.cov.set(place, place, f64::NAN);
+            let place = s.layout().target(2).place();
+            s.cov.set_diagonal(place, &[f64::NAN; 2]);
         }),
     ];
     let mut scene = Scene::new();
@@ -226,7 +228,7 @@ fn numbers_gone_wrong_reset_the_filter_which_says_so_and_goes_on() {
         poison(&mut scene.filter.core.state);
         let out = scene.hear(60);
         assert_eq!(resets(&out), 1, "{what}");
-        for estimate in (0..3).flat_map(|target| Scene::told(&out, target)) {
+        for estimate in (0..3).flat_map(|target| Scene::estimates(&out, target)) {
             let finite = estimate.state.is_none_or(|s| {
                 s.north_m.is_finite() && s.covariance.is_some_and(|p| p.iter().all(|x| x.is_finite()))
             });
@@ -243,7 +245,7 @@ fn a_vehicle_that_comes_back_elsewhere_is_placed_anew_and_never_lost() {
     // Carried a metre and turned while nobody could see: no motion explains it.
     scene.rover = [-1.2, -2.4, 1.0];
     let out = scene.hear(30);
-    let statuses: Vec<_> = Scene::told(&out, 1).iter().map(|e| e.status).collect();
+    let statuses: Vec<_> = Scene::estimates(&out, 1).iter().map(|e| e.status).collect();
     assert!(statuses.iter().all(|s| *s == TrackStatus::Tracking), "{statuses:?}");
     scene.assert_right(&out, "being carried");
     assert_eq!(resets(&out), 0);

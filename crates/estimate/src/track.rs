@@ -1,71 +1,298 @@
-//! What the filter holds of a track, with hysteresis.
+//! A track's life: from a target never seen to one that is tracked, out of sight, and lost.
+//!
+//! | from | what happens | to |
+//! |---|---|---|
+//! | any | the filter starts ([`State::clear`](super::state::State::clear)) | unknown |
+//! | unknown, lost | its markers are seen | started (1 frame) |
+//! | started | seen again: started afresh, speed from where it was first seen | started (one more), acquiring from the sixth |
+//! | acquiring | accepted, in the eighth frame or later, and settled | tracking |
+//! | started, acquiring | not seen for a second | the same, missing: reported as lost |
+//! | started, acquiring, missing | seen | the same, not missing |
+//! | tracking, coasting | fused, and in doubt ([`Certainty::Doubtful`]) | acquiring |
+//! | tracking | not seen for longer than a blink | coasting |
+//! | coasting | fused, not in doubt | tracking |
+//! | any held | not seen for `lost_after_s` (never of a target that cannot move) | lost |
+//! | acquiring, tracking, coasting | refused: all markers outside the gate | the same, counted |
+//! | acquiring | refused twice in a row | started anew (1 frame) |
+//! | tracking, coasting | refused too often in a row ([`Life::verdict`]) | placed anew: the same, unconfirmed |
+//! | placed anew | refused twice in a row | started anew (1 frame) |
+//! | placed anew | accepted | confirmed |
+//!
+//! A track whose heading has become doubtful out of sight is placed anew at once when it is seen
+//! ([`Life::on_sight`]). Whether a vehicle stands is another matter: `standstill.rs`.
 
 use windhover_base::msg::TrackStatus;
-use windhover_base::time::MonoTime;
+use windhover_base::time::{MonoTime, Span};
 
-use super::learn::MOVING;
-use super::state::{State, Target, at};
-
+/// Frames at first, each of which starts the track afresh: only then is its speed known well enough
+/// to linearise about. A speed taken as zero would forbid the sideways motion that a heading not yet
+/// known gives to a moving vehicle, and pass that off as knowledge of heading.
+const FRAMES_TO_START: u32 = 6;
 /// Frames a new track must be seen in before it is believed.
 const FRAMES_TO_TRACK: u32 = FRAMES_TO_START + 2;
+/// Frames in a row outside the gate after which a track that is not believed is given up.
+const DOUBTED_REFUSALS: u32 = 2;
 /// Heading sigma below which a track settles, and above which it is in doubt again, rad.
 const SETTLED_HEADING: (f64, f64) = (0.25, 0.8);
 /// Speed sigma likewise, m/s.
 const SETTLED_SPEED: (f64, f64) = (1.0, 2.5);
 /// Not seen for no longer than this is still tracking: one frame missed is no event, s.
-pub(super) const BLINK_S: f64 = 0.15;
+pub(crate) const BLINK_S: f64 = 0.15;
 /// A track not yet believed that is not seen for so long was none, s.
-pub(super) const DOUBTFUL_S: f64 = 1.0;
+const MISSING_S: f64 = 1.0;
 
-/// Frames at first, each of which starts the track afresh: only then is its speed known well enough
-/// to linearise about. A speed taken as zero would forbid the sideways motion that a heading not yet
-/// known gives to a moving vehicle, and pass that off as knowledge of heading.
-pub(super) const FRAMES_TO_START: u32 = 6;
-
-/// A track just started.
-pub(super) fn started(mean: [f64; at::TARGET], t: MonoTime) -> Target {
-    let first_seen = (t, [mean[0], mean[1]]);
-    Target {
-        held: true,
-        mean,
-        status: TrackStatus::Acquiring,
-        last_seen: t,
-        seen: 1,
-        rejected: 0,
-        motion: MOVING,
-        placed_anew: false,
-        memory_s: [0.0; 2],
-        fitted_memory_s: [0.0; 2],
-        started: t,
-        first_seen,
-    }
+/// When and where (north, east) a track was first seen.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(crate) struct Sighting {
+    pub(crate) t: MonoTime,
+    pub(crate) place: [f64; 2],
 }
 
-/// The same track started afresh with its speed along the heading since it was first seen.
-pub(super) fn started_again(mut mean: [f64; at::TARGET], t: MonoTime, before: &Target) -> Target {
-    let (first, place) = before.first_seen;
-    let elapsed_s = (t - first).s();
-    if elapsed_s > 0.01 {
-        let (s, c) = mean[2].sin_cos();
-        mean[3] = ((mean[0] - place[0]) * c + (mean[1] - place[1]) * s) / elapsed_s;
-    }
-    Target { mean, seen: before.seen + 1, first_seen: before.first_seen, ..started(mean, t) }
+/// What the latest frames say of a track that is fused.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub(crate) struct Evidence {
+    /// Frames in a row in which its markers lay outside the gate.
+    refused: u32,
+    /// Whether its place was read off its markers anew, and nothing has confirmed it since.
+    unconfirmed: bool,
 }
 
-impl State {
-    /// Status of target `i` in a frame that shows it.
-    pub(super) fn settle(&mut self, i: usize) {
-        let s = self.target_at(i);
-        let heading = self.cov.at(s + 2, s + 2).max(0.0).sqrt();
-        let speed = self.cov.at(s + 3, s + 3).max(0.0).sqrt();
-        let target = &mut self.targets[i];
-        let settled = heading < SETTLED_HEADING.0 && speed < SETTLED_SPEED.0;
-        let doubtful = heading > SETTLED_HEADING.1 || speed > SETTLED_SPEED.1;
-        let lasting = target.status == TrackStatus::Tracking || target.status == TrackStatus::Coasting;
-        target.status = if target.seen >= FRAMES_TO_TRACK && (settled || (lasting && !doubtful)) {
-            TrackStatus::Tracking
+/// Where a track is in its life.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub(crate) enum Life {
+    /// Not seen since the filter started.
+    #[default]
+    Unknown,
+    /// Started afresh by each frame that shows it.
+    Started { frames: u32, first: Sighting, missing: bool },
+    /// Fused, not yet (or no longer) believed.
+    Acquiring { frames: u32, evidence: Evidence, missing: bool },
+    /// Believed, and seen but a moment ago.
+    Tracking(Evidence),
+    /// Believed, and predicted out of sight.
+    Coasting(Evidence),
+    /// Out of sight for too long: its prediction is no longer an estimate.
+    Lost,
+}
+
+/// What a frame that shows a track does with it.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(crate) enum OnSight {
+    /// Starts it, as one never seen.
+    Start,
+    /// Starts it afresh, as the track first seen then and there.
+    StartAgain(Sighting),
+    /// Reads its place off its markers, or fuses them where they show no heading.
+    PlaceAnew,
+    /// Fuses its markers.
+    Fuse,
+}
+
+/// What becomes of a track whose markers were all refused.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) enum Verdict {
+    /// It goes on.
+    Keep,
+    /// It is elsewhere: its place is read off its markers, or it is started where they show no heading.
+    PlaceAnew,
+    /// It is started as one never seen.
+    Start,
+}
+
+/// How well heading and speed of a track are known.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) enum Certainty {
+    Settled,
+    Between,
+    Doubtful,
+}
+
+impl Certainty {
+    /// By the sigmas of heading (rad) and speed (m/s).
+    pub(crate) fn of(heading: f64, speed: f64) -> Self {
+        if heading < SETTLED_HEADING.0 && speed < SETTLED_SPEED.0 {
+            Self::Settled
+        } else if heading > SETTLED_HEADING.1 || speed > SETTLED_SPEED.1 {
+            Self::Doubtful
         } else {
-            TrackStatus::Acquiring
-        };
+            Self::Between
+        }
     }
 }
+
+/// What a frame knows of a track beside its life.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Circumstances {
+    /// How long ago it was last seen.
+    pub(crate) away: Span,
+    /// For how long it may be out of sight; `None` of a target that cannot move.
+    pub(crate) lost_after: Option<Span>,
+    /// Whether its heading is too uncertain to linearise an update about.
+    pub(crate) heading_doubtful: bool,
+}
+
+impl Circumstances {
+    fn is_gone(&self) -> bool {
+        self.lost_after.is_some_and(|limit| self.away > limit)
+    }
+
+    fn moves(&self) -> bool {
+        self.lost_after.is_some()
+    }
+}
+
+impl Life {
+    /// A track just started by a frame.
+    pub(crate) fn started(first: Sighting) -> Self {
+        Self::Started { frames: 1, first, missing: false }
+    }
+
+    /// What is reported of it.
+    pub(crate) fn status(self) -> TrackStatus {
+        match self {
+            Self::Started { missing: false, .. } | Self::Acquiring { missing: false, .. } => {
+                TrackStatus::Acquiring
+            }
+            Self::Tracking(_) => TrackStatus::Tracking,
+            Self::Coasting(_) => TrackStatus::Coasting,
+            Self::Unknown | Self::Started { .. } | Self::Acquiring { .. } | Self::Lost => TrackStatus::Lost,
+        }
+    }
+
+    /// Whether the state holds a place for it, reported or not.
+    pub(crate) fn is_held(self) -> bool {
+        self != Self::Unknown
+    }
+
+    /// When it was first seen, where that still counts.
+    pub(crate) fn first_mut(&mut self) -> Option<&mut Sighting> {
+        match self {
+            Self::Started { first, .. } => Some(first),
+            _ => None,
+        }
+    }
+
+    /// A frame does not show it.
+    pub(crate) fn unseen(self, now: &Circumstances) -> Self {
+        match self {
+            Self::Unknown => self,
+            _ if now.is_gone() => Self::Lost,
+            Self::Started { frames, first, missing } => {
+                Self::Started { frames, first, missing: missing || now.away.s() > MISSING_S }
+            }
+            Self::Acquiring { frames, evidence, missing } => {
+                Self::Acquiring { frames, evidence, missing: missing || now.away.s() > MISSING_S }
+            }
+            Self::Tracking(evidence) if now.away.s() > BLINK_S => Self::Coasting(evidence),
+            Self::Tracking(_) | Self::Coasting(_) | Self::Lost => self,
+        }
+    }
+
+    /// A frame shows it: what is to be done.
+    pub(crate) fn on_sight(self, now: &Circumstances) -> OnSight {
+        let back_in_doubt = now.moves() && now.heading_doubtful && now.away.s() > BLINK_S;
+        match self {
+            Self::Unknown | Self::Lost => OnSight::Start,
+            _ if now.is_gone() => OnSight::Start,
+            Self::Started { first, .. } => OnSight::StartAgain(first),
+            Self::Acquiring { missing: false, .. } => OnSight::Fuse,
+            Self::Acquiring { .. } | Self::Tracking(_) | Self::Coasting(_) if back_in_doubt => {
+                OnSight::PlaceAnew
+            }
+            Self::Acquiring { .. } | Self::Tracking(_) | Self::Coasting(_) => OnSight::Fuse,
+        }
+    }
+
+    /// It was started afresh, as the track first seen then and there.
+    pub(crate) fn started_again(self, first: Sighting) -> Self {
+        let frames = match self {
+            Self::Started { frames, .. } => frames + 1,
+            _ => 1,
+        };
+        if frames < FRAMES_TO_START {
+            Self::Started { frames, first, missing: false }
+        } else {
+            Self::Acquiring { frames, evidence: Evidence::default(), missing: false }
+        }
+    }
+
+    /// One of its markers was inside the gate.
+    pub(crate) fn accepted(self) -> Self {
+        match self {
+            Self::Acquiring { frames, missing, .. } => Self::Acquiring {
+                frames: (frames + 1).min(FRAMES_TO_TRACK),
+                evidence: Evidence::default(),
+                missing,
+            },
+            _ => self.with_evidence(|_| Evidence::default()),
+        }
+    }
+
+    /// All of its markers were outside the gate.
+    pub(crate) fn refused(self) -> Self {
+        self.with_evidence(|evidence| Evidence { refused: evidence.refused + 1, ..evidence })
+    }
+
+    /// Its place was read off its markers anew.
+    pub(crate) fn placed_anew(self) -> Self {
+        self.with_evidence(|_| Evidence { refused: 0, unconfirmed: true })
+    }
+
+    /// Frames in a row in which all of its markers were outside the gate.
+    pub(crate) fn refusals(self) -> u32 {
+        self.evidence().refused
+    }
+
+    /// After a refusal: a believed track is moved after `restart_after` frames in a row, any other given up sooner.
+    pub(crate) fn verdict(self, restart_after: u32, moves: bool) -> Verdict {
+        let Evidence { refused, unconfirmed } = self.evidence();
+        let believed = matches!(self, Self::Tracking(_)) && !unconfirmed;
+        if refused < if believed { restart_after } else { DOUBTED_REFUSALS } {
+            return Verdict::Keep;
+        }
+        match self {
+            Self::Acquiring { missing: false, .. } => Verdict::Start,
+            _ if unconfirmed || !moves => Verdict::Start,
+            _ => Verdict::PlaceAnew,
+        }
+    }
+
+    /// It was fused, or started, in a frame that shows it.
+    pub(crate) fn settled(self, certainty: Certainty) -> Self {
+        match (self, certainty) {
+            (Self::Started { frames, first, .. }, _) => Self::Started { frames, first, missing: false },
+            (Self::Acquiring { frames, evidence, .. }, Certainty::Settled) if frames >= FRAMES_TO_TRACK => {
+                Self::Tracking(evidence)
+            }
+            (Self::Acquiring { frames, evidence, .. }, _) => {
+                Self::Acquiring { frames, evidence, missing: false }
+            }
+            (Self::Tracking(evidence) | Self::Coasting(evidence), Certainty::Doubtful) => {
+                Self::Acquiring { frames: FRAMES_TO_TRACK, evidence, missing: false }
+            }
+            (Self::Tracking(evidence) | Self::Coasting(evidence), _) => Self::Tracking(evidence),
+            (Self::Unknown | Self::Lost, _) => self,
+        }
+    }
+
+    fn evidence(self) -> Evidence {
+        match self {
+            Self::Acquiring { evidence, .. } | Self::Tracking(evidence) | Self::Coasting(evidence) => {
+                evidence
+            }
+            Self::Unknown | Self::Started { .. } | Self::Lost => Evidence::default(),
+        }
+    }
+
+    fn with_evidence(mut self, change: impl Fn(Evidence) -> Evidence) -> Self {
+        if let Self::Acquiring { evidence, .. } | Self::Tracking(evidence) | Self::Coasting(evidence) =
+            &mut self
+        {
+            *evidence = change(*evidence);
+        }
+        self
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -4,104 +4,30 @@
 
 use windhover_base::msg::Disposition;
 
+use super::delayed::DelayedCopy;
 use super::matrix::{Grid, MAX_MEASURED, Small, axpy, cholesky, forward};
-use super::state::{Echo, State};
-
-/// Most state columns one measurement touches.
-const MAX_COLUMNS: usize = 24;
+use super::measurement::Measurement;
+use super::state::State;
 
 /// Beyond this many times the gate a measurement is refused: no model error explains it.
-pub(super) const REFUSE_RATIO: f64 = 50.0;
-
-/// A linearised measurement `r = H δx + noise` of `m` components that touches few columns.
-#[derive(Clone, Debug)]
-pub(super) struct Measurement {
-    pub(super) m: usize,
-    columns: usize,
-    column: [usize; MAX_COLUMNS],
-    h: [[f64; MAX_COLUMNS]; MAX_MEASURED],
-    /// Innovation.
-    pub(super) residual: [f64; MAX_MEASURED],
-    /// Noise covariance.
-    pub(super) noise: Small,
-}
-
-impl Default for Measurement {
-    fn default() -> Self {
-        Self {
-            m: 0,
-            columns: 0,
-            column: [0; MAX_COLUMNS],
-            h: [[0.0; MAX_COLUMNS]; MAX_MEASURED],
-            residual: [0.0; MAX_MEASURED],
-            noise: [[0.0; MAX_MEASURED]; MAX_MEASURED],
-        }
-    }
-}
-
-impl Measurement {
-    /// Empties it for `m` components.
-    pub(super) fn begin(&mut self, m: usize) {
-        *self = Self { m, ..Self::default() };
-    }
-
-    /// Adds the columns of `len` states from `start`; gives the index of the first.
-    pub(super) fn columns(&mut self, start: usize, len: usize) -> usize {
-        let first = self.columns;
-        for i in 0..len {
-            self.column[first + i] = start + i;
-        }
-        self.columns += len;
-        first
-    }
-
-    /// ∂component/∂column.
-    pub(super) fn set(&mut self, component: usize, column: usize, value: f64) {
-        self.h[component][column] = value;
-    }
-
-    /// ∂component/∂column.
-    pub(super) fn derivative(&self, component: usize, column: usize) -> f64 {
-        self.h[component][column]
-    }
-
-    /// ∂component/∂(column of the error state).
-    #[cfg(test)]
-    pub(super) fn derivative_by(&self, component: usize, column: usize) -> f64 {
-        let entries = self.row(component).iter().zip(&self.column);
-        entries.filter(|(_, c)| **c == column).map(|(h, _)| h).sum()
-    }
-
-    /// Raises the noise by a factor on its variance.
-    pub(super) fn scale_noise(&mut self, factor: f64) {
-        self.noise.iter_mut().flatten().for_each(|x| *x *= factor);
-    }
-
-    fn row(&self, component: usize) -> &[f64] {
-        &self.h[component][..self.columns]
-    }
-
-    fn is_finite(&self) -> bool {
-        (0..self.m).all(|i| self.residual[i].is_finite() && self.row(i).iter().all(|x| x.is_finite()))
-    }
-}
+pub(crate) const REFUSE_RATIO: f64 = 50.0;
 
 /// What became of a measurement.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Outcome {
-    pub(super) disposition: Disposition,
+pub(crate) struct Outcome {
+    pub(crate) disposition: Disposition,
     /// Normalised innovation squared over the gate.
-    pub(super) ratio: f64,
+    pub(crate) ratio: f64,
     /// Variance of each component's innovation as predicted.
-    pub(super) innovation_var: [f64; MAX_MEASURED],
+    pub(crate) innovation_var: [f64; MAX_MEASURED],
     /// Posterior expectation of the squared error over the noise assumed, a component: one on average
     /// where that noise is the true one, `E[(z − h)ᵀ R⁻¹ (z − h) | data] / m`.
-    pub(super) misfit: f64,
+    pub(crate) misfit: f64,
 }
 
 /// Room for the arithmetic, made once.
 #[derive(Clone, Debug)]
-pub(super) struct Workspace {
+pub(crate) struct Workspace {
     /// `L⁻¹ H P`, one row a component.
     whitened: Grid,
     dx: Vec<f64>,
@@ -110,14 +36,14 @@ pub(super) struct Workspace {
 }
 
 impl Workspace {
-    pub(super) fn new(n: usize) -> Self {
+    pub(crate) fn new(n: usize) -> Self {
         Self { whitened: Grid::zeros(MAX_MEASURED, n), dx: vec![0.0; n], gains: vec![[0.0; MAX_MEASURED]; n] }
     }
 
     /// Fuses `z`. With a gate (a chi-square value) the noise of a measurement outside it is raised until
     /// its innovation lies on the gate (soft gate: `R ← R + (ratio − 1) S`, so its weight falls as
     /// 1/ratio however uncertain the state is), and one absurdly far outside is refused.
-    pub(super) fn fuse(&mut self, state: &mut State, z: &Measurement, gate: Option<f64>) -> Outcome {
+    pub(crate) fn fuse(&mut self, state: &mut State, z: &Measurement, gate: Option<f64>) -> Outcome {
         let mut outcome = Outcome {
             disposition: Disposition::Invalid,
             ratio: f64::NAN,
@@ -168,7 +94,7 @@ impl Workspace {
         for i in 0..z.m {
             let out = self.whitened.row_mut(i);
             out.fill(0.0);
-            for (h, column) in z.row(i).iter().zip(&z.column) {
+            for (h, column) in z.row(i).iter().zip(z.columns()) {
                 if *h != 0.0 {
                     axpy(out, *h, state.cov.row(*column));
                 }
@@ -182,7 +108,7 @@ impl Workspace {
         for i in 0..z.m {
             let hp = self.whitened.row(i);
             for j in 0..=i {
-                let value: f64 = z.row(j).iter().zip(&z.column).map(|(h, c)| h * hp[*c]).sum();
+                let value: f64 = z.row(j).iter().zip(z.columns()).map(|(h, c)| h * hp[*c]).sum();
                 (s[i][j], s[j][i]) = (value, value);
             }
         }
@@ -209,36 +135,42 @@ impl Workspace {
                 axpy(row, -w[r], w);
             }
         }
-        for echo in state.echoes.iter_mut().chain([&mut state.probe]).filter(|e| e.live) {
-            self.update_echo(echo, z, l, white);
+        for copy in state.copies_in_use() {
+            self.update_copy(copy, z, l, white);
         }
         state.inject(&self.dx);
         state.keep_heading_unobserved(&self.dx);
     }
 
     /// Fixed-point smoothing: the copy `c` moves by `P_cx Hᵀ S⁻¹ r`.
-    fn update_echo(&mut self, echo: &mut Echo, z: &Measurement, l: &Small, white: &[f64; MAX_MEASURED]) {
+    fn update_copy(
+        &mut self,
+        copy: &mut DelayedCopy,
+        z: &Measurement,
+        l: &Small,
+        white: &[f64; MAX_MEASURED],
+    ) {
         let m = z.m;
-        let rows = echo.mean.len();
+        let rows = copy.mean.len();
         for c in 0..rows {
-            let cross = echo.cross.row(c);
+            let cross = copy.cross.row(c);
             let mut y = [0.0; MAX_MEASURED];
             for (i, y) in y[..m].iter_mut().enumerate() {
-                *y = z.row(i).iter().zip(&z.column).map(|(h, column)| h * cross[*column]).sum();
+                *y = z.row(i).iter().zip(z.columns()).map(|(h, column)| h * cross[*column]).sum();
             }
             forward(l, m, &mut y);
             self.gains[c] = y;
         }
         for c in 0..rows {
             let y = &self.gains[c];
-            let row = echo.cross.row_mut(c);
+            let row = copy.cross.row_mut(c);
             for i in 0..m {
                 axpy(row, -y[i], self.whitened.row(i));
-                echo.mean[c] += y[i] * white[i];
+                copy.mean[c] += y[i] * white[i];
             }
             for d in 0..rows {
                 let product: f64 = y[..m].iter().zip(&self.gains[d]).map(|(a, b)| a * b).sum();
-                echo.cov.add(c, d, -product);
+                copy.cov.add(c, d, -product);
             }
         }
     }

@@ -2,7 +2,7 @@
 
 mod accuracy;
 mod daemon;
-mod frames;
+mod pictures;
 mod fusion;
 mod map;
 mod page;
@@ -73,7 +73,7 @@ fn single(context: &Context<'_>, title: &str, unit: &str, points: &[[f64; 2]], i
 /// for pictures.
 pub fn render(path: &Path, flight: &Flight, truth: Option<&Truth>) -> Result<String, ReadError> {
     let context = Context { flight, truth };
-    let pictures = frames::read(path, flight)?;
+    let pictures = pictures::read(path, flight)?;
     let sections = [
         summary::section(&context, &pictures),
         accuracy::section(&context),
@@ -83,7 +83,7 @@ pub fn render(path: &Path, flight: &Flight, truth: Option<&Truth>) -> Result<Str
         fusion::section(&context),
         sensors::section(&context),
         vision::section(&context, &pictures),
-        frames::section(&pictures),
+        pictures::section(&pictures),
         daemon::section(&context),
         daemon::notices(&context),
         daemon::configuration(&context),

@@ -2,8 +2,8 @@
 
 use super::Context;
 use super::accuracy::{covariance, errors_of, is_held};
-use super::frames::Pictures;
 use super::page::{Section, list, paragraph, tiles};
+use super::pictures::Pictures;
 use super::sensors::{quantile, streams};
 use crate::app::flight::Track;
 use crate::io::proto::windhover as wh;

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use super::frames::Pictures;
 use super::page::{Section, figure, grid, table};
+use super::pictures::Pictures;
 use super::sensors::quantile;
 use super::{Context, cloud, line};
 use crate::io::proto::windhover as wh;
@@ -100,7 +100,7 @@ fn marker_chart(
 }
 
 fn quality_charts(context: &Context<'_>, pictures: &Pictures) -> String {
-    let of = |pick: fn(&super::frames::Quality) -> f64| -> Vec<[f64; 2]> {
+    let of = |pick: fn(&super::pictures::Quality) -> f64| -> Vec<[f64; 2]> {
         pictures.quality.iter().map(|(t, q)| [context.flight.seconds(*t), pick(q)]).collect()
     };
     if pictures.quality.len() < 2 {

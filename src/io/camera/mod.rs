@@ -1,13 +1,15 @@
-//! The camera on its own thread: a V4L2 device, or a recording of one played at its own pace.
+//! The camera as a task: a V4L2 device, or a recording of one played at its own pace.
 
 mod format;
 mod recorded;
 mod v4l2;
 
+use std::convert::Infallible;
+
 use windhover_base::settings::PixelFormat;
 
 use super::clock::HostClock;
-use super::device::{Backoff, Report, Stop};
+use super::device::{Backoff, Report, Reports};
 
 /// What is asked of the camera.
 #[derive(Clone, PartialEq, Debug)]
@@ -24,23 +26,19 @@ pub struct CameraSettings {
     pub pixel_format: PixelFormat,
 }
 
-/// Delivers frames until the end is asked for. Runs on the calling thread; everything it has to say
-/// goes through `tell`, at least every 100 ms.
-pub fn run(settings: &CameraSettings, clock: HostClock, stop: &Stop, tell: &dyn Fn(Report)) {
+/// Delivers frames for ever; dropping the future closes the camera.
+pub async fn run(settings: &CameraSettings, clock: HostClock, reports: Reports<'_>) -> Infallible {
     let recording = |prefix| settings.device.strip_prefix(prefix).map(str::to_owned);
     let mut backoff = Backoff::new();
-    while !stop.asked() {
+    loop {
         let fault = if let Some(path) = recording("capture:") {
-            recorded::play(&path, settings, false, clock, stop, tell)
+            recorded::play(&path, settings, false, clock, reports).await
         } else if let Some(path) = recording("capture-loop:") {
-            recorded::play(&path, settings, true, clock, stop, tell)
+            recorded::play(&path, settings, true, clock, reports).await
         } else {
-            v4l2::stream(settings, clock, stop, tell, &mut || backoff.reset())
+            v4l2::stream(settings, clock, reports, &mut || backoff.reset()).await
         };
-        match fault {
-            None => return,
-            Some(fault) => tell(Report::Down(fault)),
-        }
-        backoff.wait(stop, tell);
+        reports(Report::Down(fault));
+        backoff.wait(reports).await;
     }
 }

@@ -6,12 +6,17 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use tokio::sync::mpsc;
+
 use super::CameraSettings;
 use crate::io::capture::CaptureReader;
 use crate::io::clock::HostClock;
-use crate::io::device::{Fault, FaultKind, NAP, NoteKind, Report, Stop};
+use crate::io::device::{Fault, FaultKind, NoteKind, Report, Reports, wait_for};
 use windhover_base::msg::{EventBody, FrameEncoding, FramePayload};
 use windhover_base::time::{MonoTime, Span};
+
+/// Frames that wait for the task, as in a driver's buffers; the player waits while so many do.
+const WAITING: usize = 12;
 
 /// A recorded frame and when it was delivered, both on the recording's own clock.
 struct Recorded {
@@ -19,66 +24,95 @@ struct Recorded {
     frame: FramePayload,
 }
 
-/// Plays a recording until its end and beyond (`None` when the end of the program was asked for), or
-/// until it cannot be read.
-pub(super) fn play(
+/// What the player delivers.
+enum Played {
+    /// The recording can be read.
+    Opened,
+    /// A frame that is due.
+    Frame(FramePayload),
+    /// The recording cannot be read.
+    Unusable(Fault),
+}
+
+/// Delivers a recording's frames for ever, or until it cannot be read. Reading files blocks, so a thread of its own
+/// plays it as a driver does a camera's frames, and the task takes what it delivers.
+pub(super) async fn play(
     path: &str,
     settings: &CameraSettings,
     again: bool,
     clock: HostClock,
-    stop: &Stop,
-    tell: &dyn Fn(Report),
-) -> Option<Fault> {
+    reports: Reports<'_>,
+) -> Fault {
+    let (delivered, mut frames) = mpsc::channel(WAITING);
     let frame_time = Span::from_s(1.0 / settings.fps);
-    let mut began = clock.now();
-    let mut told = false;
-    loop {
-        let frames = match open(Path::new(path)) {
-            Ok(frames) => frames,
-            Err(detail) => return Some(Fault::new(FaultKind::Missing, path, detail)),
-        };
-        if !std::mem::replace(&mut told, true) {
-            tell(Report::Up(format!("recording {path}")));
-        }
-        let mut played = Span::ZERO;
-        let mut first = None;
-        for recorded in frames {
-            let origin = *first.get_or_insert(recorded.t_recv);
-            played = recorded.t_recv - origin;
-            if !wait_until(began + played, clock, stop, tell) {
-                return None;
-            }
-            let mut frame = recorded.frame;
-            frame.t_exposure = began + (frame.t_exposure - origin);
-            tell(Report::Frame(clock.now(), frame));
-        }
-        if first.is_none() {
-            return Some(Fault::new(FaultKind::Unsuitable, path, "holds no camera frame"));
-        }
-        if !again {
-            tell(Report::Note(NoteKind::PlayedOut, 1, format!("{path} has played to its end")));
-            while !stop.asked() {
-                tell(Report::Beat);
-                std::thread::sleep(NAP);
-            }
-            return None;
-        }
-        began += played + frame_time;
+    let player = Player { path: path.to_owned(), frame_time, again, clock, delivered };
+    if let Err(error) = std::thread::Builder::new().name("recording".into()).spawn(move || player.run()) {
+        return Fault::from_io(path, &error);
     }
+    while let Some(played) = wait_for(frames.recv(), reports).await {
+        match played {
+            Played::Opened => reports(Report::Up(format!("recording {path}"))),
+            Played::Frame(frame) => reports(Report::Frame(clock.now(), frame)),
+            Played::Unusable(fault) => return fault,
+        }
+    }
+    reports(Report::Note(NoteKind::PlayedOut, 1, format!("{path} has played to its end")));
+    wait_for(std::future::pending(), reports).await
 }
 
-/// Sleeps until `due`, answering meanwhile; whether to go on.
-fn wait_until(due: MonoTime, clock: HostClock, stop: &Stop, tell: &dyn Fn(Report)) -> bool {
-    loop {
-        tell(Report::Beat);
-        if stop.asked() {
-            return false;
+/// Plays a recording on a thread of its own, until its end or until nobody takes the frames.
+struct Player {
+    path: String,
+    frame_time: Span,
+    again: bool,
+    clock: HostClock,
+    delivered: mpsc::Sender<Played>,
+}
+
+impl Player {
+    fn run(self) {
+        if let Err(fault) = self.play() {
+            let _ = self.delivered.blocking_send(Played::Unusable(fault));
         }
-        let left = due - clock.now();
-        if left <= Span::ZERO {
-            return true;
+    }
+
+    fn play(&self) -> Result<(), Fault> {
+        let mut began = self.clock.now();
+        let mut opened = false;
+        loop {
+            let frames = open(Path::new(&self.path))
+                .map_err(|detail| Fault::new(FaultKind::Missing, &self.path, detail))?;
+            if !std::mem::replace(&mut opened, true) && self.delivered.blocking_send(Played::Opened).is_err()
+            {
+                return Ok(());
+            }
+            let mut played = Span::ZERO;
+            let mut first = None;
+            for recorded in frames {
+                let origin = *first.get_or_insert(recorded.t_recv);
+                played = recorded.t_recv - origin;
+                self.wait_until(began + played);
+                let mut frame = recorded.frame;
+                frame.t_exposure = began + (frame.t_exposure - origin);
+                if self.delivered.blocking_send(Played::Frame(frame)).is_err() {
+                    return Ok(());
+                }
+            }
+            if first.is_none() {
+                return Err(Fault::new(FaultKind::Unsuitable, &self.path, "holds no camera frame"));
+            }
+            if !self.again {
+                return Ok(());
+            }
+            began += played + self.frame_time;
         }
-        std::thread::sleep(NAP.min(Duration::from_nanos(left.ns().unsigned_abs())));
+    }
+
+    /// Sleeps until a frame is due.
+    fn wait_until(&self, due: MonoTime) {
+        if let Ok(left) = u64::try_from((due - self.clock.now()).ns()) {
+            std::thread::sleep(Duration::from_nanos(left));
+        }
     }
 }
 
@@ -162,13 +196,11 @@ fn pgm_header(data: &[u8]) -> Option<(u32, u32, usize)> {
 
 #[cfg(test)]
 mod tests {
-    use std::cell::RefCell;
-
     use super::*;
     use windhover_base::settings::PixelFormat;
 
-    #[test]
-    fn a_folder_plays_at_its_own_pace() {
+    #[tokio::test]
+    async fn a_folder_plays_at_its_own_pace() {
         // Given three images 40 ms apart, the last of them missing.
         let folder = tempfile::tempdir().expect("a folder");
         let pgm = [b"P5\n4 2\n255\n".as_slice(), &[7; 8]].concat();
@@ -177,7 +209,7 @@ mod tests {
         let list = "time_s,file\n100.00,a.pgm\n100.04,b.jpg\n100.08,c.jpg\n";
         std::fs::write(folder.path().join(TIMES), list).expect("written");
 
-        // When it is played.
+        // When it is played to its end.
         let settings = CameraSettings {
             device: String::new(),
             width: 4,
@@ -185,24 +217,25 @@ mod tests {
             fps: 25.0,
             pixel_format: PixelFormat::Grey,
         };
-        let stop = Stop::default();
-        let frames = RefCell::new(Vec::new());
-        let fault = play(
-            &folder.path().to_string_lossy(),
-            &settings,
-            false,
-            HostClock::start(),
-            &stop,
-            &|r| match r {
-                Report::Frame(t, frame) => frames.borrow_mut().push((t, frame)),
-                Report::Note(NoteKind::PlayedOut, ..) => stop.ask(),
-                _ => {}
-            },
-        );
+        let (sender, mut told) = mpsc::unbounded_channel();
+        let reports = move |report| drop(sender.send(report));
+        let path = folder.path().to_string_lossy().into_owned();
+        let mut frames = Vec::new();
+        let taken = async {
+            loop {
+                match told.recv().await.expect("the task runs") {
+                    Report::Frame(t, frame) => frames.push((t, frame)),
+                    Report::Note(NoteKind::PlayedOut, ..) => break,
+                    _ => {}
+                }
+            }
+        };
+        tokio::select! {
+            () = taken => {}
+            fault = play(&path, &settings, false, HostClock::start(), &reports) => panic!("{fault}"),
+        }
 
         // Then two frames came, as far apart as they were recorded.
-        assert!(fault.is_none());
-        let frames = frames.into_inner();
         assert_eq!(frames.len(), 2);
         let apart = frames[1].1.t_exposure - frames[0].1.t_exposure;
         assert!((apart - Span::from_ms(40.0)).abs() < Span::from_ms(0.001), "{apart:?}");

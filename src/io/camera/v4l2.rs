@@ -1,11 +1,16 @@
 //! A V4L2 camera: negotiate a format, stream mapped buffers, and survive whatever the driver does.
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::convert::Infallible;
+use std::io::ErrorKind::{Interrupted, TimedOut, WouldBlock};
+use std::os::fd::{AsRawFd, RawFd};
 use std::sync::Arc;
 use std::time::Duration;
 
+use tokio::io::Interest;
+use tokio::io::unix::AsyncFd;
 use v4l::buffer::{Flags, Metadata, Type};
 use v4l::capability::Flags as Capability;
+use v4l::device::Handle;
 use v4l::io::mmap::Stream;
 use v4l::io::traits::CaptureStream;
 use v4l::video::Capture;
@@ -15,12 +20,15 @@ use v4l::{Device, Format, FourCC, Fraction};
 use super::CameraSettings;
 use super::format::{self, FourCc};
 use crate::io::clock::HostClock;
-use crate::io::device::{Fault, FaultKind, NAP, NoteKind, Report, Stop};
+use crate::io::device::{
+    Fault, FaultKind, NoteKind, Opened, OwnsDescriptor, Report, Reports, blocking, catch_panics, register,
+    wait_for,
+};
 use windhover_base::msg::{FrameEncoding, FramePayload};
 use windhover_base::time::{MonoTime, Span};
 
 /// Mapped buffers. One is being copied while the others fill: at 30 frames a second the driver can
-/// run on for a third of a second while this thread waits for a processor. A driver that has less memory gives
+/// run on for a third of a second while this task waits for a processor. A driver that has less memory gives
 /// fewer.
 const BUFFERS: u32 = 12;
 
@@ -31,29 +39,65 @@ const FROZEN_FRAMES: f64 = 5.0;
 /// A stamp this far before its arrival, or at all after it, is not the time of exposure.
 const OLDEST_STAMP: Span = Span::from_ns(2_000_000_000);
 
-/// Streams until the device is lost (the fault) or the end is asked for (`None`). Any panic of the
-/// V4L2 library (its stream's `Drop` panics where a vanished device refuses STREAMOFF) means that the
-/// device is lost.
-pub(super) fn stream(
+/// `POLLIN` of poll(2), the same on every Linux.
+const POLLIN: i16 = 1;
+
+/// Streams until the device is lost. Any panic of the V4L2 library (its stream's `Drop` panics where a vanished
+/// device refuses STREAMOFF) means that the device is lost.
+pub(super) async fn stream(
     settings: &CameraSettings,
     clock: HostClock,
-    stop: &Stop,
-    tell: &dyn Fn(Report),
-    delivered: &mut dyn FnMut(),
-) -> Option<Fault> {
-    let device = settings.device.as_str();
-    let run = AssertUnwindSafe(|| match open(settings, tell) {
-        Ok(camera) => camera.stream(clock, stop, tell, delivered),
-        Err(fault) => Some(fault),
-    });
-    catch_unwind(run).unwrap_or_else(|_| {
-        Some(Fault::new(FaultKind::Unplugged, device, "the driver gave up; the camera is opened again"))
-    })
+    reports: Reports<'_>,
+    delivered: &mut (dyn FnMut() + Send),
+) -> Fault {
+    match try_stream(settings, clock, reports, delivered).await {
+        Ok(never) => match never {},
+        Err(fault) => fault,
+    }
+}
+
+async fn try_stream(
+    settings: &CameraSettings,
+    clock: HostClock,
+    reports: Reports<'_>,
+    delivered: &mut (dyn FnMut() + Send),
+) -> Result<Infallible, Fault> {
+    let lost = || {
+        let what = "the driver gave up; the camera is opened again";
+        Fault::new(FaultKind::Unplugged, &settings.device, what)
+    };
+    // Opening talks to the device, which takes a while over USB; so does the first frame.
+    let asked = settings.clone();
+    let opened = blocking(move || catch_panics(|| open(asked)));
+    let (camera, found) = opened.await.ok_or_else(lost)??;
+    found.into_iter().for_each(reports);
+    let started = blocking(move || catch_panics(|| camera.start(clock)));
+    let (running, first) = started.await.ok_or_else(lost)??;
+    let mut running = Opened::new(running);
+    let mut taken = first;
+    let fault = loop {
+        for report in taken {
+            if matches!(report, Report::Frame(..)) {
+                delivered();
+            }
+            reports(report);
+        }
+        let next = match running.readable(reports).await {
+            Ok(()) => catch_panics(|| running.take_next(clock)).unwrap_or_else(|| Err(lost())),
+            Err(fault) => Err(fault),
+        };
+        match next {
+            Ok(reports) => taken = reports,
+            Err(fault) => break fault,
+        }
+    };
+    running.close().await;
+    Err(fault)
 }
 
 /// What the driver agreed to.
-struct Camera<'a> {
-    settings: &'a CameraSettings,
+struct Camera {
+    settings: CameraSettings,
     device: Device,
     encoding: FrameEncoding,
     width: u32,
@@ -61,8 +105,10 @@ struct Camera<'a> {
     stride: u32,
 }
 
-fn open<'a>(settings: &'a CameraSettings, tell: &dyn Fn(Report)) -> Result<Camera<'a>, Fault> {
+/// Opens the camera and agrees on a format; what is to be reported of it.
+fn open(settings: CameraSettings) -> Result<(Camera, Vec<Report>), Fault> {
     let path = settings.device.as_str();
+    let mut reports = Vec::new();
     let device = Device::with_path(path).map_err(|e| Fault::from_io(path, &e))?;
     let unsuitable = |text: String| Fault::new(FaultKind::Unsuitable, path, text);
     let caps = device.query_caps().map_err(|_| unsuitable("is no camera (V4L2)".into()))?;
@@ -93,16 +139,17 @@ fn open<'a>(settings: &'a CameraSettings, tell: &dyn Fn(Report)) -> Result<Camer
     })?;
     if given.fourcc.repr != asked {
         let text = format!("asked for {}, the driver gives {}", format::name(asked), given.fourcc);
-        tell(Report::Note(NoteKind::FormatDiffers, 1, text));
+        reports.push(Report::Note(NoteKind::FormatDiffers, 1, text));
     }
     let fps = set_rate(&device, settings.fps);
     let rate = fps.map_or_else(|| "its own rate".into(), |fps| format!("{fps:.1} frames/s"));
-    tell(Report::Up(format!(
+    reports.push(Report::Up(format!(
         "{path}: {} ({}), {} {}x{}, {rate}",
         caps.card, caps.driver, given.fourcc, given.width, given.height
     )));
     let stride = if given.stride == 0 { format::packed_stride(encoding, given.width) } else { given.stride };
-    Ok(Camera { settings, device, encoding, width: given.width, height: given.height, stride })
+    let camera = Camera { settings, device, encoding, width: given.width, height: given.height, stride };
+    Ok((camera, reports))
 }
 
 /// Asks for a frame rate; what the driver then gives, frames a second. Drivers without this call run
@@ -113,6 +160,28 @@ fn set_rate(device: &Device, fps: f64) -> Option<f64> {
     (given.numerator > 0).then(|| f64::from(given.denominator) / f64::from(given.numerator))
 }
 
+/// The descriptor of an open device, for the runtime to wait on.
+struct Descriptor(Arc<Handle>);
+
+impl AsRawFd for Descriptor {
+    fn as_raw_fd(&self) -> RawFd {
+        self.0.fd()
+    }
+}
+
+// SAFETY: the handle closes its descriptor when the last of its holders is dropped, and this is one.
+unsafe impl OwnsDescriptor for Descriptor {}
+
+/// A running stream.
+struct Running {
+    camera: Camera,
+    ready: AsyncFd<Descriptor>,
+    stream: Stream<'static>,
+    following: Following,
+    /// Whether a dequeue failed: the stream's own count of buffers is right again once one is given up.
+    owes_buffer: bool,
+}
+
 /// What is kept from one frame to the next.
 #[derive(Default)]
 struct Following {
@@ -121,46 +190,22 @@ struct Following {
     bad_stamps_told: bool,
 }
 
-impl Camera<'_> {
-    fn stream(
-        &self,
-        clock: HostClock,
-        stop: &Stop,
-        tell: &dyn Fn(Report),
-        delivered: &mut dyn FnMut(),
-    ) -> Option<Fault> {
-        let path = self.settings.device.as_str();
-        let mut stream = match Stream::with_buffers(&self.device, Type::VideoCapture, BUFFERS) {
-            Ok(stream) => stream,
-            Err(error) => return Some(Fault::from_io(path, &error)),
-        };
+impl Camera {
+    /// Starts the stream and waits for the first frame.
+    fn start(self, clock: HostClock) -> Result<(Running, Vec<Report>), Fault> {
+        let fault = |error: &std::io::Error| Fault::from_io(&self.settings.device, error);
+        let mut stream =
+            Stream::with_buffers(&self.device, Type::VideoCapture, BUFFERS).map_err(|e| fault(&e))?;
         stream.set_timeout(self.patience());
-        let mut following = Following::default();
-        let mut started = false;
-        while !stop.asked() {
-            tell(Report::Beat);
-            if started && let Err(fault) = self.wait(&stream, stop, tell) {
-                return fault;
-            }
-            let taken = stream.next().map(|(bytes, meta)| {
-                let t_recv = clock.now();
-                self.take(bytes, meta, t_recv, &mut following, clock, tell)
-            });
-            started = true;
-            match taken {
-                Ok(Some((t_recv, frame))) => {
-                    delivered();
-                    tell(Report::Frame(t_recv, frame));
-                }
-                Ok(None) => {}
-                Err(error) => {
-                    if let Err(fault) = self.recover(&mut stream, &error) {
-                        return Some(fault);
-                    }
-                }
-            }
-        }
-        None
+        // An error of the driver alone is no readiness to read, but it is to be seen.
+        let interest = Interest::READABLE | Interest::ERROR;
+        let ready = register(Descriptor(stream.handle()), interest).map_err(|e| fault(&e))?;
+        let following = Following::default();
+        let mut running = Running { camera: self, ready, stream, following, owes_buffer: false };
+        let first = running.take_next(clock)?;
+        // From here on readiness is waited for before anything is dequeued.
+        running.stream.set_timeout(Duration::ZERO);
+        Ok((running, first))
     }
 
     /// How long a frame may take.
@@ -168,57 +213,75 @@ impl Camera<'_> {
         FROZEN.max(Duration::from_secs_f64(FROZEN_FRAMES / self.settings.fps))
     }
 
-    /// Waits for a frame, answering meanwhile. `Err(None)` where the end was asked for.
-    fn wait(&self, stream: &Stream<'_>, stop: &Stop, tell: &dyn Fn(Report)) -> Result<(), Option<Fault>> {
-        /// `POLLIN` of poll(2), the same on every Linux.
-        const POLLIN: i16 = 1;
-        let mut waited = Duration::ZERO;
-        while waited < self.patience() {
-            match stream.handle().poll(POLLIN, NAP.as_millis() as i32) {
-                Ok(0) => waited += NAP,
-                Ok(_) => return Ok(()),
-                Err(error) if error.kind() == std::io::ErrorKind::Interrupted => {}
-                Err(error) => return Err(Some(Fault::from_io(&self.settings.device, &error))),
-            }
-            tell(Report::Beat);
-            if stop.asked() {
-                return Err(None);
-            }
-        }
-        Err(Some(self.frozen()))
-    }
-
     fn frozen(&self) -> Fault {
         let text = format!("no frame for {:.1} s; the camera is opened again", self.patience().as_secs_f64());
         Fault::new(FaultKind::Frozen, &self.settings.device, text)
     }
 
-    /// After a failed dequeue: nothing to do where the device is gone; else one buffer is given up so
-    /// that the stream's own bookkeeping is right again.
-    fn recover(&self, stream: &mut Stream<'_>, error: &std::io::Error) -> Result<(), Fault> {
-        use std::io::ErrorKind::{Interrupted, TimedOut, WouldBlock};
-        match error.kind() {
-            TimedOut => return Err(self.frozen()),
-            Interrupted | WouldBlock => {}
-            _ => {
-                let mut fault = Fault::from_io(&self.settings.device, error);
-                if fault.kind == FaultKind::Missing {
-                    fault.kind = FaultKind::Unplugged;
-                    fault.detail = "went away; waiting for it to come back".into();
-                }
-                return Err(fault);
-            }
+    /// What a failed system call means.
+    fn lost(&self, error: &std::io::Error) -> Fault {
+        let mut fault = Fault::from_io(&self.settings.device, error);
+        if fault.kind == FaultKind::Missing {
+            fault.kind = FaultKind::Unplugged;
+            fault.detail = "went away; waiting for it to come back".into();
         }
-        loop {
-            match CaptureStream::dequeue(stream) {
-                Ok(_) => return Ok(()),
-                Err(error) if matches!(error.kind(), Interrupted | WouldBlock) => {}
-                Err(error) if error.kind() == TimedOut => return Err(self.frozen()),
-                Err(error) => return Err(Fault::from_io(&self.settings.device, &error)),
+        fault
+    }
+}
+
+impl Running {
+    /// Waits until a frame can be dequeued.
+    async fn readable(&self, reports: Reports<'_>) -> Result<(), Fault> {
+        let readable = async {
+            loop {
+                let mut ready = self.ready.ready(Interest::READABLE | Interest::ERROR).await?;
+                match self.ready.get_ref().0.poll(POLLIN, 0) {
+                    Ok(0) => ready.clear_ready(),
+                    Ok(_) => return Ok(()),
+                    Err(error) if error.kind() == Interrupted => {}
+                    Err(error) => return Err(error),
+                }
             }
+        };
+        match tokio::time::timeout(self.camera.patience(), wait_for(readable, reports)).await {
+            Ok(result) => result.map_err(|error| Fault::from_io(&self.camera.settings.device, &error)),
+            Err(_) => Err(self.camera.frozen()),
         }
     }
 
+    /// Dequeues what is there; what is to be reported of it.
+    fn take_next(&mut self, clock: HostClock) -> Result<Vec<Report>, Fault> {
+        if self.owes_buffer {
+            return match CaptureStream::dequeue(&mut self.stream) {
+                Err(error) if matches!(error.kind(), Interrupted | WouldBlock) => Ok(Vec::new()),
+                Err(error) if error.kind() == TimedOut => Err(self.camera.frozen()),
+                Err(error) => Err(Fault::from_io(&self.camera.settings.device, &error)),
+                Ok(_) => {
+                    self.owes_buffer = false;
+                    Ok(Vec::new())
+                }
+            };
+        }
+        match self.stream.next() {
+            Ok((bytes, meta)) => {
+                let mut reports = Vec::new();
+                let mut tell = |report| reports.push(report);
+                let t_recv = clock.now();
+                let frame = self.camera.take(bytes, meta, t_recv, &mut self.following, clock, &mut tell);
+                reports.extend(frame.map(|frame| Report::Frame(t_recv, frame)));
+                Ok(reports)
+            }
+            Err(error) if matches!(error.kind(), Interrupted | WouldBlock) => {
+                self.owes_buffer = true;
+                Ok(Vec::new())
+            }
+            Err(error) if error.kind() == TimedOut => Err(self.camera.frozen()),
+            Err(error) => Err(self.camera.lost(&error)),
+        }
+    }
+}
+
+impl Camera {
     /// Copies one frame out of its buffer; `None` where it is damaged.
     fn take(
         &self,
@@ -227,8 +290,8 @@ impl Camera<'_> {
         t_recv: MonoTime,
         following: &mut Following,
         clock: HostClock,
-        tell: &dyn Fn(Report),
-    ) -> Option<(MonoTime, FramePayload)> {
+        tell: &mut dyn FnMut(Report),
+    ) -> Option<FramePayload> {
         let missed = following
             .sequence
             .replace(meta.sequence)
@@ -253,7 +316,7 @@ impl Camera<'_> {
         }
         let t_exposure = self.exposure(meta, t_recv, following, clock, tell);
         let data: Arc<[u8]> = Arc::from(&bytes[..needed.unwrap_or(used)]);
-        let frame = FramePayload {
+        Some(FramePayload {
             index: 0,
             t_exposure,
             encoding: self.encoding,
@@ -261,8 +324,7 @@ impl Camera<'_> {
             height: self.height,
             stride: self.stride,
             data,
-        };
-        Some((t_recv, frame))
+        })
     }
 
     /// The driver's stamp where it is of the monotonic clock, recent, and later than the last; else
@@ -273,7 +335,7 @@ impl Camera<'_> {
         t_recv: MonoTime,
         following: &mut Following,
         clock: HostClock,
-        tell: &dyn Fn(Report),
+        tell: &mut dyn FnMut(Report),
     ) -> MonoTime {
         let clock_of_stamp = meta.flags & Flags::TIMESTAMP_MASK;
         let micros = meta.timestamp.sec.saturating_mul(1_000_000).saturating_add(meta.timestamp.usec);

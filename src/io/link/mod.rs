@@ -7,18 +7,20 @@ mod dial;
 mod door;
 mod events;
 mod governor;
-mod inbox;
 pub mod keys;
 mod live;
 mod pace;
 mod payload;
+mod payload_shared;
 mod peer;
 mod quic;
 mod ranges;
 mod receive;
+mod received_numbers;
 mod sense;
 mod session;
 mod station;
+mod station_shared;
 mod store_backlog;
 mod thumbnail;
 pub mod tls;
@@ -26,13 +28,12 @@ pub mod wire;
 
 pub use backlog::{Backlog, Extent, Found, MemoryBacklog, Unread};
 pub use events::{LinkError, LinkEvent};
-pub use inbox::{Inbox, Progress};
 pub use live::{Class, downlink_class};
-pub use payload::{EarlyRecords, LinkHandle, LinkStatus, PayloadLink, PayloadSettings, StationStatus};
+pub use payload::{EarlyRecords, LinkHandle, PayloadLink, PayloadSettings};
+pub use payload_shared::{LinkStatus, StationStatus};
 pub use ranges::RangeSet;
-pub use station::{
-    Arrival, Channel, FromPayload, OpenStation, PayloadStatus, Recall, StationHandle, StationLink,
-    StationSettings,
-};
+pub use received_numbers::{Progress, ReceivedNumbers};
+pub use station::{OpenStation, StationHandle, StationLink, StationSettings};
+pub use station_shared::{Arrival, Channel, FromPayload, PayloadStatus, Recall};
 pub use store_backlog::StoreBacklog;
 pub use thumbnail::Picture;

@@ -1,20 +1,20 @@
 //! The payload's side of the link: a handle that never blocks, and the tasks behind it.
 
-use std::collections::BTreeMap;
 use std::net::SocketAddr;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 
-use super::backlog::{Backlog, Extent, Found, MemoryBacklog, Unread};
+use super::backlog::{Backlog, MemoryBacklog};
 use super::door::Door;
 use super::events::{Events, LinkError, LinkEvent};
 use super::keys::Role;
 use super::live::downlink_class;
 use super::pace::Bucket;
+use super::payload_shared::{Connected, LinkStatus, PayloadShared, StationStatus};
 use super::peer::Peer;
 use super::session;
 use super::thumbnail::Picture;
@@ -63,113 +63,6 @@ impl PayloadSettings {
     }
 }
 
-/// How the link does with one station.
-#[derive(Clone, PartialEq, Debug)]
-pub struct StationStatus {
-    /// Its name.
-    pub name: String,
-    /// Whether its acknowledgements arrive.
-    pub hears_us: bool,
-    /// Round-trip time, ms.
-    pub rtt_ms: f64,
-    /// What the path is found to carry, kbit/s.
-    pub rate_kbps: f64,
-    /// Records sent live.
-    pub live: u64,
-    /// Records left to back-fill because newer ones overtook them.
-    pub thinned: u64,
-    /// Records sent again.
-    pub backfilled: u64,
-    /// Times that the card could not be read for it.
-    pub unread: u64,
-    /// Records it asked for that are still to be sent.
-    pub wanted: u64,
-}
-
-/// How the link does.
-#[derive(Clone, PartialEq, Debug, Default)]
-pub struct LinkStatus {
-    /// Connected stations.
-    pub stations: Vec<StationStatus>,
-    /// Handshakes refused since the start.
-    pub refused: u64,
-    /// Records numbered so far in this run.
-    pub records: u32,
-    /// Memory held for back-fill, bytes.
-    pub backlog_bytes: usize,
-}
-
-/// A station's latest connection.
-struct Connected {
-    peer: Peer,
-    status: StationStatus,
-    /// Whether the operator was told that it is up; a connection that takes over inherits it.
-    told: Arc<AtomicBool>,
-}
-
-/// What the sessions share.
-pub(super) struct Shared {
-    pub(super) recent: MemoryBacklog,
-    pub(super) deep: Option<Arc<dyn Backlog>>,
-    pub(super) ceiling: Option<Mutex<Bucket>>,
-    pub(super) thumbnails: Option<Duration>,
-    pub(super) thumbnail_width: u32,
-    pub(super) picture: watch::Sender<Option<Arc<Picture>>>,
-    end: watch::Sender<u32>,
-    stations: Mutex<BTreeMap<String, Connected>>,
-    events: Events,
-}
-
-impl Shared {
-    /// Tells of every new record.
-    pub(super) fn news(&self) -> watch::Receiver<u32> {
-        self.end.subscribe()
-    }
-
-    fn stations(&self) -> MutexGuard<'_, BTreeMap<String, Connected>> {
-        self.stations.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Every run of which something is held; the present one last.
-    pub(super) fn extents(&self) -> Vec<Extent> {
-        let recent = self.recent.extents();
-        let mut all = self.deep.as_ref().map_or(Vec::new(), |deep| deep.extents());
-        for now in recent {
-            match all.iter_mut().find(|e| e.run == now.run) {
-                Some(same) => {
-                    same.first = same.first.min(now.first);
-                    same.end = same.end.max(now.end);
-                }
-                None => all.push(now),
-            }
-        }
-        all
-    }
-
-    /// Reads records again, from memory where they are there, else from the card. Numbers left out are
-    /// gone for good.
-    pub(super) async fn read(self: &Arc<Self>, run: u32, first: u32, end: u32, max_bytes: usize) -> Found {
-        let recent = self.recent.read(run, first, end, max_bytes)?;
-        let covered = recent.first().is_some_and(|(number, _)| *number == first);
-        match &self.deep {
-            Some(deep) if !covered => {
-                let deep = Arc::clone(deep);
-                let end = recent.first().map_or(end, |(number, _)| *number);
-                let read = move || deep.read(run, first, end, max_bytes);
-                let found = tokio::task::spawn_blocking(read).await.unwrap_or(Err(Unread { end }))?;
-                Ok(if found.is_empty() { recent } else { found })
-            }
-            _ => Ok(recent),
-        }
-    }
-
-    pub(super) fn note_status(&self, status: StationStatus) {
-        if let Some(connected) = self.stations().get_mut(&status.name) {
-            connected.status = status;
-        }
-    }
-}
-
 /// Records of a run whose link is not open yet: they are numbered like all that follow.
 #[derive(Debug)]
 pub struct EarlyRecords(MemoryBacklog);
@@ -196,7 +89,7 @@ fn numbered(recent: &MemoryBacklog, record: &Record) -> Option<u32> {
 /// Gives records to the link. Copies are cheap; nothing here ever blocks.
 #[derive(Clone)]
 pub struct LinkHandle {
-    shared: Arc<Shared>,
+    shared: Arc<PayloadShared>,
 }
 
 impl LinkHandle {
@@ -241,7 +134,7 @@ impl LinkHandle {
 pub struct PayloadLink {
     door: Door,
     dial: Vec<String>,
-    shared: Arc<Shared>,
+    shared: Arc<PayloadShared>,
     arrivals: mpsc::Receiver<Peer>,
 }
 
@@ -257,7 +150,7 @@ impl PayloadLink {
         let (event_sender, event_receiver) = mpsc::channel(256);
         let events = Events::new(event_sender);
         let (door, arrivals) = Door::open(Role::Payload, &settings.files, settings.listen, events.clone())?;
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(PayloadShared {
             recent: MemoryBacklog::new(run, flight, settings.backlog_bytes),
             deep,
             ceiling: settings.ceiling.map(|rate| Mutex::new(Bucket::new(rate, Instant::now()))),
@@ -286,7 +179,7 @@ impl PayloadLink {
 }
 
 /// A session; an older one of the same station ends.
-fn welcome(shared: &Arc<Shared>, peer: Peer) -> impl Future<Output = ()> + Send + use<> {
+fn welcome(shared: &Arc<PayloadShared>, peer: Peer) -> impl Future<Output = ()> + Send + use<> {
     let status = StationStatus {
         name: peer.name.clone(),
         hears_us: true,

@@ -9,7 +9,7 @@ use quinn::{Connection, RecvStream, SendStream, VarInt};
 use tokio::time::Instant;
 
 use super::peer::{Ended, Peer};
-use super::station::{Arrival, Channel, FromPayload, PayloadState, Shared, lock};
+use super::station_shared::{Arrival, Channel, FromPayload, PayloadState, StationShared, lock};
 use super::wire::{self, MINOR, Reader, THUMBNAIL_LIMIT, WireError};
 use crate::io::proto::{
     link::{self as pb, to_payload, to_station},
@@ -29,7 +29,7 @@ const CHANNELS: usize = 1_024;
 const NAME_LIMIT: usize = 256;
 
 struct Receiver {
-    shared: Arc<Shared>,
+    shared: Arc<StationShared>,
     state: Arc<PayloadState>,
     connection: Connection,
     payload: Arc<str>,
@@ -40,7 +40,7 @@ struct Receiver {
 /// Receives from a payload until the connection ends; tells why it did. `up` is called when both have
 /// greeted.
 pub(super) async fn receive(
-    shared: &Arc<Shared>,
+    shared: &Arc<StationShared>,
     state: &Arc<PayloadState>,
     peer: &Peer,
     up: impl Fn(),
@@ -108,7 +108,7 @@ impl Receiver {
             return;
         }
         let recall = |flight: &str, run| (self.shared.recall)(&self.payload, flight, run);
-        lock(&self.state.inbox).announce(extent, recall);
+        lock(&self.state.received).announce(extent, recall);
         lock(&self.flights).entry(extent.run).or_insert_with(|| extent.flight.as_str().into());
     }
 
@@ -132,7 +132,7 @@ impl Receiver {
         *lock(&self.state.heard) = arrived;
         let Some(channel) = lock(&self.channels).get(&record.channel).cloned() else { return Ok(()) };
         let Some(flight) = lock(&self.flights).get(&record.run).cloned() else { return Ok(()) };
-        if !lock(&self.state.inbox).take(record.run, record.number) {
+        if !lock(&self.state.received).take(record.run, record.number) {
             return Ok(());
         }
         lock(&self.state.status).live += u64::from(live);
@@ -207,7 +207,7 @@ impl Receiver {
             match message.body {
                 Some(pb::backfill::Body::Channel(channel)) => self.learn(channel),
                 Some(pb::backfill::Body::Record(record)) => self.take(record, false).await?,
-                Some(pb::backfill::Body::Gone(range)) => lock(&self.state.inbox).gone(&range),
+                Some(pb::backfill::Body::Gone(range)) => lock(&self.state.received).gone(&range),
                 None => {}
             }
         }
@@ -235,7 +235,7 @@ impl Receiver {
         loop {
             tokio::select! {
                 _ = look.tick() => {
-                    let want = lock(&self.state.inbox).want();
+                    let want = lock(&self.state.received).want();
                     let again = asked_at.elapsed() > ASK_AGAIN && !want.ranges.is_empty();
                     if is_news(&asked, &want) || again {
                         let body = Some(to_payload::Body::Want(want.clone()));
@@ -244,7 +244,7 @@ impl Receiver {
                     }
                 }
                 () = self.state.stored.notified() => {
-                    let stored = lock(&self.state.inbox).stored_message();
+                    let stored = lock(&self.state.received).stored_message();
                     if stored != told {
                         let body = Some(to_payload::Body::Stored(stored.clone()));
                         wire::write(&mut out, &pb::ToPayload { body }).await?;

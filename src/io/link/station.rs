@@ -1,24 +1,19 @@
 //! The station's side of the link: payloads come in or are called; records come out, each once.
 
-use std::collections::BTreeMap;
 use std::net::SocketAddr;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex};
 
-use tokio::sync::{Notify, mpsc, watch};
-use tokio::time::Instant;
+use tokio::sync::{mpsc, watch};
 
 use super::door::Door;
 use super::events::{Events, LinkError, LinkEvent};
-use super::inbox::{Inbox, Progress};
 use super::keys::Role;
 use super::peer::Peer;
 use super::ranges::RangeSet;
 use super::receive;
+use super::station_shared::{FromPayload, PayloadState, PayloadStatus, Recall, StationShared, lock};
 use super::tls::KeyFiles;
-use crate::io::proto::link::Thumbnail;
-use windhover_base::time::MonoTime;
 
 /// What a station's side of the link is made of.
 #[derive(Clone, Debug)]
@@ -33,108 +28,10 @@ pub struct StationSettings {
     pub thumbnails: bool,
 }
 
-/// Topic and schema of what arrives.
-#[derive(Clone, PartialEq, Eq, Debug)]
-pub struct Channel {
-    /// Topic of the flight.
-    pub topic: String,
-    /// Name of the schema.
-    pub schema_name: String,
-    /// The schema as the payload has it; empty where it is the station's own of this name.
-    pub schema: Vec<u8>,
-}
-
-/// A record that arrived for the first time.
-#[derive(Clone, Debug)]
-pub struct Arrival {
-    /// Name of the payload.
-    pub payload: Arc<str>,
-    /// Run of the payload.
-    pub run: u32,
-    /// Name of the run's flight.
-    pub flight: Arc<str>,
-    /// Its number in the run.
-    pub number: u32,
-    /// Topic and schema.
-    pub channel: Arc<Channel>,
-    /// Log clock, the payload's host time.
-    pub log_time: MonoTime,
-    /// When it was true, the payload's host time.
-    pub publish_time: MonoTime,
-    /// The protobuf message.
-    pub data: Vec<u8>,
-    /// Whether it came live, not as back-fill.
-    pub live: bool,
-    /// When it arrived.
-    pub arrived: Instant,
-}
-
-/// What comes out of a station's link.
-#[derive(Clone, Debug)]
-pub enum FromPayload {
-    /// A record, for the first time.
-    Record(Arrival),
-    /// A thumbnail of a payload's camera image.
-    Thumbnail {
-        /// Name of the payload.
-        payload: Arc<str>,
-        /// It.
-        thumbnail: Thumbnail,
-    },
-}
-
-/// What of a run the station kept in earlier lives: by payload, flight and run.
-pub type Recall = Arc<dyn Fn(&str, &str, u32) -> RangeSet + Send + Sync>;
-
-/// How the link to one payload does.
-#[derive(Clone, PartialEq, Debug)]
-pub struct PayloadStatus {
-    /// Its name.
-    pub name: String,
-    /// Whether it is connected.
-    pub connected: bool,
-    /// Where it is, or was last.
-    pub address: SocketAddr,
-    /// Round-trip time, ms.
-    pub rtt_ms: f64,
-    /// Time since anything was heard.
-    pub silent: Duration,
-    /// Bytes received on this connection.
-    pub bytes: u64,
-    /// Records received live.
-    pub live: u64,
-    /// Program and version on board.
-    pub software: String,
-    /// How complete the station is.
-    pub progress: Progress,
-}
-
-pub(super) struct PayloadState {
-    pub(super) inbox: Mutex<Inbox>,
-    pub(super) stored: Notify,
-    pub(super) status: Mutex<PayloadStatus>,
-    pub(super) heard: Mutex<Instant>,
-    peer: Mutex<Peer>,
-    /// Whether the operator was told that it is up.
-    told: AtomicBool,
-}
-
-pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-pub(super) struct Shared {
-    payloads: Mutex<BTreeMap<String, Arc<PayloadState>>>,
-    pub(super) recall: Recall,
-    pub(super) records: mpsc::Sender<FromPayload>,
-    pub(super) thumbnails: bool,
-    events: Events,
-}
-
 /// Gives the link what it must know of the disk, and tells how it does.
 #[derive(Clone)]
 pub struct StationHandle {
-    shared: Arc<Shared>,
+    shared: Arc<StationShared>,
 }
 
 impl StationHandle {
@@ -142,7 +39,7 @@ impl StationHandle {
     pub fn stored(&self, payload: &str, run: u32, numbers: &RangeSet) {
         let state = lock(&self.shared.payloads).get(payload).cloned();
         if let Some(state) = state {
-            lock(&state.inbox).stored(run, numbers);
+            lock(&state.received).stored(run, numbers);
             state.stored.notify_one();
         }
     }
@@ -159,7 +56,7 @@ impl StationHandle {
             status.address = peer.address();
             status.bytes = connection.stats().udp_rx.bytes;
             status.silent = lock(&state.heard).elapsed();
-            status.progress = lock(&state.inbox).progress();
+            status.progress = lock(&state.received).progress();
             status
         };
         states.into_iter().map(of).collect()
@@ -175,7 +72,7 @@ impl StationHandle {
 pub struct StationLink {
     door: Door,
     dial: Vec<String>,
-    shared: Arc<Shared>,
+    shared: Arc<StationShared>,
     arrivals: mpsc::Receiver<Peer>,
 }
 
@@ -189,7 +86,7 @@ impl StationLink {
         let events = Events::new(event_sender);
         let (door, arrivals) = Door::open(Role::Station, &settings.files, settings.listen, events.clone())?;
         let (records, record_receiver) = mpsc::channel(1_024);
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(StationShared {
             payloads: Mutex::default(),
             recall,
             records,
@@ -213,43 +110,8 @@ impl StationLink {
     }
 }
 
-impl Shared {
-    /// The state of a payload, made when it first comes; an older connection ends.
-    fn state_of(&self, peer: &Peer) -> Arc<PayloadState> {
-        let mut payloads = lock(&self.payloads);
-        if let Some(state) = payloads.get(&peer.name) {
-            let old = std::mem::replace(&mut *lock(&state.peer), peer.clone());
-            old.supersede();
-            lock(&state.status).connected = true;
-            *lock(&state.heard) = Instant::now();
-            return Arc::clone(state);
-        }
-        let status = PayloadStatus {
-            name: peer.name.clone(),
-            connected: true,
-            address: peer.address(),
-            rtt_ms: 0.0,
-            silent: Duration::ZERO,
-            bytes: 0,
-            live: 0,
-            software: String::new(),
-            progress: Progress::default(),
-        };
-        let state = Arc::new(PayloadState {
-            inbox: Mutex::default(),
-            stored: Notify::new(),
-            status: Mutex::new(status),
-            heard: Mutex::new(Instant::now()),
-            peer: Mutex::new(peer.clone()),
-            told: AtomicBool::new(false),
-        });
-        payloads.insert(peer.name.clone(), Arc::clone(&state));
-        state
-    }
-}
-
 /// A session; an older one of the same payload ends.
-fn welcome(shared: &Arc<Shared>, peer: Peer) -> impl Future<Output = ()> + Send + use<> {
+fn welcome(shared: &Arc<StationShared>, peer: Peer) -> impl Future<Output = ()> + Send + use<> {
     let (state, shared) = (shared.state_of(&peer), Arc::clone(shared));
     async move {
         let up = || {

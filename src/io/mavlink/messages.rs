@@ -5,7 +5,7 @@
 use windhover_base::msg::{TargetState, TrackStatus};
 use windhover_base::time::MonoTime;
 
-use super::frame::Kind;
+use super::packet::Kind;
 
 /// HEARTBEAT.
 pub const HEARTBEAT: Kind = Kind { id: 0, crc_extra: 50 };
@@ -175,7 +175,7 @@ mod tests {
     }
 
     fn frame(sequence: u8, kind: Kind, payload: &[u8]) -> String {
-        use crate::io::mavlink::frame::{Sender, encode};
+        use crate::io::mavlink::packet::{Sender, encode};
         let bytes = encode(sequence, Sender { system: 42, component: 1 }, kind, payload, false);
         bytes.iter().map(|byte| format!("{byte:02x}")).collect()
     }

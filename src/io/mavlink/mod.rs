@@ -4,8 +4,8 @@
 //! dialect of hundreds that would have to be compiled. Only sends, unless a signing key is set: then
 //! signed datagrams of stations are counted, and others refused.
 
-pub mod frame;
 pub mod messages;
+pub mod packet;
 
 use std::net::{SocketAddr, ToSocketAddrs as _, UdpSocket};
 use std::path::{Path, PathBuf};
@@ -13,11 +13,11 @@ use std::path::{Path, PathBuf};
 use crate::config::Config;
 use crate::io::link::keys::{KeyError, read_private};
 use windhover_base::geo::Geodetic;
-use windhover_base::msg::{Output, TargetEstimate, TrackStatus};
+use windhover_base::msg::{EstimatorOutput, Measurement, Output, TargetEstimate, TrackStatus};
 use windhover_base::time::{MonoTime, Span, UtcTime};
 
-use frame::{Refused, Sender, SigningKey};
 use messages::Vehicle;
+use packet::{Refused, Sender, SigningKey};
 
 /// MAV_COMP_ID_AUTOPILOT1: ground stations draw vehicles for this component only.
 const COMPONENT: u8 = 1;
@@ -55,7 +55,13 @@ pub struct MavlinkCounts {
     pub refused: u64,
 }
 
-/// Sends the vehicles. Nothing here blocks, but for the look-up of names at the start.
+/// IPv4 addresses of stations by their names. Blocks while they are looked up.
+pub fn look_up(names: &[String]) -> Vec<SocketAddr> {
+    let v4 = |name: &String| name.to_socket_addrs().ok()?.find(SocketAddr::is_ipv4);
+    names.iter().filter_map(v4).collect()
+}
+
+/// Sends the vehicles. Nothing here blocks.
 pub struct MavlinkSender {
     socket: UdpSocket,
     names: Vec<String>,
@@ -117,13 +123,13 @@ impl MavlinkSender {
     /// Takes what it needs of the pipeline's outputs.
     pub fn output(&mut self, output: &Output) {
         match output {
-            Output::Estimate(estimate) => {
+            Output::Estimator(EstimatorOutput::Estimate(estimate)) => {
                 if let Some(latest) = self.latest.get_mut(estimate.target) {
                     *latest = Some(*estimate);
                 }
             }
             Output::Datum(_, datum) => self.datum = Some(*datum),
-            Output::Fix(fix) => {
+            Output::Measured(Measurement::Gnss(fix)) => {
                 self.geoid_m = fix.value.geoid_m.or(self.geoid_m);
                 if let Some(utc) = fix.value.utc {
                     self.utc_from_host_ns = Some(utc.unix_ns() - fix.t_valid.ns());
@@ -150,7 +156,6 @@ impl MavlinkSender {
     pub fn send(&mut self, now: MonoTime) {
         let utc = self.utc_from_host_ns.map(|ahead| UtcTime::from_unix_ns(now.ns().saturating_add(ahead)));
         let started = *self.started.get_or_insert(now);
-        self.resolve(now);
         self.listen(utc);
         if self.key.is_some() && utc.is_none() {
             return;
@@ -182,14 +187,14 @@ impl MavlinkSender {
         }
     }
 
-    fn put(&mut self, system: u8, kind: frame::Kind, payload: &[u8], utc: Option<UtcTime>) {
+    fn put(&mut self, system: u8, kind: packet::Kind, payload: &[u8], utc: Option<UtcTime>) {
         let sender = Sender { system, component: COMPONENT };
-        let mut bytes = frame::encode(self.sequence, sender, kind, payload, self.key.is_some());
+        let mut bytes = packet::encode(self.sequence, sender, kind, payload, self.key.is_some());
         self.sequence = self.sequence.wrapping_add(1);
         if let (Some((key, link_id)), Some(utc)) = (&self.key, utc) {
             // Never the same or an earlier stamp, whatever the clock does.
-            self.stamp = frame::time_stamp(utc).max(self.stamp + 1);
-            frame::sign(&mut bytes, key, *link_id, self.stamp);
+            self.stamp = packet::time_stamp(utc).max(self.stamp + 1);
+            packet::sign(&mut bytes, key, *link_id, self.stamp);
         }
         for address in &self.addresses {
             match self.socket.send_to(&bytes, address) {
@@ -199,14 +204,19 @@ impl MavlinkSender {
         }
     }
 
-    fn resolve(&mut self, now: MonoTime) {
+    /// Names of stations that are to be looked up at `now`: all, until each has an address.
+    pub fn unresolved(&mut self, now: MonoTime) -> Option<Vec<String>> {
         let whole = self.addresses.len() == self.names.len();
         if whole || self.resolved.is_some_and(|last| now - last < RESOLVE_EVERY) {
-            return;
+            return None;
         }
         self.resolved = Some(now);
-        let v4 = |name: &String| name.to_socket_addrs().ok()?.find(SocketAddr::is_ipv4);
-        self.addresses = self.names.iter().filter_map(v4).collect();
+        Some(self.names.clone())
+    }
+
+    /// Sends to these addresses from now on.
+    pub fn send_to(&mut self, addresses: Vec<SocketAddr>) {
+        self.addresses = addresses;
     }
 
     /// Empties the socket: without a key nothing is even looked at.
@@ -215,8 +225,8 @@ impl MavlinkSender {
         for _ in 0..64 {
             let Ok((length, _)) = self.socket.recv_from(&mut buffer) else { return };
             let Some((key, _)) = &self.key else { continue };
-            let verdict = frame::verify(&buffer[..length], key).and_then(|(_, _, stamp)| {
-                let now = utc.map_or(0, frame::time_stamp);
+            let verdict = packet::verify(&buffer[..length], key).and_then(|(_, _, stamp)| {
+                let now = utc.map_or(0, packet::time_stamp);
                 let fresh = stamp > self.heard_stamp && stamp.saturating_add(REPLAY_WINDOW) > now;
                 if fresh { Ok(stamp) } else { Err(Refused::Replayed) }
             });

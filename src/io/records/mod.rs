@@ -1,13 +1,15 @@
 //! What is kept: events and outputs as protobuf messages on named topics.
 
-mod inputs;
+mod events;
+mod messages;
 mod outputs;
 mod schema;
 pub mod topic;
-pub mod warm;
+pub mod warm_message;
 
-pub use inputs::{encoding_of_raw, of_event};
-pub use outputs::{DaemonFigures, Recorder, detections, health, ownship, target_state};
+pub use events::{EventDecoder, KeptMessage, is_event, of_event, topic_of_event};
+pub use messages::{detections, health, ownship, target_state};
+pub use outputs::{DaemonFigures, OutputEncoder, opening};
 pub use schema::Schema;
 
 use std::borrow::Cow;

@@ -4,14 +4,14 @@
 //! sentence means accepted; an echo with other values means refused.
 
 use super::GARMIN_ANSWER;
-use windhover_base::time::{MonoTime, Span};
+use windhover_base::time::MonoTime;
 use windhover_decode::{Sentence, framed};
 
 /// What to do now.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub(super) enum Step {
-    /// Nothing.
-    Wait,
+    /// Nothing until the receiver answers, or until this time.
+    Wait(MonoTime),
     /// Write this sentence.
     Send(String),
     /// All done: so many settings were accepted.
@@ -59,29 +59,27 @@ impl GarminSetup {
 
     /// What to do at `now`.
     pub(super) fn due(&mut self, now: MonoTime) -> Step {
-        let Some((body, must_answer)) = SENTENCES.get(self.next).copied() else {
-            return Step::Accepted(self.accepted);
-        };
-        let Some(asked) = self.asked else {
-            self.asked = Some(now);
-            self.heard.clear();
-            return Step::Send(sentence(body));
-        };
-        match self.answer(body) {
-            Some(true) => {
-                self.accepted += 1;
-                self.advance();
-                Step::Wait
+        loop {
+            let Some((body, must_answer)) = SENTENCES.get(self.next).copied() else {
+                return Step::Accepted(self.accepted);
+            };
+            let Some(asked) = self.asked else {
+                self.asked = Some(now);
+                self.heard.clear();
+                return Step::Send(sentence(body));
+            };
+            match self.answer(body) {
+                Some(true) => self.accepted += 1,
+                Some(false) => {
+                    return Step::Refused(format!("the receiver answered {body} with other values"));
+                }
+                None if now < asked + GARMIN_ANSWER => return Step::Wait(asked + GARMIN_ANSWER),
+                None if must_answer => {
+                    return Step::Refused(format!("the receiver did not answer {body}; is it a Garmin?"));
+                }
+                None => {}
             }
-            Some(false) => Step::Refused(format!("the receiver answered {body} with other values")),
-            None if now - asked < Span::from_ns(GARMIN_ANSWER.as_nanos() as i64) => Step::Wait,
-            None if must_answer => {
-                Step::Refused(format!("the receiver did not answer {body}; is it a Garmin?"))
-            }
-            None => {
-                self.advance();
-                Step::Wait
-            }
+            self.advance();
         }
     }
 
@@ -121,6 +119,7 @@ pub(super) fn bodies(text: &str) -> impl Iterator<Item = &str> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use windhover_base::time::Span;
 
     fn at(ms: f64) -> MonoTime {
         MonoTime::from_ns(0) + Span::from_ms(ms)
@@ -131,7 +130,7 @@ mod tests {
         let mut setup = GarminSetup::new();
         for pass in 0..1000 {
             match setup.due(at(f64::from(pass) * 50.0)) {
-                Step::Wait => {}
+                Step::Wait(_) => {}
                 Step::Send(sentence) => {
                     if let Some(echo) = answer(&sentence) {
                         setup.heard(echo.as_bytes());

@@ -4,14 +4,10 @@
 //! Source: Garmin GPS 18x technical specifications, "Sensor Configuration Information (PGRMC)": field 10 is
 //! the line speed, which takes effect after a reset (`PGRMI`, field 7 = R).
 
-use std::io::Read as _;
-
-use serialport::{SerialPort as _, TTYPort};
-
 use super::garmin::{bodies, sentence};
-use super::{IoKind, READ_BYTES, SerialSettings, unplugged};
+use super::{Line, READ_BYTES, SerialSettings, left};
 use crate::io::clock::HostClock;
-use crate::io::device::{Fault, NoteKind, Report, Stop};
+use crate::io::device::{Fault, NoteKind, Report, Reports, wait_for};
 use windhover_base::time::Span;
 
 /// Speeds a receiver may speak and their codes in PGRMC, factory settings first.
@@ -28,78 +24,65 @@ const RESET: &str = "PGRMI,,,,,,,R";
 
 /// The line while its speed is settled.
 pub(super) struct Settling<'a> {
-    pub(super) port: &'a mut TTYPort,
+    pub(super) line: &'a mut Line,
     pub(super) settings: &'a SerialSettings,
     pub(super) clock: HostClock,
-    pub(super) stop: &'a Stop,
-    pub(super) tell: &'a dyn Fn(Report),
+    pub(super) reports: Reports<'a>,
 }
 
 impl Settling<'_> {
     /// Leaves the line at the configured speed, and the receiver too where it can be brought there.
-    pub(super) fn settle(mut self) -> Result<(), Fault> {
+    pub(super) async fn settle(mut self) -> Result<(), Fault> {
         let wanted = self.settings.baud;
-        if self.speaks()? {
+        if self.speaks().await? {
             return Ok(());
         }
         let Some(code) = SPEEDS.iter().find(|(speed, _)| *speed == wanted).map(|(_, code)| *code) else {
             return Ok(());
         };
         for (speed, _) in SPEEDS.iter().filter(|(speed, _)| *speed != wanted) {
-            self.set_speed(*speed)?;
-            if !self.speaks()? {
+            self.line.set_speed(*speed).await?;
+            if !self.speaks().await? {
                 continue;
             }
             let body = format!("PGRMC,,,,,,,,,,{code}");
-            self.send(&body)?;
-            let heard = self.listen(|text| answered(text, code))?;
-            self.send(RESET)?;
+            self.send(&body).await?;
+            let heard = self.listen(|text| answered(text, code)).await?;
+            self.send(RESET).await?;
             // Its echo still comes at the old speed; the new one holds after the reset.
-            self.listen(|text| bodies(text).any(|body| body.starts_with("PGRMI")))?;
+            self.listen(|text| bodies(text).any(|body| body.starts_with("PGRMI"))).await?;
             let text = format!("the receiver spoke at {speed} baud and was told to speak at {wanted}");
             let note = if heard { NoteKind::Configured } else { NoteKind::NotConfigured };
-            (self.tell)(Report::Note(note, 1, text));
+            (self.reports)(Report::Note(note, 1, text));
             break;
         }
-        self.set_speed(wanted)
+        self.line.set_speed(wanted).await
     }
 
     /// Whether sentences arrive at the line's present speed.
-    fn speaks(&mut self) -> Result<bool, Fault> {
-        self.send(QUERY)?;
-        self.listen(holds_a_sentence)
+    async fn speaks(&mut self) -> Result<bool, Fault> {
+        self.send(QUERY).await?;
+        self.listen(holds_a_sentence).await
     }
 
-    fn set_speed(&mut self, speed: u32) -> Result<(), Fault> {
-        let lost = |_| unplugged(&self.settings.device);
-        // What was written goes out at the speed it was meant for.
-        std::io::Write::flush(self.port).map_err(|_| unplugged(&self.settings.device))?;
-        self.port.set_baud_rate(speed).map_err(lost)?;
-        self.port.clear(serialport::ClearBuffer::Input).map_err(lost)
+    async fn send(&mut self, body: &str) -> Result<(), Fault> {
+        self.line.write(sentence(body).as_bytes()).await
     }
 
-    fn send(&mut self, body: &str) -> Result<(), Fault> {
-        std::io::Write::write_all(self.port, sentence(body).as_bytes())
-            .map_err(|_| unplugged(&self.settings.device))
-    }
-
-    /// Hears the line for a while; whether `enough` was heard.
-    fn listen(&mut self, enough: impl Fn(&str) -> bool) -> Result<bool, Fault> {
-        let until = self.clock.now() + LISTEN;
+    /// Reads the line for a while; whether `enough` was read.
+    async fn listen(&mut self, enough: impl Fn(&str) -> bool + Send) -> Result<bool, Fault> {
+        let limit = self.clock.now() + LISTEN;
         let (mut text, mut buffer) = (String::new(), vec![0; READ_BYTES]);
-        while self.clock.now() < until && !self.stop.asked() {
-            (self.tell)(Report::Beat);
-            match self.port.read(&mut buffer) {
-                Ok(0) => return Err(unplugged(&self.settings.device)),
-                Ok(count) => text.push_str(&String::from_utf8_lossy(&buffer[..count])),
-                Err(error) if matches!(error.kind(), IoKind::TimedOut | IoKind::Interrupted) => {}
-                Err(_) => return Err(unplugged(&self.settings.device)),
-            }
+        loop {
+            let read = wait_for(self.line.read(&mut buffer), self.reports);
+            let Ok(read) = tokio::time::timeout(left(limit, self.clock), read).await else {
+                return Ok(false);
+            };
+            text.push_str(&String::from_utf8_lossy(&buffer[..read?]));
             if enough(&text) {
                 return Ok(true);
             }
         }
-        Ok(false)
     }
 }
 

@@ -1,20 +1,20 @@
-//! One serial line on its own thread: open, read, tell, and open again when it went away.
+//! One serial line as a task: open, wait for bytes, report them, and open again when the line went away.
 
 mod garbled;
 mod garmin;
 mod garmin_speed;
+mod line;
 
-use std::io::{ErrorKind as IoKind, Read, Write};
-use std::path::Path;
+use std::convert::Infallible;
 use std::time::Duration;
 
-use serialport::TTYPort;
-
 use super::clock::HostClock;
-use super::device::{Backoff, Fault, FaultKind, NAP, NoteKind, Report, Stop};
+use super::device::{Backoff, Fault, FaultKind, NoteKind, Report, Reports, wait_for};
 use garbled::TextShare;
-use garmin::GarminSetup;
+use garmin::{GarminSetup, Step};
 use garmin_speed::Settling;
+use line::Line;
+use windhover_base::time::{MonoTime, Span};
 
 /// What a line is and how it is set.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -32,146 +32,116 @@ pub struct SerialSettings {
 /// Bytes one read can return; a line at 2 Mbit/s fills it in 20 ms.
 const READ_BYTES: usize = 4096;
 
-/// Reads the line until the end is asked for. Runs on the calling thread; everything it has to say
-/// goes through `tell`, at least every 100 ms.
-pub fn run(settings: &SerialSettings, clock: HostClock, stop: &Stop, tell: &dyn Fn(Report)) {
+/// How long a receiver has to answer a configuration sentence.
+const GARMIN_ANSWER: Span = Span::from_ns(1_500_000_000);
+
+/// Reads the line for ever; dropping the future closes it.
+pub async fn run(settings: &SerialSettings, clock: HostClock, reports: Reports<'_>) -> Infallible {
     let mut backoff = Backoff::new();
-    while !stop.asked() {
-        let fault = match open(settings) {
-            Ok(port) => {
-                tell(Report::Up(format!("{} at {} baud", settings.device, settings.baud)));
-                match read_until_lost(port, settings, clock, stop, tell, &mut backoff) {
-                    Some(fault) => fault,
-                    None => return,
-                }
+    loop {
+        let fault = match Line::open(settings).await {
+            Ok(line) => {
+                reports(Report::Up(format!("{} at {} baud", settings.device, settings.baud)));
+                let mut reader = Reader { line, settings, clock, reports };
+                let fault = match reader.read(&mut backoff).await {
+                    Ok(never) => match never {},
+                    Err(fault) => fault,
+                };
+                reader.line.close().await;
+                fault
             }
             Err(fault) => fault,
         };
-        tell(Report::Down(fault));
-        backoff.wait(stop, tell);
+        reports(Report::Down(fault));
+        backoff.wait(reports).await;
     }
 }
 
-/// Opens the line for this program alone. A device that is busy, missing, forbidden or no serial
-/// line is told apart.
-fn open(settings: &SerialSettings) -> Result<TTYPort, Fault> {
-    let device = settings.device.as_str();
-    if settings.baud == 0 {
-        return Err(Fault::new(FaultKind::Unsuitable, device, "line speed 0 hangs up; set baud"));
-    }
-    // The serial library folds several errors into one; the plain system calls tell them apart.
-    std::fs::metadata(device).map_err(|e| Fault::from_io(device, &e))?;
-    let builder = serialport::new(device, settings.baud).timeout(NAP);
-    TTYPort::open(&builder).map_err(|error| fault_from_open(device, settings.baud, &error))
-}
-
-fn fault_from_open(device: &str, baud: u32, error: &serialport::Error) -> Fault {
-    use serialport::ErrorKind;
-    match error.kind() {
-        ErrorKind::NoDevice => {
-            Fault::new(FaultKind::Busy, device, "another program holds the port; stop that program")
-        }
-        ErrorKind::Io(IoKind::NotFound) => {
-            Fault::new(FaultKind::Missing, device, "not there; is it plugged in?")
-        }
-        ErrorKind::Io(IoKind::PermissionDenied) => Fault::new(
-            FaultKind::Denied,
-            device,
-            "permission denied; add this user to the group that owns it (dialout)",
-        ),
-        _ if !Path::new(device).exists() => {
-            Fault::new(FaultKind::Missing, device, "not there; is it plugged in?")
-        }
-        ErrorKind::InvalidInput => {
-            Fault::new(FaultKind::Unsuitable, device, format!("{error}; does it do {baud} baud?"))
-        }
-        _ => Fault::new(FaultKind::Failed, device, format!("cannot be opened as a serial line: {error}")),
-    }
-}
-
-/// Reads until the line is lost (the fault) or the end is asked for (`None`).
-fn read_until_lost(
-    mut port: TTYPort,
-    settings: &SerialSettings,
+/// An open line and what is needed to read it.
+struct Reader<'a> {
+    line: Line,
+    settings: &'a SerialSettings,
     clock: HostClock,
-    stop: &Stop,
-    tell: &dyn Fn(Report),
-    backoff: &mut Backoff,
-) -> Option<Fault> {
-    let mut buffer = vec![0; READ_BYTES];
-    let mut share = TextShare::default();
-    let mut setup = None;
-    if settings.configure_garmin {
-        if let Err(fault) = (Settling { port: &mut port, settings, clock, stop, tell }).settle() {
-            return Some(fault);
-        }
-        setup = Some(GarminSetup::new());
-    }
-    while !stop.asked() {
-        let now = clock.now();
-        if let Some(step) = setup.as_mut().map(|setup| setup.due(now))
-            && let Err(fault) = garmin_step(step, &mut port, settings, tell, &mut setup)
-        {
-            return Some(fault);
-        }
-        match port.read(&mut buffer) {
-            Ok(0) => return Some(unplugged(&settings.device)),
-            Ok(count) => {
-                let bytes = &buffer[..count];
-                tell(Report::Bytes(clock.now(), bytes.to_vec()));
-                backoff.reset();
-                if let Some(setup) = &mut setup {
-                    setup.heard(bytes);
-                }
-                if settings.text
-                    && let Some(percent) = share.garbled(bytes)
-                {
-                    let text = format!(
-                        "{percent} % of what {} sends is no text; is its line speed {} baud?",
-                        settings.device, settings.baud
-                    );
-                    tell(Report::Note(NoteKind::Garbled, 1, text));
-                }
-            }
-            Err(error) if matches!(error.kind(), IoKind::TimedOut | IoKind::Interrupted) => {}
-            Err(_) => return Some(unplugged(&settings.device)),
-        }
-        tell(Report::Beat);
-    }
-    None
+    reports: Reports<'a>,
 }
 
-/// Does one step of a receiver's configuration; the setup ends itself when it is through.
-fn garmin_step(
-    step: garmin::Step,
-    port: &mut TTYPort,
-    settings: &SerialSettings,
-    tell: &dyn Fn(Report),
-    setup: &mut Option<GarminSetup>,
-) -> Result<(), Fault> {
-    match step {
-        garmin::Step::Wait => {}
-        garmin::Step::Send(sentence) => {
-            port.write_all(sentence.as_bytes()).map_err(|_| unplugged(&settings.device))?;
+impl Reader<'_> {
+    /// Reads until the line is lost.
+    async fn read(&mut self, backoff: &mut Backoff) -> Result<Infallible, Fault> {
+        let mut setup = None;
+        if self.settings.configure_garmin {
+            let (settings, clock, reports) = (self.settings, self.clock, self.reports);
+            Settling { line: &mut self.line, settings, clock, reports }.settle().await?;
+            setup = Some(GarminSetup::new());
         }
-        garmin::Step::Accepted(count) => {
-            tell(Report::Note(NoteKind::Configured, count, format!("{count} settings accepted")));
-            *setup = None;
-        }
-        garmin::Step::Refused(what) => {
-            tell(Report::Note(NoteKind::NotConfigured, 1, what));
-            *setup = None;
+        let mut buffer = vec![0; READ_BYTES];
+        let mut share = TextShare::default();
+        loop {
+            let answer_by = match &mut setup {
+                Some(running) => self.configure(running).await?,
+                None => None,
+            };
+            if answer_by.is_none() {
+                setup = None;
+            }
+            let Some(count) = self.read_by(answer_by, &mut buffer).await? else { continue };
+            let bytes = &buffer[..count];
+            (self.reports)(Report::Bytes(self.clock.now(), bytes.to_vec()));
+            backoff.reset();
+            if let Some(setup) = &mut setup {
+                setup.heard(bytes);
+            }
+            self.judge(&mut share, bytes);
         }
     }
-    Ok(())
+
+    /// Waits for bytes; `None` where none came until `limit`.
+    async fn read_by(&mut self, limit: Option<MonoTime>, buffer: &mut [u8]) -> Result<Option<usize>, Fault> {
+        let left = limit.map_or(Duration::MAX, |limit| left(limit, self.clock));
+        let read = wait_for(self.line.read(buffer), self.reports);
+        tokio::time::timeout(left, read).await.ok().transpose()
+    }
+
+    /// Reports where text that arrives is no text.
+    fn judge(&self, share: &mut TextShare, bytes: &[u8]) {
+        if self.settings.text
+            && let Some(percent) = share.garbled(bytes)
+        {
+            let (device, baud) = (&self.settings.device, self.settings.baud);
+            let text =
+                format!("{percent} % of what {device} sends is no text; is its line speed {baud} baud?");
+            (self.reports)(Report::Note(NoteKind::Garbled, 1, text));
+        }
+    }
+
+    /// Goes on with a receiver's configuration; until when its answer is waited for, `None` where it is through.
+    async fn configure(&mut self, setup: &mut GarminSetup) -> Result<Option<MonoTime>, Fault> {
+        loop {
+            let note = match setup.due(self.clock.now()) {
+                Step::Wait(limit) => return Ok(Some(limit)),
+                Step::Send(sentence) => {
+                    self.line.write(sentence.as_bytes()).await?;
+                    continue;
+                }
+                Step::Accepted(count) => {
+                    Report::Note(NoteKind::Configured, count, format!("{count} settings accepted"))
+                }
+                Step::Refused(what) => Report::Note(NoteKind::NotConfigured, 1, what),
+            };
+            (self.reports)(note);
+            return Ok(None);
+        }
+    }
+}
+
+/// Time left until `limit`.
+fn left(limit: MonoTime, clock: HostClock) -> Duration {
+    Duration::from_nanos(u64::try_from((limit - clock.now()).ns()).unwrap_or(0))
 }
 
 fn unplugged(device: &str) -> Fault {
     Fault::new(FaultKind::Unplugged, device, "the line went away; waiting for it to come back")
 }
-
-/// How long a receiver has to answer a configuration sentence.
-const GARMIN_ANSWER: Duration = Duration::from_millis(1500);
 
 #[cfg(test)]
 mod tests;

@@ -9,6 +9,9 @@ use std::time::Duration;
 
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 
+use serialport::TTYPort;
+use tokio_util::sync::CancellationToken;
+
 use super::*;
 
 /// The far end of a pseudo-terminal and the name of its near end.
@@ -24,7 +27,7 @@ fn pty() -> (File, String) {
 /// A running line: its reports, and the switch that ends it.
 struct Line {
     reports: Receiver<Report>,
-    stop: Stop,
+    stop: CancellationToken,
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
@@ -33,13 +36,14 @@ impl Line {
         let settings =
             SerialSettings { device: device.to_owned(), baud: 38400, text: true, configure_garmin };
         let (sender, reports) = channel();
-        let stop = Stop::default();
+        let stop = CancellationToken::new();
         let thread = std::thread::spawn({
             let stop = stop.clone();
             move || {
-                run(&settings, HostClock::start(), &stop, &|report| {
-                    let _ = sender.send(report);
-                });
+                let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+                let reports = move |report| drop(sender.send(report));
+                let line = run(&settings, HostClock::start(), &reports);
+                runtime.expect("a runtime").block_on(stop.run_until_cancelled(line));
             }
         });
         Self { reports, stop, thread: Some(thread) }
@@ -68,7 +72,7 @@ impl Line {
 
 impl Drop for Line {
     fn drop(&mut self) {
-        self.stop.ask();
+        self.stop.cancel();
         if let Some(thread) = self.thread.take() {
             thread.join().expect("the line's thread ends by itself");
         }

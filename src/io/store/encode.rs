@@ -5,10 +5,10 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::frames::FrameKeeper;
+use super::frame_keeper::FrameKeeper;
 use super::queue::{Entry, Popped, Queue};
 use super::record::{ChannelDef, RawRecord, STATE_TOPIC, Weight};
-use super::shared::Shared;
+use super::store_shared::StoreShared;
 use crate::io::records::{self, Record, Schema};
 use windhover_base::msg::{Event, EventBody, Source};
 use windhover_base::time::MonoTime;
@@ -68,7 +68,7 @@ pub(super) fn run(
     intake: &Queue<Work>,
     output: &Queue<RawRecord>,
     frames: &FrameKeeper,
-    shared: &Shared,
+    shared: &StoreShared,
     now: impl Fn() -> MonoTime,
 ) {
     let mut channels = Channels::default();
@@ -118,7 +118,7 @@ pub(super) fn run(
 fn encode_event(
     event: &Event,
     frames: &FrameKeeper,
-    shared: &Shared,
+    shared: &StoreShared,
     channels: &mut Channels,
 ) -> Option<RawRecord> {
     if let EventBody::Frame(frame) = &event.body {

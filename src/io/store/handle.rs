@@ -7,20 +7,20 @@ use std::time::Duration;
 
 use super::encode::{self, Work};
 use super::flight_writer::SegmentLimits;
-use super::frames::{FrameKeeper, Region};
+use super::frame_keeper::{FrameKeeper, Region};
 use super::index::Index;
 use super::keeper::{Keeper, Message};
 use super::queue::{Entry, Queue};
 use super::record::{RawRecord, STATE_TOPIC, Weight};
 use super::recorder::{self, Recorder, Settings};
 use super::segment::Head;
-use super::shared::Shared;
 use super::status::{Recording, StoreNotice, StoreStatus};
+use super::store_shared::StoreShared;
 use super::volume::Volume;
 use crate::config::{Config, StoreConfig};
 use crate::io::clock::HostClock;
-use crate::io::records::{Record, topic};
-use windhover_base::msg::{Event, EventBody, Source, WarmState};
+use crate::io::records::{self, Record};
+use windhover_base::msg::{Event, EventBody, WarmState};
 use windhover_base::time::UtcTime;
 
 /// Dates before this are a receiver's error (a week number that rolled over, a clock without a
@@ -42,7 +42,7 @@ pub struct Store {
 #[derive(Clone, Debug)]
 pub struct StoreHandle {
     intake: Arc<Queue<Work>>,
-    shared: Arc<Shared>,
+    shared: Arc<StoreShared>,
     keeper: std::sync::mpsc::SyncSender<Message>,
     region_margin_px: u32,
 }
@@ -63,7 +63,7 @@ impl Store {
     ) -> (Self, Receiver<StoreNotice>) {
         let (notices, heard) = sync_channel(256);
         let (to_keeper, inbox) = sync_channel(256);
-        let shared = Arc::new(Shared::new(notices));
+        let shared = Arc::new(StoreShared::new(notices));
         let half = (store.queue_mb as usize) << 19;
         let intake = Arc::new(Queue::new(half));
         let output: Arc<Queue<RawRecord>> = Arc::new(Queue::new(half));
@@ -124,15 +124,12 @@ fn spawn(name: &str, work: impl FnOnce() + Send + 'static) -> Option<JoinHandle<
 impl StoreHandle {
     /// Keeps an event as it was heard.
     pub fn event(&self, event: &Event) {
-        let (topic, bytes, weight) = match &event.body {
-            EventBody::Tick => return,
-            EventBody::Bytes { source, data } => (source.topic(), data.len(), Weight::Small),
-            EventBody::Frame(frame) => (Source::Camera.topic(), frame.data.len(), Weight::Frame),
-            EventBody::Warm(_) => (topic::WARM_START, size_of::<WarmState>() + 1024, Weight::Small),
-            EventBody::Dropped { .. }
-            | EventBody::Pulse
-            | EventBody::SourceUp(_)
-            | EventBody::SourceDown(_) => (topic::SOURCE_EVENT, 0, Weight::Small),
+        let Some(topic) = records::topic_of_event(&event.body) else { return };
+        let (bytes, weight) = match &event.body {
+            EventBody::Bytes { data, .. } => (data.len(), Weight::Small),
+            EventBody::Frame(frame) => (frame.data.len(), Weight::Frame),
+            EventBody::Warm(_) => (size_of::<WarmState>() + 1024, Weight::Small),
+            _ => (0, Weight::Small),
         };
         let log_ns = encode::unsigned(event.t_recv);
         let value = Work::Event(event.clone());

@@ -15,8 +15,8 @@ use super::inspect;
 use super::rebuild;
 use super::retention;
 use super::seal::{self, Sealing};
-use super::shared::Shared;
 use super::status::{Recording, StoreNotice};
+use super::store_shared::StoreShared;
 use super::volume::{StoreResult, Volume};
 use crate::config::StoreConfig;
 use crate::io::clock::HostClock;
@@ -71,7 +71,7 @@ pub(super) struct Keeper {
     volume: Volume,
     config: StoreConfig,
     clock: HostClock,
-    shared: Arc<Shared>,
+    shared: Arc<StoreShared>,
     index: Option<Index>,
     tried_at: Option<MonoTime>,
     retained_at: MonoTime,
@@ -88,7 +88,12 @@ pub(super) struct Keeper {
 }
 
 impl Keeper {
-    pub(super) fn new(volume: Volume, config: StoreConfig, clock: HostClock, shared: Arc<Shared>) -> Self {
+    pub(super) fn new(
+        volume: Volume,
+        config: StoreConfig,
+        clock: HostClock,
+        shared: Arc<StoreShared>,
+    ) -> Self {
         Self {
             volume,
             config,

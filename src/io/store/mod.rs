@@ -11,7 +11,7 @@ mod encode;
 pub mod flight;
 pub mod flight_writer;
 pub mod format;
-pub mod frames;
+pub mod frame_keeper;
 mod handle;
 #[cfg(test)]
 mod handle_tests;
@@ -29,12 +29,12 @@ pub mod seal;
 #[cfg(test)]
 mod seal_tests;
 pub mod segment;
-mod shared;
 pub mod status;
+mod store_shared;
 pub mod summary;
 pub mod volume;
 pub mod wear;
 
-pub use frames::Region;
+pub use frame_keeper::Region;
 pub use handle::{Store, StoreHandle};
 pub use status::{Recording, StoreNotice, StoreStatus};

@@ -17,8 +17,8 @@ use super::keeper::Message;
 use super::queue::{Drops, Popped, Queue};
 use super::record::{ChannelDef, DROPOUT_TOPIC, RawRecord, STATE_TOPIC, Weight};
 use super::segment::Head;
-use super::shared::Shared;
 use super::status::{Durations, Recording, StoreNotice};
+use super::store_shared::StoreShared;
 use super::volume::{StoreError, StoreResult, Volume, device_of};
 use crate::config::StoreConfig;
 use crate::io::clock::HostClock;
@@ -48,7 +48,7 @@ pub(super) struct Recorder {
     volume: Volume,
     settings: Settings,
     clock: HostClock,
-    shared: Arc<Shared>,
+    shared: Arc<StoreShared>,
     keeper: SyncSender<Message>,
     flight: Option<FlightWriter>,
     trouble: Option<String>,
@@ -70,7 +70,7 @@ impl Recorder {
         volume: Volume,
         settings: Settings,
         clock: HostClock,
-        shared: Arc<Shared>,
+        shared: Arc<StoreShared>,
         keeper: SyncSender<Message>,
     ) -> Self {
         Self {

@@ -175,3 +175,26 @@ pub struct Ownship {
     /// One-sigma of attitude as small rotations about north, east, down, radians.
     pub attitude_sigma_rad: Vector3<f64>,
 }
+
+/// What the joint filter says.
+#[derive(Clone, PartialEq, Debug)]
+pub enum EstimatorOutput {
+    /// A target at a frame, as known when the frame had been looked at.
+    Estimate(TargetEstimate),
+    /// A target at an earlier frame, with what was measured up to the smoother's lag after it.
+    Smoothed(TargetEstimate),
+    /// The helicopter at a frame.
+    Ownship(Ownship),
+    /// What became of a measurement.
+    Fusion(FusionResult),
+    /// The receiver jumped for good: helicopter, targets and ground features moved along.
+    Anchored {
+        /// By how much, NED.
+        moved_m: Vector3<f64>,
+    },
+    /// The filter started again.
+    Reset {
+        /// Why.
+        reason: &'static str,
+    },
+}

@@ -28,7 +28,7 @@ pub enum EventBody {
     },
     /// One camera frame.
     Frame(FramePayload),
-    /// Time passed: silence is an event too, so that time-outs replay.
+    /// Time passed and nothing arrived. It follows from the times of the events around it, so it is not kept.
     Tick,
     /// Something was lost before it could be recorded.
     Dropped {

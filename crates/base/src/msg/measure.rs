@@ -77,6 +77,15 @@ pub struct AttitudeSample {
     pub tilt: Option<Tilt>,
 }
 
+/// A measurement that a line's bytes were decoded to.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum Measurement {
+    /// Of a GPS receiver.
+    Gnss(Stamped<GnssEpoch>),
+    /// Of a compass.
+    Attitude(Stamped<AttitudeSample>),
+}
+
 /// Which marker a detection is of.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum MarkerId {

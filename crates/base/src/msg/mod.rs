@@ -13,17 +13,19 @@ mod source;
 mod warm;
 
 pub use estimate::{
-    Disposition, FusionResult, FusionSource, Ownship, TargetEstimate, TargetState, TrackStatus,
+    Disposition, EstimatorOutput, FusionResult, FusionSource, Ownship, TargetEstimate, TargetState,
+    TrackStatus,
 };
 pub use event::{Event, EventBody, FrameEncoding, FramePayload};
 pub use family::{FamilySpec, TagFamily};
 pub use health::{Health, SourceHealth, TargetHealth};
 pub use image::{GrayImage, ImageView, RgbImage};
 pub use measure::{
-    AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, MarkerDetection, MarkerId, Stamped,
+    AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, MarkerDetection, MarkerId,
+    Measurement, Stamped,
 };
 pub use notice::{Notice, NoticeKind};
-pub use output::Output;
+pub use output::{Output, TimedOutput};
 pub use predict::{FramePrediction, MarkerPrediction};
 pub use source::{Delivery, PerSource, Source};
 pub use warm::{WARM_STATES, WarmArrival, WarmFilter, WarmSite, WarmState};

@@ -1,9 +1,6 @@
 //! What the pipeline says: estimates, what became of measurements, notices, health.
 
-use super::{
-    AttitudeSample, FeatureTrack, FusionResult, GnssEpoch, Health, MarkerDetection, Notice, Ownship, Stamped,
-    TargetEstimate,
-};
+use super::{EstimatorOutput, FeatureTrack, Health, MarkerDetection, Measurement, Notice, TargetEstimate};
 use crate::geo::Geodetic;
 use crate::time::MonoTime;
 
@@ -12,10 +9,8 @@ use crate::time::MonoTime;
 pub enum Output {
     /// The origin of the NED frame was settled, at this host time.
     Datum(MonoTime, Geodetic),
-    /// A GPS epoch, mapped to host time.
-    Fix(Stamped<GnssEpoch>),
-    /// A compass sample, mapped to host time.
-    Attitude(Stamped<AttitudeSample>),
+    /// A measurement, mapped to host time.
+    Measured(Measurement),
     /// What was seen in a frame.
     Detections {
         /// Number of the frame.
@@ -27,18 +22,21 @@ pub enum Output {
         /// Ground features.
         features: Vec<FeatureTrack>,
     },
-    /// The helicopter's own state at a frame.
-    Ownship(Ownship),
-    /// A target's estimate at a frame, as known in real time.
-    Estimate(TargetEstimate),
-    /// A target's estimate at an earlier frame, from the fixed-lag smoother.
-    Smoothed(TargetEstimate),
+    /// The joint filter says something.
+    Estimator(EstimatorOutput),
     /// A target's estimate by the paper's method.
     Paper(TargetEstimate),
-    /// What became of a measurement.
-    Fusion(FusionResult),
     /// Something an operator should know.
     Notice(Notice),
     /// How everything does, once a second.
     Health(Box<Health>),
+}
+
+/// An output, and when what caused it happened.
+#[derive(Clone, Debug)]
+pub struct TimedOutput {
+    /// Host time of the event, or of the tick before it, from which the output followed.
+    pub t_cause: MonoTime,
+    /// The output.
+    pub output: Output,
 }

@@ -13,7 +13,7 @@ use tokio::sync::{Notify, mpsc};
 use tokio::time::Instant;
 
 use super::governor::Governor;
-use super::payload::{Shared, StationStatus};
+use super::payload_shared::{PayloadShared, StationStatus};
 use super::peer::{Ended, Peer};
 use super::sense::Sense;
 use super::wire::{self, MINOR, Reader, WireError};
@@ -27,7 +27,7 @@ const JUDGE: Duration = Duration::from_millis(100);
 
 /// What the tasks of a session share.
 pub(super) struct Session {
-    shared: Arc<Shared>,
+    shared: Arc<PayloadShared>,
     connection: Connection,
     governor: Mutex<Governor>,
     wanted: Mutex<Wanted>,
@@ -57,7 +57,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 /// Serves a station until the connection ends; tells why it did. `up` is called when both have greeted.
-pub(super) async fn serve(shared: &Arc<Shared>, peer: &Peer, up: impl Fn()) -> Ended {
+pub(super) async fn serve(shared: &Arc<PayloadShared>, peer: &Peer, up: impl Fn()) -> Ended {
     let connection = peer.connection.clone();
     let outcome = match tokio::time::timeout(GREETING, greet(shared, &connection)).await {
         Ok(Ok((control_out, control_in, hello))) => {
@@ -73,7 +73,7 @@ pub(super) async fn serve(shared: &Arc<Shared>, peer: &Peer, up: impl Fn()) -> E
 type Greeted = (SendStream, Reader, pb::StationHello);
 
 /// The control stream is opened by whoever called; both sides greet at once.
-async fn greet(shared: &Arc<Shared>, connection: &Connection) -> Result<Greeted, WireError> {
+async fn greet(shared: &Arc<PayloadShared>, connection: &Connection) -> Result<Greeted, WireError> {
     let ended = |e: quinn::ConnectionError| WireError::Ended(e.to_string());
     let (mut out, input) = match connection.side() {
         quinn::Side::Client => connection.open_bi().await.map_err(ended)?,
@@ -99,7 +99,7 @@ fn extent(e: super::backlog::Extent) -> pb::Extent {
 }
 
 async fn run(
-    shared: &Arc<Shared>,
+    shared: &Arc<PayloadShared>,
     peer: &Peer,
     control_out: SendStream,
     control_in: Reader,

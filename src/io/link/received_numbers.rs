@@ -62,12 +62,12 @@ pub struct Progress {
 
 /// Everything a station knows of one payload's numbers.
 #[derive(Clone, Debug, Default)]
-pub struct Inbox {
+pub struct ReceivedNumbers {
     runs: BTreeMap<u32, Run>,
     repeated: u64,
 }
 
-impl Inbox {
+impl ReceivedNumbers {
     /// The payload tells what it holds of a run. What a station kept of it in earlier lives is asked for
     /// once (`recall`, by flight and run).
     pub fn announce(&mut self, extent: &pb::Extent, recall: impl FnOnce(&str, u32) -> RangeSet) {
@@ -166,71 +166,71 @@ mod tests {
 
     #[test]
     fn what_is_young_is_given_time_and_what_is_missing_is_asked_for() {
-        let mut inbox = Inbox::default();
-        inbox.announce(&extent(0, 10), |_, _| RangeSet::of(0, 3));
-        assert!(ranges(&inbox.want()).is_empty(), "a first look asks for nothing");
-        assert!(inbox.take(5, 12), "live");
-        assert!(!inbox.take(5, 12), "the same again");
-        assert!(!inbox.take(5, 1), "stored in an earlier life");
-        assert_eq!(ranges(&inbox.want()), [(3, 10)]);
-        assert_eq!(ranges(&inbox.want()), [(3, 12)]);
+        let mut received = ReceivedNumbers::default();
+        received.announce(&extent(0, 10), |_, _| RangeSet::of(0, 3));
+        assert!(ranges(&received.want()).is_empty(), "a first look asks for nothing");
+        assert!(received.take(5, 12), "live");
+        assert!(!received.take(5, 12), "the same again");
+        assert!(!received.take(5, 1), "stored in an earlier life");
+        assert_eq!(ranges(&received.want()), [(3, 10)]);
+        assert_eq!(ranges(&received.want()), [(3, 12)]);
         for number in 3..9 {
-            assert!(inbox.take(5, number));
+            assert!(received.take(5, number));
         }
-        inbox.gone(&pb::Range { run: 5, first: 9, end: 12 });
-        assert!(ranges(&inbox.want()).is_empty());
-        let progress = inbox.progress();
+        received.gone(&pb::Range { run: 5, first: 9, end: 12 });
+        assert!(ranges(&received.want()).is_empty());
+        let progress = received.progress();
         assert_eq!((progress.received, progress.missing, progress.gone, progress.repeated), (10, 0, 3, 2));
     }
 
     #[test]
     fn what_is_missing_becomes_overdue_with_time() {
-        let mut inbox = Inbox::default();
-        inbox.announce(&extent(0, 10), |_, _| RangeSet::of(0, 6));
-        let told = |inbox: &Inbox| (inbox.progress().missing, inbox.progress().overdue);
+        let mut received = ReceivedNumbers::default();
+        received.announce(&extent(0, 10), |_, _| RangeSet::of(0, 6));
+        let told = |received: &ReceivedNumbers| (received.progress().missing, received.progress().overdue);
         for _ in 1..OVERDUE_LOOKS {
-            inbox.want();
-            assert_eq!(told(&inbox), (4, 0));
+            received.want();
+            assert_eq!(told(&received), (4, 0));
         }
-        inbox.take(5, 11);
-        inbox.want();
-        assert_eq!(told(&inbox), (5, 4), "10 is still young");
-        inbox.take(5, 6);
-        assert_eq!(told(&inbox), (4, 3));
+        received.take(5, 11);
+        received.want();
+        assert_eq!(told(&received), (5, 4), "10 is still young");
+        received.take(5, 6);
+        assert_eq!(told(&received), (4, 3));
     }
 
     #[test]
     fn a_payload_cannot_make_it_grow_without_bound_or_declare_the_future_gone() {
-        let mut inbox = Inbox::default();
+        let mut received = ReceivedNumbers::default();
         for run in 0..2 * RUNS as u32 {
-            inbox.announce(&pb::Extent { run, ..extent(0, 1) }, |_, _| RangeSet::new());
+            received.announce(&pb::Extent { run, ..extent(0, 1) }, |_, _| RangeSet::new());
         }
-        assert_eq!(inbox.runs.len(), RUNS);
-        inbox.gone(&pb::Range { run: 0, first: 0, end: u32::MAX });
-        assert!(inbox.take(0, 1), "only what was announced can be gone");
+        assert_eq!(received.runs.len(), RUNS);
+        received.gone(&pb::Range { run: 0, first: 0, end: u32::MAX });
+        assert!(received.take(0, 1), "only what was announced can be gone");
     }
 
     #[test]
     fn stored_is_what_is_on_disk_only() {
-        let mut inbox = Inbox::default();
-        inbox.announce(&extent(0, 10), |_, _| RangeSet::new());
+        let mut received = ReceivedNumbers::default();
+        received.announce(&extent(0, 10), |_, _| RangeSet::new());
         for number in 0..6 {
-            inbox.take(5, number);
+            received.take(5, number);
         }
-        inbox.stored(5, &RangeSet::of(0, 4));
-        assert_eq!(inbox.stored_message().ranges, [pb::Range { run: 5, first: 0, end: 4 }]);
+        received.stored(5, &RangeSet::of(0, 4));
+        assert_eq!(received.stored_message().ranges, [pb::Range { run: 5, first: 0, end: 4 }]);
     }
 
     proptest::proptest! {
         #[test]
         fn nothing_is_taken_twice(numbers in proptest::collection::vec(0_u32..50, 0..200)) {
-            let mut inbox = Inbox::default();
-            inbox.announce(&extent(0, 0), |_, _| RangeSet::new());
+            let mut received = ReceivedNumbers::default();
+            received.announce(&extent(0, 0), |_, _| RangeSet::new());
             let mut taken = std::collections::BTreeSet::new();
             for number in numbers {
-                proptest::prop_assert_eq!(inbox.take(5, number), taken.insert(number));
+                proptest::prop_assert_eq!(received.take(5, number), taken.insert(number));
             }
-            let progress = inbox.progress();
+            let progress = received.progress();
             proptest::prop_assert_eq!(progress.received, taken.len() as u64);
             let end = taken.last().map_or(0, |n| u64::from(*n) + 1);
             proptest::prop_assert_eq!(progress.received + progress.missing, end);

@@ -4,14 +4,14 @@ use std::time::Duration;
 
 use prost::Message as _;
 
-use super::card::Slot;
-use super::devices::Surroundings;
+use super::context::TaskContext;
+use super::flight_store::FlightStore;
 use super::supervise::Heart;
 use crate::config::Config;
 use crate::io::clock::HostClock;
 use crate::io::process;
 use crate::io::proto::{host_time, windhover};
-use crate::io::records::warm;
+use crate::io::records::warm_message;
 use crate::io::store::{Recording, StoreHandle};
 use windhover_base::msg::WarmState;
 use windhover_base::time::{MonoTime, Span};
@@ -23,7 +23,7 @@ const STATE: &str = "warm";
 const OLDEST: Span = Span::from_ns(120_000_000_000);
 
 /// Longest the pipeline waits at the start for the card to tell the state. What devices deliver meanwhile
-/// waits in the inbox, which holds twice as much. The state is the first thing read of a card: only one that
+/// waits in the events, which holds twice as much. The state is the first thing read of a card: only one that
 /// is slow beyond use, or an index that another program holds, takes so long.
 const PATIENCE: Span = Span::from_ns(5_000_000_000);
 
@@ -83,7 +83,7 @@ impl Origin {
             boot_id: self.boot_id.clone().unwrap_or_default(),
             host_from_monotonic_ns: self.host_from_monotonic.ns(),
             config_crc: self.config_crc,
-            ..warm::message(t, state)
+            ..warm_message::message(t, state)
         };
         message.encode_to_vec()
     }
@@ -92,7 +92,7 @@ impl Origin {
     /// is told by the monotonic clock, so the computer's date may have been set between.
     pub fn take_back(&self, kept: &[u8], now: MonoTime) -> Result<(WarmState, Span), Stale> {
         let message = windhover::WarmState::decode(kept).map_err(|_| Stale::Unreadable)?;
-        let mut state = warm::state(&message).ok_or(Stale::Unreadable)?;
+        let mut state = warm_message::state(&message).ok_or(Stale::Unreadable)?;
         if self.boot_id.as_deref() != Some(message.boot_id.as_str()) {
             return Err(Stale::AnotherBoot);
         }
@@ -122,13 +122,18 @@ pub fn save(store: &StoreHandle, origin: &Origin, t: MonoTime, state: &WarmState
 }
 
 /// Waits for the card to tell what an earlier run knew.
-pub fn wait_for(slot: &Slot, origin: &Origin, around: &Surroundings, heart: &Heart) -> Earlier {
-    let end = around.clock.now() + PATIENCE;
-    while !around.stop.asked() && around.clock.now() < end {
+pub fn wait_for(
+    flight_store: &FlightStore,
+    origin: &Origin,
+    context: &TaskContext,
+    heart: &Heart,
+) -> Earlier {
+    let end = context.clock.now() + PATIENCE;
+    while !context.stop.is_cancelled() && context.clock.now() < end {
         heart.beat();
-        if let Some(store) = slot.get() {
+        if let Some(store) = flight_store.get() {
             if let Some(index) = store.index() {
-                let kept = index.state(STATE).map(|kept| origin.take_back(&kept, around.clock.now()));
+                let kept = index.state(STATE).map(|kept| origin.take_back(&kept, context.clock.now()));
                 return match kept {
                     Some(Ok((state, age))) => Earlier::Known(Box::new(state), age),
                     Some(Err(stale)) => Earlier::Unusable(stale),
@@ -141,7 +146,7 @@ pub fn wait_for(slot: &Slot, origin: &Origin, around: &Surroundings, heart: &Hea
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    if around.stop.asked() { Earlier::Nothing } else { Earlier::NotTold(PATIENCE) }
+    if context.stop.is_cancelled() { Earlier::Nothing } else { Earlier::NotTold(PATIENCE) }
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! The pipeline's inbox: bounded, in order of time, the oldest frame dropped first.
+//! The queue of events before the pipeline: bounded, in order of time, the oldest frame dropped first.
 
 use std::collections::VecDeque;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
@@ -19,6 +19,9 @@ const CATCH_UP: Span = Span::from_ns(500_000_000);
 
 /// What devices delivered and the pipeline has not yet taken.
 ///
+/// Device tasks put events in, the pipeline's thread takes them out; neither waits for the other. No channel of a
+/// library drops its oldest message and reports that, so the lanes stand here.
+///
 /// Events leave it in the order they were heard, numbered, and with times that never go back: what
 /// the pipeline handles is what is recorded, so a recording replays to the same estimates.
 ///
@@ -29,7 +32,7 @@ const CATCH_UP: Span = Span::from_ns(500_000_000);
 /// Frames that come in a burst are all kept. Only a pipeline that does not catch up loses the oldest: then no more
 /// wait than the queue is set to hold, so that estimates are of what is seen now.
 #[derive(Debug)]
-pub struct Inbox {
+pub struct EventQueue {
     lanes: Mutex<Lanes>,
     filled: Condvar,
     frames: usize,
@@ -46,13 +49,15 @@ struct Lanes {
     /// Since when more frames wait than the queue is set to hold; until all are taken.
     crowded: Option<MonoTime>,
     dropped: PerSource<u32>,
+    /// Whether somebody wants the taker to look up.
+    woken: bool,
     last: Option<MonoTime>,
     next_seq: u64,
     next_frame: u32,
 }
 
-impl Inbox {
-    /// An inbox where so many frames wait for a pipeline that is behind.
+impl EventQueue {
+    /// A queue where so many frames wait for a pipeline that is behind.
     pub fn new(frames: usize) -> Self {
         Self { lanes: Mutex::default(), filled: Condvar::new(), frames: frames.max(1) }
     }
@@ -92,13 +97,21 @@ impl Inbox {
     pub fn take(&self, patience: Duration) -> Option<Event> {
         let mut lanes = self.lock();
         if lanes.is_empty() {
-            let waited = self.filled.wait_timeout_while(lanes, patience, |lanes| lanes.is_empty());
+            let waiting = |lanes: &mut Lanes| lanes.is_empty() && !lanes.woken;
+            let waited = self.filled.wait_timeout_while(lanes, patience, waiting);
             lanes = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
+        lanes.woken = false;
         lanes.next()
     }
 
-    /// An event of the inbox's own making (time passing), numbered in order.
+    /// Has [`Self::take`] return at once, now or when it is called next.
+    pub fn wake(&self) {
+        self.lock().woken = true;
+        self.filled.notify_one();
+    }
+
+    /// An event of the queue's own making (time passing), numbered in order.
     pub fn number(&self, t: MonoTime, body: EventBody) -> Event {
         self.lock().number(t, body)
     }
@@ -176,19 +189,19 @@ mod tests {
         }
     }
 
-    fn drain(inbox: &Inbox) -> Vec<Event> {
-        std::iter::from_fn(|| inbox.take(Duration::ZERO)).collect()
+    fn drain(queue: &EventQueue) -> Vec<Event> {
+        std::iter::from_fn(|| queue.take(Duration::ZERO)).collect()
     }
 
     #[test]
     fn events_leave_in_order_of_time_and_never_go_back() {
-        let inbox = Inbox::new(3);
-        inbox.put_frame(at(20), frame(15));
-        inbox.put(at(10), EventBody::Bytes { source: Source::Gps, data: vec![1] });
-        inbox.put(at(30), EventBody::Bytes { source: Source::Compass, data: vec![2] });
-        let first = drain(&inbox);
-        inbox.put(at(25), EventBody::Bytes { source: Source::Gps, data: vec![3] });
-        let late = drain(&inbox);
+        let queue = EventQueue::new(3);
+        queue.put_frame(at(20), frame(15));
+        queue.put(at(10), EventBody::Bytes { source: Source::Gps, data: vec![1] });
+        queue.put(at(30), EventBody::Bytes { source: Source::Compass, data: vec![2] });
+        let first = drain(&queue);
+        queue.put(at(25), EventBody::Bytes { source: Source::Gps, data: vec![3] });
+        let late = drain(&queue);
         let times: Vec<i64> = first.iter().chain(&late).map(|e| e.t_recv.ns() / 1_000_000).collect();
         assert_eq!(times, [10, 20, 30, 30]);
         let numbers: Vec<u64> = first.iter().chain(&late).map(|e| e.seq).collect();
@@ -197,14 +210,14 @@ mod tests {
 
     #[test]
     fn a_burst_is_kept() {
-        let inbox = Inbox::new(2);
+        let queue = EventQueue::new(2);
         for round in [0, 400, 1000, 5000] {
             // Given a computer that stood still, which delivers everything at once.
             for n in 0..BURST as i64 {
-                inbox.put_frame(at(round + n), frame(round + n));
+                queue.put_frame(at(round + n), frame(round + n));
             }
             // Then all of it is there, in order.
-            let events = drain(&inbox);
+            let events = drain(&queue);
             assert_eq!(events.len(), BURST);
             assert!(events.iter().all(|e| matches!(e.body, EventBody::Frame(_))), "{events:?}");
         }
@@ -213,12 +226,12 @@ mod tests {
     #[test]
     fn a_pipeline_that_is_too_slow_handles_new_frames() {
         // Given a pipeline that takes two frames of three, for ten seconds.
-        let inbox = Inbox::new(3);
+        let queue = EventQueue::new(3);
         let mut ages = Vec::new();
         for n in 0..300 {
-            inbox.put_frame(at(n * 33), frame(n * 33));
+            queue.put_frame(at(n * 33), frame(n * 33));
             if n % 3 != 0 {
-                let taken = std::iter::from_fn(|| inbox.take(Duration::ZERO));
+                let taken = std::iter::from_fn(|| queue.take(Duration::ZERO));
                 let newest = taken.take(2).find(|e| matches!(e.body, EventBody::Frame(_)));
                 ages.extend(newest.map(|e| n * 33 - e.t_recv.ns() / 1_000_000));
             }
@@ -231,11 +244,11 @@ mod tests {
     #[test]
     fn the_newest_frames_win_and_the_loss_is_told() {
         // Given frames that nobody takes for longer than a burst lasts.
-        let inbox = Inbox::new(2);
+        let queue = EventQueue::new(2);
         for ms in [10, 20, 30, 40, 600] {
-            inbox.put_frame(at(ms), frame(ms));
+            queue.put_frame(at(ms), frame(ms));
         }
-        let events = drain(&inbox);
+        let events = drain(&queue);
         assert!(
             matches!(events[0].body, EventBody::Dropped { source: Source::Camera, count: 3 }),
             "{:?}",
@@ -254,15 +267,15 @@ mod tests {
     #[test]
     fn a_pipeline_behind_on_reads_still_sees_frames() {
         // Given a pipeline that takes one read in the time of a frame, three reads behind.
-        let inbox = Inbox::new(2);
+        let queue = EventQueue::new(2);
         for ms in [0, 10, 20] {
-            inbox.put(at(ms), EventBody::Bytes { source: Source::Compass, data: vec![0] });
+            queue.put(at(ms), EventBody::Bytes { source: Source::Compass, data: vec![0] });
         }
         let mut taken = Vec::new();
         for ms in (30..300).step_by(10) {
-            inbox.put_frame(at(ms), frame(ms));
-            inbox.put(at(ms + 1), EventBody::Bytes { source: Source::Compass, data: vec![0] });
-            taken.extend(inbox.take(Duration::ZERO));
+            queue.put_frame(at(ms), frame(ms));
+            queue.put(at(ms + 1), EventBody::Bytes { source: Source::Compass, data: vec![0] });
+            taken.extend(queue.take(Duration::ZERO));
         }
         // Then it comes to a frame all the same, after the reads before it, and what was lost is told with it, once.
         let frames = taken.iter().filter(|e| matches!(e.body, EventBody::Frame(_))).count();
@@ -271,12 +284,19 @@ mod tests {
     }
 
     #[test]
+    fn who_is_woken_does_not_wait() {
+        let queue = EventQueue::new(1);
+        queue.wake();
+        assert!(queue.take(Duration::from_secs(3_600)).is_none());
+    }
+
+    #[test]
     fn reads_are_bounded() {
-        let inbox = Inbox::new(1);
+        let queue = EventQueue::new(1);
         for n in 0..READS + 5 {
-            inbox.put(at(n as i64), EventBody::Bytes { source: Source::Compass, data: vec![0] });
+            queue.put(at(n as i64), EventBody::Bytes { source: Source::Compass, data: vec![0] });
         }
-        let events = drain(&inbox);
+        let events = drain(&queue);
         assert_eq!(events.len(), READS + 1);
         assert!(matches!(events[0].body, EventBody::Dropped { source: Source::Compass, count: 5 }));
     }

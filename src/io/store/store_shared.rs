@@ -4,14 +4,14 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::mpsc::SyncSender;
 use std::sync::{Mutex, MutexGuard, PoisonError, RwLock};
 
-use super::frames::Region;
+use super::frame_keeper::Region;
 use super::index::Index;
 use super::status::{StoreNotice, StoreStatus};
 use windhover_base::time::UtcTime;
 
 /// What the store's threads and its handles share.
 #[derive(Debug)]
-pub(super) struct Shared {
+pub(super) struct StoreShared {
     status: Mutex<StoreStatus>,
     notices: SyncSender<StoreNotice>,
     index: RwLock<Option<Index>>,
@@ -27,7 +27,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-impl Shared {
+impl StoreShared {
     pub(super) fn new(notices: SyncSender<StoreNotice>) -> Self {
         Self {
             status: Mutex::default(),

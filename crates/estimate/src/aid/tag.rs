@@ -1,0 +1,113 @@
+//! A tag on a vehicle: its four corners at once, each through lens, mount, lever arms and the ground under the vehicle.
+
+use nalgebra::{Matrix2, Matrix2x3, Vector2, Vector3};
+
+use windhover_base::msg::{Disposition, FusionSource};
+
+use super::Aid;
+use super::pixel::{self, PoseColumns};
+use crate::blocks::own;
+use crate::core::Core;
+use crate::fitted::blend_factor;
+use crate::measurement::Measurement;
+use crate::models::Models;
+use crate::shape;
+use crate::state::State;
+use crate::update::REFUSE_RATIO;
+
+/// A point of a vehicle as it was seen.
+#[derive(Clone, Copy)]
+pub(super) struct Sighting<'a> {
+    /// In the vehicle frame, m.
+    pub(super) point: &'a Vector3<f64>,
+    pub(super) px: &'a Vector2<f64>,
+    pub(super) cov_px2: &'a Matrix2<f64>,
+}
+
+/// The corners of a tag.
+#[derive(Clone, Copy)]
+pub(crate) struct Tag<'a> {
+    pub(crate) target: usize,
+    /// In the vehicle frame, m.
+    pub(crate) points: &'a [Vector3<f64>; 4],
+    pub(crate) corners_px: &'a [Vector2<f64>; 4],
+    pub(crate) cov_px2: &'a [Matrix2<f64>; 4],
+}
+
+impl Aid for Tag<'_> {
+    const SOURCE: FusionSource = FusionSource::Marker;
+
+    fn linearise(&self, state: &State, models: &Models, z: &mut Measurement) -> Result<(), Disposition> {
+        let corners = self.points.iter().zip(self.corners_px).zip(self.cov_px2);
+        let seen = corners.map(|((point, px), cov_px2)| Sighting { point, px, cov_px2 });
+        linearise_points(self.target, seen, state, models, z)
+    }
+}
+
+/// Writes points of a vehicle into `z`.
+pub(super) fn linearise_points<'a>(
+    target: usize,
+    seen: impl ExactSizeIterator<Item = Sighting<'a>>,
+    state: &State,
+    models: &Models,
+    z: &mut Measurement,
+) -> Result<(), Disposition> {
+    let mean = &state.targets[target].mean;
+    let curvature = pixel::curvature_px2(&state.cov, models);
+    let factor = state.learnt.marker_factor[target];
+    z.begin(2 * seen.len());
+    let camera = PoseColumns::touch(z);
+    let pose = z.touch(state.layout().target(target).pose());
+    for (i, Sighting { point, px, cov_px2 }) in seen.enumerate() {
+        let (world, derivatives) = pixel::target_point(mean, models, point);
+        let view = pixel::view(&state.own, models, &world).ok_or(Disposition::Invalid)?;
+        let known = cov_px2 + Matrix2::identity() * models.marker_var_px2;
+        let noise = known * factor + Matrix2::identity() * curvature;
+        camera.set_point(z, i, px, &view, &noise);
+        z.set(2 * i, pose, &Matrix2x3::from_columns(&derivatives.map(|d| view.d_point * d)));
+    }
+    Ok(())
+}
+
+/// Sightings the fitted noise remembers: some seconds of one vehicle's tags.
+const SAMPLES: f64 = 100.0;
+
+impl Tag<'_> {
+    /// Fuses it through the gate, with its noise raised to what its shape shows; whether it was inside.
+    pub(crate) fn fuse(&self, core: &mut Core) -> bool {
+        if !core.expect_aid(self) {
+            return false;
+        }
+        let worse = core.worse_than_assumed(self.target);
+        fuse_expected(core, self.target, worse)
+    }
+}
+
+/// Fuses the marker that stands in `z` through the gate, its noise raised by a factor; whether it was inside.
+pub(super) fn fuse_expected(core: &mut Core, target: usize, worse: f64) -> bool {
+    let curvature = pixel::curvature_px2(&core.state.cov, &core.models);
+    let settled = curvature < pixel::LITTLE_CURVATURE * core.z.noise[0][0];
+    core.z.scale_noise(worse);
+    let outcome = core.fuse_gated(FusionSource::Marker);
+    if settled && core.teaches(&outcome) {
+        let factor = &mut core.state.learnt.marker_factor[target];
+        blend_factor(factor, outcome.misfit * worse, SAMPLES, pixel::FACTORS);
+    }
+    outcome.ratio <= 1.0
+}
+
+impl Core {
+    /// By what factor the variance of the tag's pixels in `self.z` is larger than assumed, by what its shape shows:
+    /// 1 unless that is beyond the gate, or so far beyond that it is no tag of ours.
+    fn worse_than_assumed(&self, target: usize) -> f64 {
+        if self.at_truth {
+            return 1.0;
+        }
+        let gate = self.models.gates[shape::LEFT];
+        let pose = self.state.layout().target(target).pose();
+        let rigid = [pose.column(0), pose.column(1), pose.column(2), own::POSITION.column(2)];
+        let left =
+            shape::left_over(&self.z, &rigid).filter(|left| (1.0..REFUSE_RATIO).contains(&(left / gate)));
+        left.map_or(1.0, |left| left / shape::LEFT as f64)
+    }
+}

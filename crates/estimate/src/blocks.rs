@@ -1,0 +1,191 @@
+//! Which part of the joint state lies in which columns of the error state.
+//!
+//! Order: the helicopter and its sensors' slow errors ([`own`]), each target ([`TargetBlock`]), each ground feature
+//! (two columns). A new state of the helicopter is a constant of [`own`] behind the last one.
+
+use std::ops::Range;
+
+use nalgebra::SVector;
+
+/// `N` neighbouring columns of the error state.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) struct Block<const N: usize>(usize);
+
+impl<const N: usize> Block<N> {
+    /// The first columns of all.
+    pub(crate) const FIRST: Self = Self(0);
+
+    /// The columns right behind another block.
+    pub(crate) const fn after<const M: usize>(before: Block<M>) -> Self {
+        Self(before.end())
+    }
+
+    /// The `N` columns from the first of another block on.
+    pub(crate) const fn from_start_of<const M: usize>(first: Block<M>) -> Self {
+        Self(first.0)
+    }
+
+    /// The column of component `i`.
+    pub(crate) const fn column(self, i: usize) -> usize {
+        debug_assert!(i < N);
+        self.0 + i
+    }
+
+    /// The column behind its last one.
+    pub(crate) const fn end(self) -> usize {
+        self.0 + N
+    }
+
+    /// Its columns.
+    pub(crate) const fn range(self) -> Range<usize> {
+        self.0..self.end()
+    }
+
+    /// `M` of its columns, from component `i` on.
+    pub(crate) const fn part<const M: usize>(self, i: usize) -> Block<M> {
+        debug_assert!(i + M <= N);
+        Block(self.0 + i)
+    }
+
+    /// Its part of a row of the error state's length.
+    pub(crate) fn of(self, row: &[f64]) -> SVector<f64, N> {
+        SVector::from_column_slice(&row[self.range()])
+    }
+}
+
+/// The helicopter's part.
+pub(crate) mod own {
+    use super::Block;
+
+    /// Position of the body frame's origin, NED, m.
+    pub(crate) const POSITION: Block<3> = Block::FIRST;
+    /// Its velocity, NED, m/s.
+    pub(crate) const VELOCITY: Block<3> = Block::after(POSITION);
+    /// Attitude error: small rotation about the NED axes, `R = exp(δ) R̂`, rad.
+    pub(crate) const ATTITUDE: Block<3> = Block::after(VELOCITY);
+    /// Its vertical component: the error of absolute heading.
+    pub(crate) const TURN: Block<1> = ATTITUDE.part(2);
+    /// Angular rate in the body frame, rad/s.
+    pub(crate) const RATE: Block<3> = Block::after(ATTITUDE);
+    /// Specific force in the body frame, m/s².
+    pub(crate) const FORCE: Block<3> = Block::after(RATE);
+    /// GPS position bias, NED, m.
+    pub(crate) const GPS_BIAS: Block<3> = Block::after(FORCE);
+    /// Compass heading bias, rad.
+    pub(crate) const HEADING_BIAS: Block<1> = Block::after(GPS_BIAS);
+    /// How much of the true tilt the compass reads.
+    pub(crate) const TILT_GAIN: Block<1> = Block::after(HEADING_BIAS);
+    /// Tilt bias (pitch, roll), rad.
+    pub(crate) const TILT_BIAS: Block<2> = Block::after(TILT_GAIN);
+    /// How much older GPS is than configured, s.
+    pub(crate) const GPS_DELAY: Block<1> = Block::after(TILT_BIAS);
+    /// Drag: acceleration per metre a second through the air, 1/s.
+    pub(crate) const DRAG: Block<1> = Block::after(GPS_DELAY);
+
+    /// Rate and force, which the increments of the helicopter's motion are made of.
+    pub(crate) const MOTION: Block<6> = Block::from_start_of(RATE);
+    /// Length of the helicopter's part.
+    pub(crate) const LEN: usize = DRAG.end();
+    /// The slow states, from the receiver's bias on: see `motion/slow.rs`.
+    pub(crate) const SLOW: Block<{ LEN - FORCE.end() }> = Block::after(FORCE);
+}
+
+/// Length of a target's part.
+pub(crate) const TARGET: usize = 5;
+/// Length of a feature's part: north, east.
+pub(crate) const FEATURE: usize = 2;
+
+/// One target's part: north, east, heading, speed, yaw rate of the rear axle.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) struct TargetBlock(Block<TARGET>);
+
+impl TargetBlock {
+    /// Where target `i` lies in a state that holds nothing but targets, as a delayed copy does.
+    pub(crate) const fn alone(i: usize) -> Self {
+        Self(Block(TARGET * i))
+    }
+
+    /// All of it.
+    pub(crate) const fn all(self) -> Block<TARGET> {
+        self.0
+    }
+
+    /// North and east of the rear axle, m.
+    pub(crate) const fn place(self) -> Block<2> {
+        self.0.part(0)
+    }
+
+    /// North, east, heading.
+    pub(crate) const fn pose(self) -> Block<3> {
+        self.0.part(0)
+    }
+
+    /// Heading, rad.
+    pub(crate) const fn heading(self) -> Block<1> {
+        self.0.part(2)
+    }
+
+    /// Speed of the rear axle, m/s.
+    pub(crate) const fn speed(self) -> Block<1> {
+        self.0.part(3)
+    }
+
+    /// Yaw rate, rad/s.
+    pub(crate) const fn yaw_rate(self) -> Block<1> {
+        self.0.part(4)
+    }
+
+    /// Speed and yaw rate, the two that walk.
+    pub(crate) const fn motion(self) -> Block<2> {
+        self.0.part(3)
+    }
+}
+
+/// Where each part of a state of so many targets and features lies.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub(crate) struct Layout {
+    pub(crate) targets: usize,
+    pub(crate) features: usize,
+}
+
+impl Layout {
+    /// Length of the error state.
+    pub(crate) const fn len(self) -> usize {
+        self.feature(self.features).0
+    }
+
+    /// Target `i`.
+    pub(crate) const fn target(self, i: usize) -> TargetBlock {
+        TargetBlock(Block(own::LEN + TARGET * i))
+    }
+
+    /// Feature `i`.
+    pub(crate) const fn feature(self, i: usize) -> Block<FEATURE> {
+        Block(own::LEN + TARGET * self.targets + FEATURE * i)
+    }
+
+    /// Every pair of columns that is a place on the ground: of targets, then of features.
+    pub(crate) fn places(self) -> impl Iterator<Item = Block<2>> {
+        let targets = (0..self.targets).map(move |i| self.target(i).place());
+        targets.chain((0..self.features).map(move |i| self.feature(i)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_parts_of_a_state_lie_one_behind_the_other() {
+        let layout = Layout { targets: 2, features: 3 };
+        assert_eq!(own::MOTION.range(), own::RATE.column(0)..own::FORCE.end());
+        assert_eq!(own::SLOW.range(), own::GPS_BIAS.column(0)..own::LEN);
+        assert_eq!(layout.target(0).all().column(0), own::LEN);
+        assert_eq!(layout.target(1).all().column(0), layout.target(0).yaw_rate().end());
+        assert_eq!(layout.feature(0).column(0), layout.target(1).all().end());
+        assert_eq!(layout.feature(2).end(), layout.len());
+        let places: Vec<_> = layout.places().map(Block::range).collect();
+        assert_eq!(places.len(), 5);
+        assert_eq!(places[4].end, layout.len());
+    }
+}

@@ -1,0 +1,193 @@
+//! The pipeline's task: takes events in order, has them recorded, handles them, passes on what follows.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use crate::config::Config;
+use crate::pipeline::{Pipeline, next_tick};
+use windhover_base::geo::Tile;
+use windhover_base::msg::{EstimatorOutput, Event, EventBody, Health, Output, TargetEstimate, TimedOutput};
+use windhover_base::time::{MonoTime, Span};
+
+use super::context::TaskContext;
+use super::events::{self, Event as OperatorEvent};
+use super::flight_store::{FlightStore, StoreOrders};
+use super::health;
+use super::latencies::Latencies;
+use super::sink::{Outlets, Sink};
+use super::status::SharedStatus;
+use super::supervise::Heart;
+use super::warm_start::{self, Earlier, Origin};
+
+/// Longest that is spent on what waits when the end was asked for.
+const LAST_CALL: Span = Span::from_ns(500_000_000);
+
+/// What the pipeline's task works with.
+pub struct Parts {
+    /// The configuration.
+    pub config: Arc<Config>,
+    /// Its terrain, where it names one.
+    pub terrain: Option<Arc<Tile>>,
+    /// What every task is given.
+    pub context: TaskContext,
+    /// Where health is shown.
+    pub status: SharedStatus,
+    /// Where what an earlier run knew is kept.
+    pub flight_store: FlightStore,
+    /// Where events and outputs go.
+    pub outlets: Outlets<Box<dyn Sink>>,
+    /// What the store is asked to do.
+    pub orders: StoreOrders,
+    /// Its heart.
+    pub heart: Heart,
+}
+
+/// Runs the pipeline on the calling thread until the end is asked for and everything that waits is handled.
+pub fn run(parts: Parts) {
+    let Parts { config, terrain, context, status, flight_store, outlets, orders, heart } = parts;
+    let mut task = PipelineTask {
+        config: &config,
+        context: &context,
+        status: &status,
+        origin: Origin::here(&config, context.clock),
+        flight_store,
+        outlets,
+        pipeline: Pipeline::with_terrain(&config, terrain),
+        latencies: Latencies::default(),
+        outputs: Vec::new(),
+    };
+    task.continue_from_earlier(&heart);
+    let mut end = None;
+    loop {
+        heart.beat();
+        let now = context.clock.now();
+        if context.stop.is_cancelled() && now - *end.get_or_insert(now) > LAST_CALL {
+            break;
+        }
+        match context.events.take(until_tick(now)) {
+            Some(event) => task.handle(&event),
+            None if context.stop.is_cancelled() => break,
+            None => task.pass_time(),
+        }
+    }
+    task.finish();
+    orders.pipeline_done.cancel();
+}
+
+/// An event that was stamped before a tick may be queued this much after it and still comes first.
+const QUEUED_LATE: Span = Span::from_ns(5_000_000);
+
+/// Time from `now` until the next tick is due: so long the task may wait for an event.
+fn until_tick(now: MonoTime) -> Duration {
+    let due = next_tick(now - QUEUED_LATE) + QUEUED_LATE;
+    Duration::from_nanos((due - now).ns().unsigned_abs())
+}
+
+struct PipelineTask<'a> {
+    config: &'a Config,
+    context: &'a TaskContext,
+    status: &'a SharedStatus,
+    origin: Origin,
+    flight_store: FlightStore,
+    outlets: Outlets<Box<dyn Sink>>,
+    pipeline: Pipeline,
+    latencies: Latencies,
+    outputs: Vec<TimedOutput>,
+}
+
+impl PipelineTask<'_> {
+    /// Continues from what an earlier run left on the card, where that is fresh. It is an event like
+    /// every other, the first of all: what flew is what replays.
+    fn continue_from_earlier(&mut self, heart: &Heart) {
+        if !self.config.store.enabled {
+            return;
+        }
+        let tell = |words: String| self.context.log.tell(OperatorEvent::WarmStart, "", words);
+        match warm_start::wait_for(&self.flight_store, &self.origin, self.context, heart) {
+            Earlier::Known(state, age) => {
+                tell(format!("continues from what was known {:.1} s ago", age.s()));
+                let body = EventBody::Warm(state);
+                let event = self.context.events.number(self.context.began, body);
+                self.handle(&event);
+            }
+            Earlier::Unusable(stale) => tell(format!("what an earlier run knew is not used: {stale}")),
+            Earlier::NotTold(patience) => tell(format!(
+                "begins anew: the card did not tell within {:.0} s what an earlier run knew",
+                patience.s()
+            )),
+            Earlier::Nothing => {}
+        }
+    }
+
+    fn pass_time(&mut self) {
+        if let Some(t) = self.pipeline.tick_due(self.context.clock.now()) {
+            let tick = self.context.events.number(t, EventBody::Tick);
+            self.pipeline.handle(&tick, &mut self.outputs);
+            self.pass_on();
+        }
+    }
+
+    fn handle(&mut self, event: &Event) {
+        // Recorded first: what the pipeline stumbles over is on the card.
+        self.outlets.event(event);
+        self.pipeline.handle(event, &mut self.outputs);
+        self.pass_on();
+    }
+
+    fn finish(&mut self) {
+        self.pipeline.finish(&mut self.outputs);
+        self.pass_on();
+        if let Some(all) = self.latencies.of_flight() {
+            self.context.log.tell_with(OperatorEvent::Latencies, "", "", |line| {
+                line.count("frames", all.frames)
+                    .figure("p50_ms", all.p50.ms(), 2)
+                    .figure("p99_ms", all.p99.ms(), 2)
+                    .figure("max_ms", all.longest.ms(), 2)
+            });
+        }
+    }
+
+    /// Passes on what followed.
+    fn pass_on(&mut self) {
+        let outputs = std::mem::take(&mut self.outputs);
+        for timed in &outputs {
+            match &timed.output {
+                Output::Notice(notice) => {
+                    let about = notice.source.map_or("", windhover_base::msg::Source::name);
+                    let line = events::line_of_notice(notice);
+                    let event = OperatorEvent::Pipeline(notice.kind);
+                    // A target's notices tell its name in their words only.
+                    let key = if about.is_empty() { notice.detail.clone() } else { about.to_owned() };
+                    self.context.log.tell_keyed(notice.t, event, key, |_| line);
+                }
+                Output::Health(health) => self.health(health),
+                Output::Estimator(EstimatorOutput::Estimate(estimate)) => self.estimate(estimate),
+                _ => {}
+            }
+            self.outlets.output(timed);
+        }
+        self.outputs = outputs;
+        self.outputs.clear();
+    }
+
+    fn estimate(&mut self, estimate: &TargetEstimate) {
+        if estimate.target == 0 {
+            self.latencies.push(self.context.clock.now() - estimate.t_valid);
+        }
+    }
+
+    fn health(&mut self, health: &Health) {
+        let (p50, p99) = (self.latencies.quantile(0.5), self.latencies.quantile(0.99));
+        let figures = self.status.with(|shown| {
+            shown.figures.latency_p50 = p50;
+            shown.figures.latency_p99 = p99;
+            shown.health = Some(health.clone());
+            shown.figures.clone()
+        });
+        self.outlets.figures(figures.by_name());
+        self.context.log.write(health::line(health, self.config, Some(&figures)));
+        if let (Some(state), Some(store)) = (self.pipeline.warm_state(), self.flight_store.get()) {
+            warm_start::save(&store, &self.origin, health.t, &state);
+        }
+    }
+}

@@ -1,0 +1,100 @@
+//! The power task: reads supply and temperature once a second, and waits for the line that tells of power going.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use tokio::sync::watch;
+
+use super::context::TaskContext;
+use super::events::Event;
+use super::supervise::Heart;
+use crate::config::PowerConfig;
+use crate::io::device::{Report, blocking};
+use crate::io::power::{PowerReader, PowerReading};
+use crate::io::power_line;
+use crate::io::process;
+
+/// How often supply and temperature are read.
+const READING: Duration = Duration::from_secs(1);
+
+/// What was read last.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct Supply {
+    /// Supply and temperature.
+    pub reading: PowerReading,
+    /// Resident memory of this process, megabytes.
+    pub memory_mb: Option<f64>,
+}
+
+/// The health task's side: what is read, and how.
+#[derive(Debug)]
+pub struct PowerView {
+    /// The settings in force; a change takes effect at once.
+    pub settings: watch::Sender<PowerConfig>,
+    /// What was read last; news once a second.
+    pub supply: watch::Receiver<Supply>,
+    /// Whether the line that tells of power going is active.
+    pub line: watch::Receiver<bool>,
+}
+
+/// What the task works with.
+pub struct PowerTask {
+    settings: watch::Receiver<PowerConfig>,
+    supply: watch::Sender<Supply>,
+    line: watch::Sender<bool>,
+}
+
+/// The task's parts, and the health task's side.
+pub fn parts(config: &PowerConfig) -> (PowerTask, PowerView) {
+    let (settings, settings_in_force) = watch::channel(config.clone());
+    let (supply, supply_read) = watch::channel(Supply::default());
+    let (line, line_level) = watch::channel(false);
+    let task = PowerTask { settings: settings_in_force, supply, line };
+    (task, PowerView { settings, supply: supply_read, line: line_level })
+}
+
+/// Reads and waits until the end is asked for.
+pub async fn run(mut task: PowerTask, context: TaskContext, heart: Heart) {
+    loop {
+        let settings = task.settings.borrow_and_update().clone();
+        let watching = async {
+            tokio::join!(read(&settings, &task.supply, &heart), watch_line(&settings, &task.line, &context))
+        };
+        // What is dropped ends first: a line is given to one reader.
+        tokio::select! {
+            () = context.stop.cancelled() => return,
+            Ok(()) = task.settings.changed() => {}
+            ((), ()) = watching => {}
+        }
+    }
+}
+
+/// Reads supply and temperature for ever. A sensor on a slow bus blocks, so a thread for that reads.
+async fn read(settings: &PowerConfig, supply: &watch::Sender<Supply>, heart: &Heart) {
+    let path = |file: &Option<String>| file.as_ref().map(PathBuf::from);
+    let files = (path(&settings.voltage_file), path(&settings.going_file));
+    let reader = PowerReader::new(Path::new(&settings.sysfs), files.0, files.1);
+    let mut round = tokio::time::interval(READING);
+    round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    loop {
+        heart.while_waiting(round.tick()).await;
+        let reader = reader.clone();
+        let read = move || Supply { reading: reader.read(), memory_mb: process::resident_mb() };
+        supply.send_replace(blocking(read).await);
+    }
+}
+
+/// Watches the line for ever, where one is configured.
+async fn watch_line(settings: &PowerConfig, level: &watch::Sender<bool>, context: &TaskContext) {
+    level.send_replace(false);
+    let Some(line) = &settings.going_line else { return std::future::pending().await };
+    let reports = |report| match report {
+        Report::Up(text) => context.log.tell(Event::DeviceUp, "power_line", text),
+        Report::Down(fault) => context.log.tell(Event::DeviceDown, "power_line", fault.to_string()),
+        _ => {}
+    };
+    let active = |active| {
+        level.send_replace(active);
+    };
+    match power_line::run(line, &reports, &active).await {}
+}

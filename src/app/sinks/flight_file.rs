@@ -1,0 +1,71 @@
+//! The flight file of a replay: what the recording has, and the outputs anew.
+
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::PathBuf;
+
+use crate::app::sink::{OutgoingRecord, Sink};
+use crate::io::mcap_read::RawMessage;
+use crate::io::mcap_write::{McapWriter, WriteError};
+use crate::io::records::{self, topic};
+use windhover_base::settings::CameraConfig;
+use windhover_base::time::MonoTime;
+
+/// Writes a flight; the file is made when the first message is there.
+pub struct FlightFile {
+    path: PathBuf,
+    config_toml: String,
+    camera: CameraConfig,
+    writer: Option<McapWriter<BufWriter<File>>>,
+    fault: Option<WriteError>,
+}
+
+impl FlightFile {
+    /// At `path`, with the configuration attached.
+    pub fn new(path: PathBuf, config_toml: String, camera: CameraConfig) -> Self {
+        Self { path, config_toml, camera, writer: None, fault: None }
+    }
+
+    /// Copies a message of the recording, unless a replay makes it anew.
+    ///
+    /// # Errors
+    /// The file cannot be made or written.
+    pub fn copy(&mut self, raw: &RawMessage) -> Result<(), WriteError> {
+        if self.writer.is_none() {
+            self.begin(raw.log_time)?;
+        }
+        match &mut self.writer {
+            Some(writer) if !topic::is_output(&raw.channel.topic) => writer.copy(raw),
+            _ => Ok(()),
+        }
+    }
+
+    fn begin(&mut self, t: MonoTime) -> Result<(), WriteError> {
+        let writer = self.writer.insert(McapWriter::create(&self.path, &self.config_toml, t)?);
+        records::opening(&self.camera, t).iter().try_for_each(|record| writer.write(record))
+    }
+
+    /// Whether everything given to it so far was written.
+    ///
+    /// # Errors
+    /// The first record that was not.
+    pub fn check(&mut self) -> Result<(), WriteError> {
+        self.fault.take().map_or(Ok(()), Err)
+    }
+
+    /// Ends the file.
+    ///
+    /// # Errors
+    /// What was left cannot be written.
+    pub fn finish(self) -> Result<(), WriteError> {
+        self.writer.map_or(Ok(()), |writer| writer.finish().map(drop))
+    }
+}
+
+impl Sink for FlightFile {
+    fn record(&mut self, record: &mut OutgoingRecord) {
+        if let (Some(writer), None) = (&mut self.writer, &self.fault) {
+            self.fault = writer.write(&record.record).err();
+        }
+    }
+}

@@ -1,0 +1,27 @@
+//! Status that the tasks share: figures of the running daemon, and the pipeline's health.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use windhover_base::msg::Health;
+
+use super::health::Figures;
+
+/// Status that the tasks share. Copies are the same status.
+#[derive(Clone, Debug, Default)]
+pub struct SharedStatus(Arc<Mutex<Status>>);
+
+/// What is shared.
+#[derive(Clone, Debug, Default)]
+pub struct Status {
+    /// Figures that only a running daemon has. Each task writes its own.
+    pub figures: Figures,
+    /// The pipeline's last health. The pipeline's task writes it.
+    pub health: Option<Health>,
+}
+
+impl SharedStatus {
+    /// Reads or changes the status under its lock.
+    pub fn with<T>(&self, access: impl FnOnce(&mut Status) -> T) -> T {
+        access(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}

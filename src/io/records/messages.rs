@@ -1,0 +1,245 @@
+//! Protobuf messages of what the pipeline says: our own, and Foxglove's where a schema exists.
+
+use nalgebra::{UnitQuaternion, Vector3};
+use prost_types::Timestamp;
+
+use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
+use windhover_base::msg::{
+    FeatureTrack, FixKind, Health, MarkerDetection, MarkerId, Notice, NoticeKind, Ownship, SourceHealth,
+    TargetEstimate, TrackStatus,
+};
+use windhover_base::time::MonoTime;
+
+pub(super) fn stamp(t: MonoTime) -> Option<Timestamp> {
+    Some(timestamp(t))
+}
+
+pub(super) fn transform(
+    t: MonoTime,
+    parent: &str,
+    child: &str,
+    at: Vector3<f64>,
+    parent_from_child: &UnitQuaternion<f64>,
+) -> fox::FrameTransform {
+    let q = parent_from_child.quaternion();
+    fox::FrameTransform {
+        timestamp: stamp(t),
+        parent_frame_id: parent.into(),
+        child_frame_id: child.into(),
+        translation: Some(fox::Vector3 { x: at.x, y: at.y, z: at.z }),
+        rotation: Some(fox::Quaternion { x: q.i, y: q.j, z: q.k, w: q.w }),
+    }
+}
+
+pub(super) fn fix_number(fix: FixKind) -> u32 {
+    match fix {
+        FixKind::None => 0,
+        FixKind::TwoD => 2,
+        FixKind::ThreeD => 3,
+    }
+}
+
+/// Everything seen in a frame, as a message.
+pub fn detections(
+    frame: u32,
+    t: MonoTime,
+    markers: &[MarkerDetection],
+    features: &[FeatureTrack],
+) -> wh::Detections {
+    let feature = |f: &FeatureTrack| wh::Feature { id: f.id, u: f.px.x, v: f.px.y, sigma_px: f.sigma_px };
+    wh::Detections {
+        timestamp: stamp(t),
+        frame,
+        markers: markers.iter().map(marker).collect(),
+        features: features.iter().map(feature).collect(),
+    }
+}
+
+fn marker(m: &MarkerDetection) -> wh::Marker {
+    let (kind, family, id, target) = match m.marker {
+        MarkerId::Tag { family, id } => ("apriltag", family.name(), id, 0),
+        MarkerId::Disc { target, marker } => ("disc", "", marker as u32, target as u32),
+    };
+    let covariances = match m.corners_px {
+        Some(_) => &m.corner_cov_px2[..],
+        None => std::slice::from_ref(&m.center_cov_px2),
+    };
+    wh::Marker {
+        kind: kind.into(),
+        family: family.into(),
+        id,
+        hamming: u32::from(m.hamming),
+        margin: m.margin,
+        center_u: m.center_px.x,
+        center_v: m.center_px.y,
+        corners: m.corners_px.iter().flatten().flat_map(|c| [c.x, c.y]).collect(),
+        covariance_px2: covariances.iter().flat_map(|p| [p[(0, 0)], p[(0, 1)], p[(1, 1)]]).collect(),
+        size_px: m.size_px,
+        target,
+    }
+}
+
+/// Overlays: tags as outlines with their number, discs as circles, features as points. Foxglove puts
+/// the centre of the top-left pixel at (0.5, 0.5).
+pub(super) fn annotations(
+    t: MonoTime,
+    markers: &[MarkerDetection],
+    features: &[FeatureTrack],
+) -> fox::ImageAnnotations {
+    let at = |u: f64, v: f64| fox::Point2 { x: u + 0.5, y: v + 0.5 };
+    let colour = |r, g, b| Some(fox::Color { r, g, b, a: 1.0 });
+    let mut overlay = fox::ImageAnnotations { timestamp: stamp(t), ..Default::default() };
+    for m in markers {
+        match (m.marker, m.corners_px) {
+            (MarkerId::Tag { id, .. }, Some(corners)) => {
+                overlay.points.push(fox::PointsAnnotation {
+                    timestamp: stamp(t),
+                    r#type: fox::points_annotation::Type::LineLoop.into(),
+                    points: corners.iter().map(|c| at(c.x, c.y)).collect(),
+                    outline_color: colour(0.1, 0.9, 0.3),
+                    thickness: 2.0,
+                    ..Default::default()
+                });
+                overlay.texts.push(fox::TextAnnotation {
+                    timestamp: stamp(t),
+                    position: Some(at(m.center_px.x, m.center_px.y)),
+                    text: id.to_string(),
+                    font_size: 14.0,
+                    text_color: colour(0.1, 0.9, 0.3),
+                    ..Default::default()
+                });
+            }
+            _ => overlay.circles.push(fox::CircleAnnotation {
+                timestamp: stamp(t),
+                position: Some(at(m.center_px.x, m.center_px.y)),
+                diameter: m.size_px,
+                thickness: 2.0,
+                outline_color: colour(0.1, 0.9, 0.3),
+                ..Default::default()
+            }),
+        }
+    }
+    if !features.is_empty() {
+        overlay.points.push(fox::PointsAnnotation {
+            timestamp: stamp(t),
+            r#type: fox::points_annotation::Type::Points.into(),
+            points: features.iter().map(|f| at(f.px.x, f.px.y)).collect(),
+            outline_color: colour(1.0, 0.7, 0.1),
+            thickness: 3.0,
+            ..Default::default()
+        });
+    }
+    overlay
+}
+
+/// The helicopter's own state, as a message.
+pub fn ownship(own: &Ownship) -> wh::Ownship {
+    let q = own.ned_from_body.quaternion();
+    wh::Ownship {
+        timestamp: stamp(own.t_valid),
+        frame: own.frame,
+        lat_deg: own.lat_deg,
+        lon_deg: own.lon_deg,
+        height_m: own.height_m,
+        north_m: own.position_ned_m.x,
+        east_m: own.position_ned_m.y,
+        down_m: own.position_ned_m.z,
+        vn_mps: own.velocity_ned_mps.x,
+        ve_mps: own.velocity_ned_mps.y,
+        vd_mps: own.velocity_ned_mps.z,
+        qw: q.w,
+        qx: q.i,
+        qy: q.j,
+        qz: q.k,
+        position_sigma_m: own.position_sigma_m.as_slice().to_vec(),
+        attitude_sigma_rad: own.attitude_sigma_rad.as_slice().to_vec(),
+    }
+}
+
+fn status(status: TrackStatus) -> wh::TrackStatus {
+    match status {
+        TrackStatus::Lost => wh::TrackStatus::Lost,
+        TrackStatus::Acquiring => wh::TrackStatus::Acquiring,
+        TrackStatus::Tracking => wh::TrackStatus::Tracking,
+        TrackStatus::Coasting => wh::TrackStatus::Coasting,
+    }
+}
+
+/// A target's estimate, as a message.
+pub fn target_state(estimate: &TargetEstimate, name: &str) -> wh::TargetState {
+    let mut message = wh::TargetState {
+        timestamp: stamp(estimate.t_valid),
+        frame: estimate.frame,
+        target: name.into(),
+        status: status(estimate.status).into(),
+        known: estimate.state.is_some(),
+        ..Default::default()
+    };
+    if let Some(s) = &estimate.state {
+        message.north_m = s.north_m;
+        message.east_m = s.east_m;
+        message.heading_rad = s.heading_rad;
+        message.speed_mps = s.speed_mps;
+        message.yaw_rate_radps = s.yaw_rate_radps;
+        message.lat_deg = s.lat_deg;
+        message.lon_deg = s.lon_deg;
+        if let Some(p) = &s.covariance {
+            message.covariance =
+                (0..5).flat_map(|row| (row..5).map(move |column| p[(row, column)])).collect();
+        }
+    }
+    message
+}
+
+pub(super) fn log_message(notice: &Notice) -> fox::Log {
+    let level = match notice.kind {
+        NoticeKind::FixLost
+        | NoticeKind::SourceSilent
+        | NoticeKind::TargetLost
+        | NoticeKind::FilterReset
+        | NoticeKind::FrameUnusable
+        | NoticeKind::Dropped
+        | NoticeKind::ClockJump
+        | NoticeKind::TerrainMissing
+        | NoticeKind::BytesRefused => fox::log::Level::Warning,
+        _ => fox::log::Level::Info,
+    };
+    fox::Log {
+        timestamp: stamp(notice.t),
+        level: level.into(),
+        message: notice.detail.clone(),
+        name: notice.kind.name().into(),
+        ..Default::default()
+    }
+}
+
+/// Health, as a message; `names` are the targets'.
+pub fn health(now: &Health, names: &[String]) -> wh::Health {
+    let source = |s: &SourceHealth| wh::SourceHealth {
+        name: s.source.name().into(),
+        rate_hz: s.rate_hz,
+        age_ms: s.age.map_or(-1.0, |age| age.ms()),
+        total: s.total,
+        refused: s.refused,
+        dropped: s.dropped,
+    };
+    let targets = now.targets.iter().map(|t| {
+        let name = &names[t.last.target];
+        wh::TargetHealth {
+            name: name.clone(),
+            status: status(t.last.status).into(),
+            frames_seen: t.frames_seen,
+            state: Some(target_state(&t.last, name)),
+        }
+    });
+    wh::Health {
+        timestamp: stamp(now.t),
+        sources: now.sources.iter().map(source).collect(),
+        targets: targets.collect(),
+        fix: fix_number(now.fix),
+        sats: now.sats.unwrap_or(0),
+        clock_sigma_ms: now.clock_sigma.map_or(-1.0, |s| s.ms()),
+        dispositions: now.dispositions.iter().map(|(d, n)| (d.name().to_owned(), *n)).collect(),
+        ..Default::default()
+    }
+}

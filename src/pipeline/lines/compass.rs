@@ -1,0 +1,45 @@
+//! The compass line: bytes to samples at their time of validity.
+
+use super::{Line, on_the_wire};
+use windhover_base::msg::{Measurement, Stamped};
+use windhover_base::settings::CompassConfig;
+use windhover_base::time::{MonoTime, Span, SteadyClock};
+use windhover_decode::{CompassDecoder, DecodeCounts, HeardAttitude};
+
+/// Compass bytes to samples at their time of validity.
+pub(in crate::pipeline) struct CompassLine {
+    decoder: CompassDecoder,
+    heard: Vec<HeardAttitude>,
+    clock: SteadyClock,
+    baud: u32,
+    latency: Span,
+}
+
+impl CompassLine {
+    pub(super) fn new(config: &CompassConfig) -> Self {
+        Self {
+            decoder: CompassDecoder::new(config.format),
+            heard: Vec::new(),
+            clock: SteadyClock::new(),
+            baud: config.baud,
+            latency: Span::from_ms(config.latency_ms),
+        }
+    }
+}
+
+impl Line for CompassLine {
+    fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<Measurement>) {
+        self.decoder.push(bytes, t_recv, &mut self.heard);
+        for heard in self.heard.drain(..) {
+            let length = heard.bytes + heard.bytes_after;
+            let began = heard.t_recv - on_the_wire(length, self.baud);
+            let t_valid = self.clock.smooth(began) - self.latency;
+            let sample = Stamped { t_valid, t_recv: heard.t_recv, seq, value: heard.sample };
+            out.push(Measurement::Attitude(sample));
+        }
+    }
+
+    fn counts(&self) -> &DecodeCounts {
+        self.decoder.counts()
+    }
+}

@@ -1,0 +1,96 @@
+//! The GPS line: bytes to epochs at their time of validity.
+
+use super::{Line, on_the_wire};
+use windhover_base::msg::{Measurement, Stamped, WarmArrival};
+use windhover_base::settings::GpsConfig;
+use windhover_base::time::{GnssClock, MonoTime, Span};
+use windhover_decode::{DecodeCounts, GnssDecoder, HeardEpoch};
+
+/// Arrivals kept for a warm start: the jitter of a 5 Hz receiver over 10 s.
+const WARM_ARRIVALS: usize = 50;
+
+/// GPS bytes to epochs at their time of validity.
+pub(in crate::pipeline) struct GpsLine {
+    decoder: GnssDecoder,
+    heard: Vec<HeardEpoch>,
+    clock: GnssClock,
+    clock_sigma: Option<Span>,
+    baud: u32,
+    latency: Span,
+}
+
+impl GpsLine {
+    pub(super) fn new(config: &GpsConfig) -> Self {
+        let latency = Span::from_ms(config.latency_ms);
+        Self {
+            decoder: GnssDecoder::new(),
+            heard: Vec::new(),
+            clock: GnssClock::new(latency),
+            clock_sigma: None,
+            baud: config.baud,
+            latency,
+        }
+    }
+
+    fn stamp(&mut self, seq: u64, out: &mut Vec<Measurement>) {
+        for heard in self.heard.drain(..) {
+            let began = heard.t_first_byte - on_the_wire(heard.bytes_before_end, self.baud);
+            if let (true, Some(time_of_day_ns)) = (heard.opens_burst, heard.epoch.time_of_day_ns) {
+                self.clock.observe(time_of_day_ns, began);
+            }
+            // An epoch without a time, or one the fit does not know, was true a latency ago.
+            let fitted = heard.epoch.time_of_day_ns.and_then(|of_day| self.clock.host_time_of(of_day, began));
+            if !heard.opens_burst && fitted.is_none() {
+                // Another instant within a burst, which neither its arrival nor the fit puts in time.
+                continue;
+            }
+            self.clock_sigma = fitted.map(|(_, sigma)| sigma);
+            let t_valid = fitted.map_or(began - self.latency, |(t, _)| t);
+            let epoch = Stamped { t_valid, t_recv: heard.t_last_byte, seq, value: heard.epoch };
+            out.push(Measurement::Gnss(epoch));
+        }
+    }
+
+    /// Recent arrivals, for [`Self::resume`].
+    pub(in crate::pipeline) fn arrivals(&self) -> Vec<WarmArrival> {
+        let arrivals = self.clock.arrivals(WARM_ARRIVALS);
+        arrivals.into_iter().map(|(t, offset_ns)| WarmArrival { t_ns: t.ns(), offset_ns }).collect()
+    }
+
+    /// Continues the clock fit of an earlier run.
+    pub(in crate::pipeline) fn resume(&mut self, arrivals: &[WarmArrival]) {
+        let arrivals: Vec<_> = arrivals.iter().map(|a| (MonoTime::from_ns(a.t_ns), a.offset_ns)).collect();
+        self.clock.resume(&arrivals);
+    }
+
+    /// One-sigma of the fit from UTC to host time.
+    pub(in crate::pipeline) fn clock_sigma(&self) -> Option<Span> {
+        self.clock_sigma
+    }
+
+    /// The receiver's pulse marked a whole second of UTC at this host time.
+    pub(in crate::pipeline) fn pulse(&mut self, edge: MonoTime) {
+        self.clock.observe_pulse(edge);
+    }
+}
+
+impl Line for GpsLine {
+    fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<Measurement>) {
+        self.decoder.push(bytes, t_recv, &mut self.heard);
+        self.stamp(seq, out);
+    }
+
+    fn tick(&mut self, now: MonoTime, seq: u64, out: &mut Vec<Measurement>) {
+        self.decoder.tick(now, &mut self.heard);
+        self.stamp(seq, out);
+    }
+
+    fn finish(&mut self, out: &mut Vec<Measurement>) {
+        self.decoder.flush(&mut self.heard);
+        self.stamp(u64::MAX, out);
+    }
+
+    fn counts(&self) -> &DecodeCounts {
+        self.decoder.counts()
+    }
+}

@@ -1,0 +1,59 @@
+//! Sources that deliver bytes: bytes in, stamped measurements out. One file a line, one row in [`Lines::of`].
+
+mod compass;
+mod gps;
+
+pub(super) use compass::CompassLine;
+pub(super) use gps::GpsLine;
+
+use windhover_base::msg::{Measurement, Source};
+use windhover_base::settings::{CompassConfig, GpsConfig};
+use windhover_base::time::{MonoTime, Span};
+use windhover_decode::DecodeCounts;
+
+/// A decoder, and the clock that puts what it decodes in time.
+pub(super) trait Line {
+    /// Takes the bytes that one read returned at `t_recv`.
+    fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<Measurement>);
+
+    /// Time has come to `now`: what waited for more bytes waits no longer.
+    fn tick(&mut self, _now: MonoTime, _seq: u64, _out: &mut Vec<Measurement>) {}
+
+    /// No more bytes follow.
+    fn finish(&mut self, _out: &mut Vec<Measurement>) {}
+
+    /// Counts of what was decoded and refused so far.
+    fn counts(&self) -> &DecodeCounts;
+}
+
+/// The lines of a pipeline.
+pub(super) struct Lines {
+    pub(super) gps: GpsLine,
+    pub(super) compass: CompassLine,
+}
+
+impl Lines {
+    pub(super) fn new(gps: &GpsConfig, compass: &CompassConfig) -> Self {
+        Self { gps: GpsLine::new(gps), compass: CompassLine::new(compass) }
+    }
+
+    /// The line of a source; `None` where it does not deliver bytes.
+    pub(super) fn of(&mut self, source: Source) -> Option<&mut dyn Line> {
+        match source {
+            Source::Gps => Some(&mut self.gps),
+            Source::Compass => Some(&mut self.compass),
+            Source::Camera => None,
+        }
+    }
+}
+
+/// How many pieces were refused, and the reasons.
+pub(super) fn refused(counts: &DecodeCounts) -> (u64, String) {
+    let reasons: Vec<String> = counts.refusals().map(|(why, n)| format!("{n} {}", why.words())).collect();
+    (counts.refused_total(), reasons.join(", "))
+}
+
+/// Time on the wire: ten bits a byte (8N1).
+fn on_the_wire(bytes: usize, baud: u32) -> Span {
+    Span::from_s(bytes as f64 * 10.0 / f64::from(baud.max(1)))
+}
