@@ -7,7 +7,7 @@
 use std::ops::Range;
 
 use super::binarise::Bitmap;
-use super::disjoint_sets::{root, union};
+use super::disjoint_sets::union;
 use super::simd::{Kernel, Simd};
 
 /// Dark pixels `start..end` of a row.

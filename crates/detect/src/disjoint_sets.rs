@@ -9,7 +9,7 @@ pub(super) fn union(parents: &mut [u32], a: u32, b: u32) {
 
 /// The root of a set; the way to it is halved.
 #[inline(always)]
-pub(super) fn root(parents: &mut [u32], mut i: u32) -> u32 {
+fn root(parents: &mut [u32], mut i: u32) -> u32 {
     loop {
         let parent = parents[i as usize];
         if parent == i {
