@@ -69,7 +69,7 @@ test-real: debug
 # adds a hundred crates to the build; `make lint` compiles it.
 test-zenoh: setup-python
 	@sh tests/setup/venv.sh $(VENV)-zenoh tests/zenoh/requirements.txt
-	$(CARGO) build --locked --features zenoh
+	$(CARGO) build --locked --bins --examples --features zenoh
 	$(VENV)-zenoh/bin/python -m unittest discover -s tests/zenoh -p 'test_*.py' -v
 
 # Tests that take minutes each and prove more of the same; two ignored ones make goldens and captures anew.
