@@ -6,15 +6,7 @@ use windhover_base::settings::CompassFormat;
 use windhover_base::time::MonoTime;
 use windhover_decode::CompassDecoder;
 
-const FORMATS: [CompassFormat; 7] = [
-    CompassFormat::Tcm2,
-    CompassFormat::Os5000,
-    CompassFormat::Hmr3000,
-    CompassFormat::Revolution,
-    CompassFormat::Pni,
-    CompassFormat::Pashr,
-    CompassFormat::Nmea,
-];
+const FORMATS: [CompassFormat; CompassFormat::ALL.len()] = CompassFormat::ALL;
 
 // The first byte chooses the format and how long reads are.
 fuzz_target!(|data: &[u8]| {

@@ -2,9 +2,8 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use windhover_base::msg::ImageView;
-use windhover_base::msg::TagFamily;
-use windhover_detect::TagDetector;
+use windhover_base::msg::{ImageView, TagFamily};
+use windhover_detect::{Detector, Limits};
 
 // The first three bytes choose width, stride and smallest tag; the rest are pixels.
 fuzz_target!(|data: &[u8]| {
@@ -16,11 +15,9 @@ fuzz_target!(|data: &[u8]| {
         return;
     }
     let view = ImageView { width, height, stride, data: pixels };
-    let mut detector = TagDetector::new(&TagFamily::ALL, 8.0 + f64::from(min_px % 40), 3);
-    let mut found = Vec::new();
-    detector.detect(view, &mut found);
-    for tag in &found {
-        let corners = tag.corners_px.expect("a tag has corners");
-        assert!(corners.iter().all(|c| c.iter().all(|x| x.is_finite())));
+    let mut detector =
+        Detector::new(&TagFamily::ALL, Limits { min_px: 8.0 + f64::from(min_px % 40), max_hamming: 3 });
+    for tag in detector.detect(view) {
+        assert!(tag.corners_px.iter().all(|c| c.iter().all(|x| x.is_finite())));
     }
 });

@@ -8,7 +8,6 @@ use crate::io::device::{Fault, NoteKind, Report};
 use crate::io::pps;
 use crate::io::serial::{self, SerialSettings};
 use windhover_base::msg::{EventBody, Source};
-use windhover_base::settings::CompassFormat;
 
 use super::context::TaskContext;
 use super::events::{self, OperatorEvent};
@@ -31,7 +30,7 @@ pub async fn compass(config: Arc<Config>, context: TaskContext, heart: Heart) {
     let settings = SerialSettings {
         device: config.compass.device.clone(),
         baud: config.compass.baud,
-        text: config.compass.format != CompassFormat::Pni,
+        text: config.compass.format.is_text(),
         configure_garmin: false,
     };
     line(Part::Compass, Source::Compass, &settings, context, heart).await;

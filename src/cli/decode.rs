@@ -60,34 +60,15 @@ struct CompassArgs {
     #[arg(long)]
     json: bool,
     /// What the compass speaks; by default the format that understands most of the log
-    #[arg(long, value_enum)]
-    format: Option<Format>,
+    #[arg(long, value_parser = formats())]
+    format: Option<CompassFormat>,
 }
 
 /// Formats as the configuration names them.
-#[derive(clap::ValueEnum, Clone, Copy, PartialEq, Debug)]
-enum Format {
-    Tcm2,
-    Os5000,
-    Hmr3000,
-    Revolution,
-    Pni,
-    Pashr,
-    Nmea,
-}
-
-impl Format {
-    const fn of_config(self) -> CompassFormat {
-        match self {
-            Self::Tcm2 => CompassFormat::Tcm2,
-            Self::Os5000 => CompassFormat::Os5000,
-            Self::Hmr3000 => CompassFormat::Hmr3000,
-            Self::Revolution => CompassFormat::Revolution,
-            Self::Pni => CompassFormat::Pni,
-            Self::Pashr => CompassFormat::Pashr,
-            Self::Nmea => CompassFormat::Nmea,
-        }
-    }
+fn formats() -> impl clap::builder::TypedValueParser<Value = CompassFormat> {
+    use clap::builder::TypedValueParser;
+    clap::builder::PossibleValuesParser::new(CompassFormat::ALL.map(CompassFormat::name))
+        .try_map(|name| name.parse::<CompassFormat>())
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
@@ -263,7 +244,7 @@ struct ReadingJson {
 
 fn decode_compass(
     bytes: &[u8],
-    format: Option<Format>,
+    format: Option<CompassFormat>,
     json: bool,
     out: &mut impl Write,
 ) -> std::io::Result<DecodeCounts> {
@@ -293,8 +274,8 @@ fn decode_compass(
     Ok(counts)
 }
 
-fn decode_as(bytes: &[u8], format: Format) -> (Vec<HeardAttitude>, DecodeCounts) {
-    let (mut decoder, mut heard) = (CompassDecoder::new(format.of_config()), Vec::new());
+fn decode_as(bytes: &[u8], format: CompassFormat) -> (Vec<HeardAttitude>, DecodeCounts) {
+    let (mut decoder, mut heard) = (CompassDecoder::new(format), Vec::new());
     decoder.push(bytes, MonoTime::default(), &mut heard);
     (heard, decoder.counts().clone())
 }
@@ -302,12 +283,12 @@ fn decode_as(bytes: &[u8], format: Format) -> (Vec<HeardAttitude>, DecodeCounts)
 /// The decoding by the format that understands most: whole attitudes first, then any reading. A
 /// device's own format goes before plain NMEA.
 fn likeliest(bytes: &[u8]) -> (Vec<HeardAttitude>, DecodeCounts) {
-    let own = [Format::Hmr3000, Format::Revolution, Format::Pashr, Format::Tcm2, Format::Os5000, Format::Pni];
+    let own = CompassFormat::ALL.into_iter().filter(|format| *format != CompassFormat::Nmea);
     let understood = |heard: &[HeardAttitude]| {
         let angles = |r: &CompassReading| [r.heading_deg, r.pitch_deg, r.roll_deg].iter().flatten().count();
         heard.iter().map(|heard| angles(&heard.reading)).sum::<usize>()
     };
-    let mut best = decode_as(bytes, Format::Nmea);
+    let mut best = decode_as(bytes, CompassFormat::Nmea);
     for format in own {
         let other = decode_as(bytes, format);
         if understood(&other.0) > understood(&best.0) {

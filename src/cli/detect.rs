@@ -6,9 +6,8 @@ use serde_json::{Value, json};
 
 use super::{CliError, CliResult};
 use crate::io::clock::HostClock;
-use windhover_base::msg::TagFamily;
-use windhover_base::msg::{GrayImage, MarkerDetection, MarkerId};
-use windhover_detect::{LARGEST_IMAGE_PX, TagDetector};
+use windhover_base::msg::{GrayImage, TagFamily};
+use windhover_detect::{Detector, LARGEST_IMAGE_PX, Limits, TagDetection};
 
 /// Find markers in images.
 #[derive(clap::Args, Debug)]
@@ -48,8 +47,8 @@ fn min_px(text: &str) -> Result<f64, String> {
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
-    let mut detector = TagDetector::new(&[args.family], args.min_px, args.max_hamming);
-    let mut found = Vec::new();
+    let limits = Limits { min_px: args.min_px, max_hamming: args.max_hamming };
+    let mut detector = Detector::new(&[args.family], limits);
     let mut failed = 0;
     for path in &args.images {
         let image = match read(path) {
@@ -60,14 +59,13 @@ pub(super) fn run(args: &Args) -> CliResult {
                 continue;
             }
         };
-        found.clear();
         let start = HostClock::thread_processor_time();
-        detector.detect(image.view(), &mut found);
+        let found = detector.detect(image.view());
         let ms = (HostClock::thread_processor_time() - start).ms();
         if args.json {
-            println!("{}", as_json(path, ms, &found));
+            println!("{}", as_json(path, ms, found));
         } else {
-            print_lines(path, ms, &found);
+            print_lines(path, ms, found);
         }
     }
     match failed {
@@ -93,38 +91,36 @@ fn read(path: &Path) -> Result<GrayImage, String> {
     GrayImage::from_vec(width, height, image.into_raw()).ok_or_else(|| "no pixels".to_owned())
 }
 
-fn as_json(path: &Path, ms: f64, found: &[MarkerDetection]) -> Value {
+fn as_json(path: &Path, ms: f64, found: &[TagDetection]) -> Value {
     let detections: Vec<Value> = found
         .iter()
-        .filter_map(|m| {
-            let MarkerId::Tag { family, id } = m.marker else { return None };
-            Some(json!({
-                "family": family.name(),
-                "id": id,
-                "hamming": m.hamming,
-                "margin": m.margin,
-                "center": [m.center_px.x, m.center_px.y],
-                "corners": m.corners_px?.map(|c| [c.x, c.y]),
-            }))
+        .map(|tag| {
+            json!({
+                "family": tag.family.name(),
+                "id": tag.id,
+                "hamming": tag.hamming,
+                "margin": tag.margin,
+                "center": [tag.center_px.x, tag.center_px.y],
+                "corners": tag.corners_px.map(|c| [c.x, c.y]),
+            })
         })
         .collect();
     json!({ "image": path.to_string_lossy(), "ms": ms, "detections": detections })
 }
 
-fn print_lines(path: &Path, ms: f64, found: &[MarkerDetection]) {
+fn print_lines(path: &Path, ms: f64, found: &[TagDetection]) {
     let tags = if found.len() == 1 { "tag" } else { "tags" };
     println!("{}: {} {tags} in {ms:.2} ms", path.display(), found.len());
-    for m in found {
-        if let MarkerId::Tag { family, id } = m.marker {
-            println!(
-                "  {} {id} at ({:.1}, {:.1}), {:.1} px, hamming {}, margin {:.0}",
-                family.name(),
-                m.center_px.x,
-                m.center_px.y,
-                m.size_px,
-                m.hamming,
-                m.margin
-            );
-        }
+    for tag in found {
+        println!(
+            "  {} {} at ({:.1}, {:.1}), {:.1} px, hamming {}, margin {:.0}",
+            tag.family.name(),
+            tag.id,
+            tag.center_px.x,
+            tag.center_px.y,
+            tag.size_px,
+            tag.hamming,
+            tag.margin
+        );
     }
 }

@@ -28,7 +28,7 @@ use windhover_base::msg::{
 };
 use windhover_base::settings::{MarkerKind, TargetConfig};
 use windhover_base::time::{MonoTime, Span};
-use windhover_detect::FrameDetector;
+use windhover_detect::tracking::FrameDetector;
 use windhover_estimate::{Estimator, PaperEstimator};
 
 /// Events in, outputs out.

@@ -5,12 +5,16 @@
 
 mod chart;
 mod geometry;
+mod ink;
 pub mod intrinsics;
+mod mark;
 pub mod montecarlo;
 mod scale;
 mod style;
 
-pub use chart::{Chart, Ink, Mark};
+pub use chart::Chart;
 pub use geometry::{ellipse, thin};
+pub use ink::Ink;
+pub use mark::Mark;
 pub use scale::Scale;
 pub use style::{CHART_CSS, PALETTE_CSS, escape, standalone};

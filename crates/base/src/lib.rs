@@ -1,8 +1,4 @@
-//! What the crates of windhover have in common: time, frames and geodesy, the values that flow
-//! between them, and the settings that they take.
-//!
-//! Nothing here reads a clock, waits, logs or touches a device.
-
+#![doc = include_str!("../README.md")]
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 pub mod geo;

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, DVector, Vector3};
 
-use super::boresight_filter::{Filter, PARAMETERS, Parameters};
+use super::boresight_filter::Filter;
+use super::boresight_state::{PARAMETERS, Parameters};
 use windhover_base::geo::{Geodetic, LocalFrame};
 use windhover_base::msg::{AttitudeSample, GnssEpoch, MarkerDetection, MarkerId, Stamped};
 use windhover_base::settings::{MarkerConfig, Rig, TargetConfig, TargetModel};
@@ -119,6 +120,10 @@ enum Item<'a> {
 /// Estimates the boresight by least squares over all raw measurements: GPS positions with a slowly
 /// varying bias, GPS velocities, compass angles, pixels of markers. Values of the configuration are
 /// the start and, loosely, the prior. `surveyed` gives markers whose positions are known.
+///
+/// # Errors
+/// Without a flight, or where one has no fixes, readings or markers, or is too short. The number of the
+/// flight is given.
 pub fn boresight(
     rig: &Rig,
     declination_rad: f64,

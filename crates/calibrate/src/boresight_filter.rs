@@ -8,18 +8,10 @@ use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, DVector, Rotation3, Vector2, Vector3};
 
-use windhover_base::geo::{Tilt, body_from_camera, euler_321, rot_z, wrap_angle};
+use super::boresight_state::{ATTITUDE, BASE, FIRST, MarkerState, PARAMETERS, PER_MARKER, Parameters, State};
+use windhover_base::geo::{Tilt, euler_321, rot_z, wrap_angle};
 use windhover_base::msg::{AttitudeSample, MarkerDetection, MarkerId};
 use windhover_base::settings::{MarkerConfig, MarkerKind, Rig};
-
-/// Parameters of mounting and time, in the order of the state.
-pub(super) const PARAMETERS: usize = 11;
-/// Where they begin in the state: after position, velocity, acceleration, GPS bias, attitude, rate.
-pub(super) const FIRST: usize = 18;
-/// States of each marker: its centre (north, east, down) and where its top points.
-const PER_MARKER: usize = 4;
-const BASE: usize = FIRST + PARAMETERS;
-const ATTITUDE: usize = 12;
 
 /// Jerk of the helicopter, power density, (m/s³)²/Hz: a hard stop takes a second.
 const JERK: f64 = 4.0;
@@ -32,29 +24,6 @@ const VERTICAL: f64 = 1.6;
 const LEAST_PX: f64 = 0.15;
 /// Largest normalised innovation squared per component that is used.
 const GATE: f64 = 16.0;
-
-/// Mounting and time: mount yaw, pitch, roll; lever arm forward, right, down; compass yaw, pitch and
-/// roll zeros (reported minus true); lateness of compass and GPS stamps against the camera's.
-pub(super) type Parameters = [f64; PARAMETERS];
-
-/// The state at an instant.
-#[derive(Clone, Debug)]
-struct State {
-    position: Vector3<f64>,
-    velocity: Vector3<f64>,
-    acceleration: Vector3<f64>,
-    bias: Vector3<f64>,
-    ned_from_body: Rotation3<f64>,
-    rate: Vector3<f64>,
-    parameters: Parameters,
-    markers: Vec<MarkerState>,
-}
-
-#[derive(Clone, Copy, Debug)]
-struct MarkerState {
-    center: Vector3<f64>,
-    top: f64,
-}
 
 /// One pass over one flight.
 pub(super) struct Filter<'a> {
@@ -69,68 +38,6 @@ pub(super) struct Filter<'a> {
     pub(super) fit: (f64, usize),
     /// Measurements left out by the gate.
     pub(super) refused: usize,
-}
-
-impl State {
-    /// The state changed by `amount` along one axis of its error.
-    fn moved(&self, axis: usize, amount: f64) -> Self {
-        let mut next = self.clone();
-        next.add(axis, amount);
-        next
-    }
-
-    fn add(&mut self, axis: usize, amount: f64) {
-        match axis {
-            0..3 => self.position[axis] += amount,
-            3..6 => self.velocity[axis - 3] += amount,
-            6..9 => self.acceleration[axis - 6] += amount,
-            9..12 => self.bias[axis - 9] += amount,
-            12..15 => {
-                let mut turn = Vector3::zeros();
-                turn[axis - ATTITUDE] = amount;
-                self.ned_from_body = Rotation3::new(turn) * self.ned_from_body;
-            }
-            15..18 => self.rate[axis - 15] += amount,
-            FIRST..BASE => self.parameters[axis - FIRST] += amount,
-            _ => {
-                let marker = &mut self.markers[(axis - BASE) / PER_MARKER];
-                match (axis - BASE) % PER_MARKER {
-                    3 => marker.top += amount,
-                    part => marker.center[part] += amount,
-                }
-            }
-        }
-    }
-
-    fn size(&self) -> usize {
-        BASE + PER_MARKER * self.markers.len()
-    }
-
-    /// How the state changes as everything turns about the vertical, per radian, but for what is constant.
-    fn turning(&self) -> DVector<f64> {
-        let mut out = DVector::zeros(self.size());
-        let mut put = |at: usize, v: &Vector3<f64>| {
-            out[at] = -v.y;
-            out[at + 1] = v.x;
-        };
-        put(0, &self.position);
-        put(3, &self.velocity);
-        put(6, &self.acceleration);
-        for (k, marker) in self.markers.iter().enumerate() {
-            put(BASE + PER_MARKER * k, &marker.center);
-        }
-        out
-    }
-
-    /// `body_from_camera` with the estimated mounting angles.
-    fn body_from_camera(&self, rig: &Rig) -> Rotation3<f64> {
-        let [yaw, pitch, roll, ..] = self.parameters;
-        body_from_camera(rig.camera.mount.image_top, yaw, pitch, roll)
-    }
-
-    fn lever(&self) -> Vector3<f64> {
-        Vector3::new(self.parameters[3], self.parameters[4], self.parameters[5])
-    }
 }
 
 impl<'a> Filter<'a> {

@@ -70,6 +70,9 @@ pub const WINDOW_PX: f64 = 11.0;
 /// Which corner is first does not matter to calibration.
 ///
 /// `window_px` is half the width of the window in which each corner is placed ([`WINDOW_PX`]).
+///
+/// # Errors
+/// Where no board of this size is found, or too many of its corners are hidden.
 pub fn find_corners(
     image: ImageView<'_>,
     columns: usize,

@@ -2,21 +2,13 @@
 
 use nalgebra::Vector2;
 
+pub use super::least_squares::Wanted;
 use super::least_squares::{COUNT, K3, Problem, SKEW, scaled_cholesky};
 use super::zhang::{PlanePose, PlaneView, homography, pose_of, starts};
 use windhover_base::geo::CameraModel;
 
 /// Parameters of the camera, in the order of [`Intrinsics::sigma`].
 pub const PARAMETERS: [&str; COUNT] = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "skew"];
-
-/// Which of the optional parameters are estimated; the others stay zero.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub struct Wanted {
-    /// The third radial term.
-    pub k3: bool,
-    /// Bouguet's α.
-    pub skew: bool,
-}
 
 /// Why views gave no intrinsics.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, thiserror::Error)]
@@ -69,6 +61,9 @@ pub struct Intrinsics {
 ///
 /// Minimises the squared distance between seen and projected points over the camera and every
 /// plane's pose by Levenberg–Marquardt; poses are eliminated view by view (Schur complement).
+///
+/// # Errors
+/// With too few views, or where they do not determine the camera (all square to the lens, for example).
 pub fn calibrate(
     views: &[PlaneView],
     width: f64,

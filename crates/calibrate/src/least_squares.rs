@@ -3,7 +3,6 @@
 
 use nalgebra::{Matrix6, Rotation3, SMatrix, SVector, Vector2, Vector3};
 
-use super::intrinsics::Wanted;
 use super::zhang::{PlanePose, PlaneView};
 use windhover_base::geo::{CameraModel, skew as cross_matrix};
 
@@ -17,6 +16,15 @@ pub(super) const SKEW: usize = 9;
 const MOST_STEPS: usize = 100;
 /// The search ends when the sum of squares falls by less than this share of itself.
 const LEAST_GAIN: f64 = 1e-10;
+
+/// Which of the optional parameters are estimated; the others stay zero.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Wanted {
+    /// The third radial term.
+    pub k3: bool,
+    /// Bouguet's α.
+    pub skew: bool,
+}
 
 /// A least-squares problem at its present guess.
 #[derive(Clone)]

@@ -1,10 +1,9 @@
-//! Calibration, and what accuracy to expect of it: the camera's intrinsics from boards, mounting
-//! angles from flights, the paper's Monte Carlo analysis.
-
+#![doc = include_str!("../README.md")]
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 pub mod boresight;
 mod boresight_filter;
+mod boresight_state;
 mod chessboard;
 #[cfg(test)]
 mod drawn_board;
@@ -13,6 +12,7 @@ pub mod intrinsics;
 mod least_squares;
 pub mod montecarlo;
 mod saddle;
+mod spread;
 mod subpixel;
 mod tag_grid;
 mod zhang;

@@ -8,6 +8,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 
+pub use super::spread::{moments, radii};
 use windhover_base::geo::{
     CameraModel, Ground, LocateError, PoseSigmas, body_from_camera, locate, locate_with_covariance,
     ned_from_body_321, rot_y, rot_z,
@@ -171,6 +172,9 @@ impl Setup {
     ///
     /// At (35): `σ_N² = σ_pN² + h² (σ_θ² + σ_u²)`, `σ_E² = σ_pE² + h² (σ_φ² + σ_v²)` with u and v
     /// along the body axes. An error of focal length or principal point acts as one of the pixel.
+    ///
+    /// # Errors
+    /// Where the ray of the pixel looked at does not meet the ground.
     pub fn closed_form(&self, sigmas: &PerSource) -> Result<Matrix2<f64>, LocateError> {
         let square = |k: usize| sigmas[k] * sigmas[k];
         let xd = {
@@ -214,6 +218,9 @@ impl Setup {
     }
 
     /// Runs the analysis over `samples` draws; the same seed gives the same figures.
+    ///
+    /// # Errors
+    /// Where the ray of the pixel looked at does not meet the ground without any error.
     pub fn run(&self, samples: usize, seed: u64) -> Result<Analysis, LocateError> {
         let truth = self.located(&[0.0; SOURCE_COUNT])?;
         let closed_m2 = self.closed_form(&self.sigmas)?;
@@ -258,34 +265,6 @@ fn draw(distribution: Distribution, rng: &mut ChaCha8Rng) -> f64 {
         // Uniform over ±√3 has unit variance.
         Distribution::Uniform => (2.0 * rng.random::<f64>() - 1.0) * 3f64.sqrt(),
     }
-}
-
-/// Mean, and covariance about it, of (north, east) errors; zero where there are too few.
-pub fn moments(errors_m: &[[f64; 2]]) -> (Vector2<f64>, Matrix2<f64>) {
-    let n = errors_m.len();
-    if n < 2 {
-        return (Vector2::zeros(), Matrix2::zeros());
-    }
-    let mean = errors_m.iter().map(|e| Vector2::from(*e)).sum::<Vector2<f64>>() / n as f64;
-    let spread: Matrix2<f64> = errors_m
-        .iter()
-        .map(|e| {
-            let d = Vector2::from(*e) - mean;
-            d * d.transpose()
-        })
-        .sum();
-    (mean, spread / (n - 1) as f64)
-}
-
-/// Radii that hold 50 % and 95 % of the errors, and the largest; zero where there are none.
-pub fn radii(errors_m: &[[f64; 2]]) -> (f64, f64, f64) {
-    let mut distances: Vec<f64> = errors_m.iter().map(|e| e[0].hypot(e[1])).collect();
-    distances.sort_by(f64::total_cmp);
-    let quantile = |q: f64| match distances.len() {
-        0 => 0.0,
-        n => distances[((q * n as f64).ceil() as usize).clamp(1, n) - 1],
-    };
-    (quantile(0.5), quantile(0.95), quantile(1.0))
 }
 
 #[cfg(test)]

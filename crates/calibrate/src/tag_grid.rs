@@ -3,9 +3,8 @@
 use nalgebra::Vector2;
 
 use super::zhang::{PlaneView, homography};
-use windhover_base::msg::TagFamily;
-use windhover_base::msg::{ImageView, MarkerDetection, MarkerId};
-use windhover_detect::TagDetector;
+use windhover_base::msg::{ImageView, TagFamily};
+use windhover_detect::{Detector, Limits, TagDetection};
 
 /// Smallest edge of a tag that is used, pixels: corners of smaller ones are too rough.
 const LEAST_PX: f64 = 14.0;
@@ -54,9 +53,13 @@ impl TagGrid {
     ///
     /// Numbers may count from the top row down or, as Kalibr prints them, from the bottom row up:
     /// whichever the image agrees with is taken.
+    ///
+    /// # Errors
+    /// Where too few tags of the grid are seen, or they do not lie as on this grid.
     pub fn find(&self, image: ImageView<'_>) -> Result<PlaneView, TagGridError> {
-        let mut seen = Vec::new();
-        TagDetector::new(&[self.family], LEAST_PX, 1).detect(image, &mut seen);
+        let limits = Limits { min_px: LEAST_PX, max_hamming: 1 };
+        let mut detector = Detector::new(&[self.family], limits);
+        let seen = detector.detect(image);
         let wanted = self.columns * self.rows;
         let tags: Vec<(usize, [Vector2<f64>; 4])> = seen.iter().filter_map(|m| self.tag_of(m)).collect();
         let mut numbers: Vec<usize> = tags.iter().map(|t| t.0).collect();
@@ -78,10 +81,9 @@ impl TagGrid {
         Ok(if best == 0 { down } else { up })
     }
 
-    fn tag_of(&self, seen: &MarkerDetection) -> Option<(usize, [Vector2<f64>; 4])> {
-        let MarkerId::Tag { family, id } = seen.marker else { return None };
-        let of_grid = family == self.family && (id as usize) < self.columns * self.rows;
-        of_grid.then_some((id as usize, seen.corners_px?))
+    fn tag_of(&self, seen: &TagDetection) -> Option<(usize, [Vector2<f64>; 4])> {
+        let number = seen.id as usize;
+        (number < self.columns * self.rows).then_some((number, seen.corners_px))
     }
 
     fn view(&self, tags: &[(usize, [Vector2<f64>; 4])], from_below: bool) -> PlaneView {

@@ -1,7 +1,7 @@
 //! The order of sentences in a receiver's burst, learnt from the stream: which sentence ends a
 //! cycle, and which ones lead it although they carry no time.
 
-use super::frame::LineSpan;
+use super::lines::LineSpan;
 use super::report::Kind;
 use windhover_base::time::Span;
 

@@ -1,6 +1,6 @@
 //! An epoch put together of sentences of one time.
 
-use super::frame::LineSpan;
+use super::lines::LineSpan;
 use super::report::{Date, Kind, Report};
 use nalgebra::Vector3;
 use windhover_base::msg::{FixKind, GnssEpoch};

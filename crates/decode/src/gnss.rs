@@ -3,7 +3,7 @@
 use super::burst::{BurstOrder, Cycle};
 use super::counts::{DecodeCounts, Refusal};
 use super::epoch::{Calendar, Draft};
-use super::frame::{Line, LineFramer, LineSpan, LineStart};
+use super::lines::{Line, LineFramer, LineSpan, LineStart};
 use super::report::{Kind, Report};
 use super::sentence::Sentence;
 use super::{garmin, standard};

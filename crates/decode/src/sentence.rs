@@ -21,6 +21,9 @@ pub fn framed(body: &str) -> String {
 
 impl<'a> Sentence<'a> {
     /// From a line `$body*HH`, nothing after the checksum.
+    ///
+    /// # Errors
+    /// Where the line is no ASCII sentence, or its checksum is missing or wrong.
     pub fn of_line(line: &'a [u8]) -> Result<Self, Refusal> {
         let line = std::str::from_utf8(line).map_err(|_| Refusal::NotAscii)?;
         if !line.bytes().all(|byte| (0x20..0x7F).contains(&byte)) {

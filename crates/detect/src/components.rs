@@ -7,6 +7,7 @@
 use std::ops::Range;
 
 use super::binarise::Bitmap;
+use super::disjoint_sets::union;
 use super::simd::{Kernel, Simd};
 
 /// Dark pixels `start..end` of a row.
@@ -319,26 +320,6 @@ impl Kernel for FindOutlines<'_> {
     #[inline(always)]
     fn run(self) {
         self.labeller.outline(self.words);
-    }
-}
-
-/// Joins two sets; the earlier root stays root.
-#[inline(always)]
-fn union(parents: &mut [u32], a: u32, b: u32) {
-    let (a, b) = (root(parents, a), root(parents, b));
-    parents[a.max(b) as usize] = a.min(b);
-}
-
-#[inline(always)]
-fn root(parents: &mut [u32], mut i: u32) -> u32 {
-    loop {
-        let parent = parents[i as usize];
-        if parent == i {
-            return i;
-        }
-        let grandparent = parents[parent as usize];
-        parents[i as usize] = grandparent;
-        i = grandparent;
     }
 }
 

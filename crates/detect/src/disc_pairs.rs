@@ -3,7 +3,7 @@
 use nalgebra::{Matrix2, Vector2};
 
 use super::disc::{Blob, DiscFinder, center_shift};
-use super::tag::Region;
+use super::roi::Roi;
 use windhover_base::geo::CameraModel;
 use windhover_base::msg::{
     FramePrediction, GrayImage, ImageView, MarkerDetection, MarkerId, MarkerPrediction, RgbImage,
@@ -91,9 +91,9 @@ impl DiscPairs {
         let tracking = prediction.filter(|p| !p.search);
         for i in 0..self.discs.len() {
             if let Some(prediction) = tracking {
-                let region = predicted(&self.discs[i], Some(prediction)).and_then(|m| region_of(image, m));
-                if let Some(region) = region {
-                    self.search(i, image, rgb, region);
+                let roi = predicted(&self.discs[i], Some(prediction)).and_then(|m| roi_of(image, m));
+                if let Some(roi) = roi {
+                    self.search(i, image, rgb, roi);
                 }
                 continue;
             }
@@ -110,7 +110,7 @@ impl DiscPairs {
                     }
                 }
                 None => {
-                    let whole = Region { u: 0, v: 0, width: image.width, height: image.height };
+                    let whole = Roi { u: 0, v: 0, width: image.width, height: image.height };
                     self.search(i, image, rgb, whole);
                 }
             }
@@ -121,10 +121,10 @@ impl DiscPairs {
         }
     }
 
-    fn search(&mut self, disc: usize, image: ImageView<'_>, rgb: Option<&RgbImage>, region: Region) {
+    fn search(&mut self, disc: usize, image: ImageView<'_>, rgb: Option<&RgbImage>, roi: Roi) {
         let look = self.discs[disc].look;
         self.found.clear();
-        let part = image.crop(region.u, region.v, region.width, region.height);
+        let part = image.crop(roi.u, roi.v, roi.width, roi.height);
         let sizes = (0.0, 0.5 * image.width.min(image.height) as f64);
         match (look, rgb) {
             (Look::Dark, _) => self.finder.find(part, sizes, &mut self.found),
@@ -133,7 +133,7 @@ impl DiscPairs {
                 self.finder.find(self.plane.view(), sizes, &mut self.found);
             }
             (Look::Color(color), Some(rgb)) => {
-                color_distance(rgb, region, color, &mut self.plane);
+                color_distance(rgb, roi, color, &mut self.plane);
                 self.finder.find(self.plane.view(), sizes, &mut self.found);
             }
             // A grey frame of a coloured disc: lighter or darker, there is no telling which.
@@ -143,7 +143,7 @@ impl DiscPairs {
                 self.finder.find(self.plane.view(), sizes, &mut self.found);
             }
         }
-        let shift = Vector2::new(region.u as f64, region.v as f64);
+        let shift = Vector2::new(roi.u as f64, roi.v as f64);
         self.blobs.extend(self.found.iter().map(|b| (disc, Blob { center: b.center + shift, ..*b })));
     }
 
@@ -238,9 +238,9 @@ fn reach(m: &MarkerPrediction) -> f64 {
 }
 
 /// The part of a frame in which a predicted disc lies whole, with ground around it.
-fn region_of(image: ImageView<'_>, m: &MarkerPrediction) -> Option<Region> {
+fn roi_of(image: ImageView<'_>, m: &MarkerPrediction) -> Option<Roi> {
     let radius = reach(m) + 0.5 * (1.0 + SIZE_SLACK) * m.size_px + AROUND_PX;
-    radius.is_finite().then(|| Region::around(image, m.center_px, radius)).flatten()
+    radius.is_finite().then(|| Roi::around(image, m.center_px, radius)).flatten()
 }
 
 fn predicted<'a>(disc: &Disc, prediction: Option<&'a FramePrediction>) -> Option<&'a MarkerPrediction> {
@@ -275,16 +275,16 @@ fn negative(image: ImageView<'_>, to: &mut GrayImage) {
 
 /// Distance in chromaticity from a colour in part of a frame, dark where near: shares of red, green and blue do
 /// not change with the light.
-fn color_distance(rgb: &RgbImage, region: Region, color: [u8; 3], to: &mut GrayImage) {
-    (to.width, to.height, to.stride) = (region.width, region.height, region.width);
+fn color_distance(rgb: &RgbImage, roi: Roi, color: [u8; 3], to: &mut GrayImage) {
+    (to.width, to.height, to.stride) = (roi.width, roi.height, roi.width);
     let shares = |c: [u8; 3]| {
         let sum = c.iter().map(|&x| f32::from(x)).sum::<f32>() + 24.0;
         c.map(|x| (f32::from(x) + 8.0) / sum)
     };
     let wanted = shares(color);
     to.data.clear();
-    for v in region.v..region.v + region.height {
-        let row = &rgb.data[3 * (v * rgb.width + region.u)..][..3 * region.width];
+    for v in roi.v..roi.v + roi.height {
+        let row = &rgb.data[3 * (v * rgb.width + roi.u)..][..3 * roi.width];
         to.data.extend(row.chunks_exact(3).map(|p| {
             let here = shares([p[0], p[1], p[2]]);
             let distance: f32 = wanted.iter().zip(here).map(|(a, b)| (a - b).abs()).sum();

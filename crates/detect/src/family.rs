@@ -5,8 +5,7 @@
 //! colour; tagStandard41h12 has its data outside that ring as well, and its border is the light
 //! square inside a dark ring: it is looked for in the inverted image.
 
-use super::codes;
-use windhover_base::msg::TagFamily;
+use windhover_base::msg::{FamilySpec, TagFamily};
 
 /// What a grid of bits was recognised as.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -39,18 +38,9 @@ pub(super) struct Family {
 }
 
 impl Family {
-    /// The tables of a family; `max_hamming` is cut to what keeps chance matches rare.
-    ///
-    /// With N codes of n bits, a random grid matches within h errors in one of four turns with
-    /// probability about `4 N Σ C(n, k) / 2ⁿ`. The limits keep that below 2·10⁻⁴ save for 16h5,
-    /// whose 2·10⁻³ at h = 0 is what its few bits allow.
+    /// The tables of a family; `max_hamming` is cut to what the family allows.
     pub fn new(family: TagFamily, max_hamming: u8) -> Self {
-        let (width, pad, inverted, limit, codes): (usize, usize, bool, u8, &'static [u64]) = match family {
-            TagFamily::Tag36h11 => (8, 1, false, 2, &codes::TAG36H11),
-            TagFamily::Tag25h9 => (7, 1, false, 1, &codes::TAG25H9),
-            TagFamily::Tag16h5 => (6, 1, false, 0, &codes::TAG16H5),
-            TagFamily::Tag41h12 => (5, 2, true, 3, &codes::TAG41H12),
-        };
+        let &FamilySpec { border: width, pad, inverted, correctable: limit, codes, .. } = family.spec();
         let cells = data_cells(width, pad);
         let turned = std::array::from_fn(|turns| {
             cells.iter().map(|&cell| grid_index(turn(cell, width, turns), width, pad)).collect()

@@ -1,20 +1,20 @@
-//! Markers and ground features in frames.
-
+#![doc = include_str!("../README.md")]
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 mod binarise;
-mod codes;
 mod components;
 mod corners;
+mod detection;
+mod detector;
 mod disc;
 mod disc_pairs;
+mod disjoint_sets;
 mod edge_points;
 mod edges;
 mod equations;
 mod family;
 mod features;
 mod flow;
-mod frame;
 mod homography;
 mod noise;
 mod pattern;
@@ -23,15 +23,19 @@ mod pose;
 mod pyramid;
 mod quad;
 mod refine;
+mod roi;
 mod simd;
-mod tag;
 mod tag_edges;
 mod tag_model;
 mod template;
+pub mod tracking;
 mod windows;
 
-pub use frame::FrameDetector;
+pub use detection::TagDetection;
+pub use detector::{Detector, LARGEST_IMAGE_PX, Limits};
 pub use pattern::{TagPattern, tag_pattern};
 pub use pose::{TagPose, TagPoses, tag_poses};
+pub use roi::Roi;
 pub use simd::Simd;
-pub use tag::{LARGEST_IMAGE_PX, Region, TagDetector};
+pub use windhover_base::geo::CameraModel;
+pub use windhover_base::msg::{GrayImage, ImageView, TagFamily};

@@ -1,9 +1,4 @@
-//! Where the vehicle is, where it points and how it moves: one joint error-state filter over the
-//! helicopter, its sensors' slow errors and every target, on raw measurements at their time of
-//! validity; a fixed-lag smoother with it; and the paper's own estimator beside it.
-//!
-//! `docs/estimator.md` gives state, models and what each choice is worth.
-
+#![doc = include_str!("../README.md")]
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 pub mod align;

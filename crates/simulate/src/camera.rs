@@ -2,10 +2,11 @@
 
 use nalgebra::{Rotation3, Vector2, Vector3};
 
+use super::instant::VehicleTruth;
 use super::markers::corners_in_vehicle;
 use super::random::{Purpose, Stream};
 use super::scenario::{vector, within};
-use super::world::{VehicleTruth, World};
+use super::world::World;
 use windhover_base::geo::ned_from_body_321;
 use windhover_base::time::{MonoTime, Span};
 

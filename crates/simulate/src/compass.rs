@@ -2,9 +2,10 @@
 
 use nalgebra::Vector3;
 
+use super::instant::OwnshipTruth;
 use super::random::{Purpose, Stream};
 use super::scenario::{Scenario, within};
-use super::world::{OwnshipTruth, World};
+use super::world::World;
 use windhover_base::geo::{Tilt, euler_321, ned_from_body_321, rot_z, wrap_angle};
 use windhover_base::msg::AttitudeSample;
 use windhover_base::time::{MonoTime, Span};

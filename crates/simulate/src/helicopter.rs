@@ -7,11 +7,11 @@
 
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
+use super::instant::{OwnshipTruth, STEP_S};
 use super::ode::Table;
 use super::random::{Purpose, Stream, Wander};
 use super::scenario::{Helicopter, HelicopterPath, Wind};
 use super::vehicle::VehicleMotion;
-use super::world::{OwnshipTruth, STEP_S};
 use windhover_base::geo::{ned_from_body_321, wrap_angle};
 
 /// Standard gravity, m/s².

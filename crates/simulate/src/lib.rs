@@ -1,10 +1,4 @@
-//! Simulated flights: motion, sensors with their errors, serial sentences and camera frames.
-//!
-//! A [`Scenario`] says everything by figures; [`World`] is the truth at any time; [`SensorSuite`]
-//! turns it into measurements as values (for Monte Carlo runs, without bytes or pixels); [`Flight`]
-//! into the events of real devices: serial bytes at the pace of their line, and rendered frames.
-//! Everything is seeded: the same scenario and seed give the same flight on any machine.
-
+#![doc = include_str!("../README.md")]
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 mod camera;
@@ -13,7 +7,9 @@ mod compass_wire;
 mod flight;
 mod garmin;
 mod gnss;
+mod guide;
 mod helicopter;
+mod instant;
 mod line;
 mod markers;
 mod ode;
@@ -21,6 +17,7 @@ mod random;
 pub mod render;
 mod scenario;
 mod scenarios;
+mod sensor_errors;
 mod suite;
 pub mod truth;
 mod vehicle;
@@ -28,14 +25,13 @@ mod world;
 
 pub use camera::{CameraPose, FrameTruth, MarkerTruth};
 pub use flight::{Flight, FlightError, FrameStorage, JpegEncoder};
+pub use instant::{OwnshipTruth, VehicleTruth};
 pub use markers::corners_in_vehicle;
 pub use random::{Stream, Wander};
-pub use scenario::{
-    CameraSim, Clock, CompassSim, GpsSim, Helicopter, HelicopterPath, HiddenMarker, Route, Scenario, Scene,
-    SpeedPlan, VehiclePlan, Wind,
-};
+pub use scenario::{Clock, Helicopter, HelicopterPath, Route, Scenario, Scene, SpeedPlan, VehiclePlan, Wind};
+pub use sensor_errors::{CameraSim, CompassSim, GpsSim, HiddenMarker};
 pub use suite::{Sample, SensorSuite};
-pub use world::{OwnshipTruth, VehicleTruth, World};
+pub use world::World;
 
 #[cfg(test)]
 mod tests;

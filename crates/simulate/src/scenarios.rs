@@ -1,9 +1,9 @@
 //! The named scenarios.
 
 use super::scenario::{
-    CameraSim, Clock, CompassSim, GpsSim, Helicopter, HelicopterPath, HiddenMarker, Route, Scenario, Scene,
-    SpeedPlan, VehiclePlan, Wind,
+    Clock, Helicopter, HelicopterPath, Route, Scenario, Scene, SpeedPlan, VehiclePlan, Wind,
 };
+use super::sensor_errors::{CameraSim, CompassSim, GpsSim, HiddenMarker};
 use windhover_base::geo::{Geodetic, ImageTop, TiltConvention};
 use windhover_base::settings::{CompassFormat, Rig, TargetConfig, TargetModel};
 use windhover_base::time::MonoTime;

@@ -1,9 +1,9 @@
 //! How a ground vehicle moves: a driver, a drive and a steering gear with lag, on level ground.
 
+use super::instant::{STEP_S, VehicleTruth};
 use super::ode::Table;
 use super::random::{Purpose, Stream, Wander};
 use super::scenario::{Route, SpeedPlan, VehiclePlan};
-use super::world::{STEP_S, VehicleTruth};
 use windhover_base::geo::wrap_angle;
 use windhover_base::settings::{TargetConfig, TargetModel};
 

@@ -20,6 +20,9 @@ pub struct DeclinationError {
 }
 
 /// Declination at a place and time, radians, east positive: `ψ_true = ψ_magnetic + declination`.
+///
+/// # Errors
+/// Where the model does not cover the place or the date.
 pub fn declination(at: Geodetic, date: UtcTime) -> Result<f64, DeclinationError> {
     let refused = |reason: String| DeclinationError { date, reason };
     let civil = date.civil();

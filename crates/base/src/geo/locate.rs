@@ -47,6 +47,9 @@ pub struct PoseSigmas {
 /// `p_camera` is the camera's position in NED, `ned_from_camera` its attitude, `above_m` the height
 /// of the wanted point over the ground (a marker on a roof), `limit_m` the farthest slant accepted.
 /// `d = ned_from_camera [u v 1]ᵀ`, `Zc = (D0 − p_D)/d_D`, `G = p + Zc d` (paper eq. 11–13, corrected).
+///
+/// # Errors
+/// Where the pixel is outside the lens model, or its ray does not meet the ground within `limit_m`.
 pub fn locate(
     camera: &CameraModel,
     p_camera: &Vector3<f64>,
@@ -70,6 +73,9 @@ pub fn locate(
 ///
 /// With `n = (∂D/∂N, ∂D/∂E, −1)` the ground's normal scaled so that it works on a slope too, a small
 /// change `δ` of the ray's far end moves the ground point by `(I − d nᵀ/(nᵀd)) δ`.
+///
+/// # Errors
+/// Those of [`locate`].
 pub fn locate_with_covariance(
     camera: &CameraModel,
     p_camera: &Vector3<f64>,

@@ -8,19 +8,19 @@
 
 mod camera;
 mod declination;
-mod frames;
 mod ground;
 mod locate;
+mod rotations;
 mod terrain;
 mod wgs84;
 
 pub use camera::{CameraModel, Projection};
 pub use declination::{DeclinationError, declination};
-pub use frames::{
+pub use ground::Ground;
+pub use locate::{GroundPoint, LocateError, PoseSigmas, locate, locate_with_covariance};
+pub use rotations::{
     ImageTop, Tilt, TiltConvention, body_from_camera, euler_312, euler_321, ned_from_body_312,
     ned_from_body_321, rot_x, rot_y, rot_z, skew, tilt_from_down, wrap_angle,
 };
-pub use ground::Ground;
-pub use locate::{GroundPoint, LocateError, PoseSigmas, locate, locate_with_covariance};
 pub use terrain::{Terrain, TerrainError, Tile};
 pub use wgs84::{Geodetic, LocalFrame};

@@ -81,6 +81,9 @@ impl Tile {
     /// An SRTM `.hgt` file: big-endian heights of two bytes, −32768 where missing, a square that
     /// covers one degree and shares its border with its neighbours (USGS, SRTM documentation). `stem`
     /// is its name without extension, which tells the south-west corner.
+    ///
+    /// # Errors
+    /// Where the name tells no corner, or the bytes are no square of heights.
     pub fn from_hgt(stem: &str, bytes: &[u8]) -> Result<Self, TerrainError> {
         let (south, west) = hgt_corner(stem).ok_or(TerrainError::Name)?;
         let side = match bytes.len() / 2 {

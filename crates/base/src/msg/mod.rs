@@ -17,7 +17,7 @@ pub use estimate::{
     TrackStatus,
 };
 pub use event::{Event, EventBody, FrameEncoding, FramePayload};
-pub use family::TagFamily;
+pub use family::{FamilySpec, TagFamily};
 pub use health::{Health, SourceHealth, TargetHealth};
 pub use image::{GrayImage, ImageView, RgbImage};
 pub use measure::{

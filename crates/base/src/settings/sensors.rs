@@ -85,24 +85,61 @@ pub struct CompassConfig {
     pub tilt_noise_deg: f64,
 }
 
-/// Serial compass formats.
-#[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum CompassFormat {
+/// The enum of formats with their names, out of one row a format.
+macro_rules! compass_formats {
+    ($($(#[$about:meta])* $variant:ident = $name:literal;)*) => {
+        /// Serial compass formats.
+        #[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
+        pub enum CompassFormat {
+            $($(#[$about])* #[serde(rename = $name)] $variant,)*
+        }
+
+        impl CompassFormat {
+            /// Every format.
+            pub const ALL: [Self; [$($name),*].len()] = [$(Self::$variant),*];
+
+            /// Its name in configuration and on the command line.
+            pub const fn name(self) -> &'static str {
+                match self {
+                    $(Self::$variant => $name,)*
+                }
+            }
+        }
+    };
+}
+
+compass_formats! {
     /// PNI TCM2, TCM2.5, TCM2.6 word format `$C…P…R…`.
-    Tcm2,
+    Tcm2 = "tcm2";
     /// OceanServer OS5000.
-    Os5000,
+    Os5000 = "os5000";
     /// Honeywell HMR3000 `$PTNTHPR`.
-    Hmr3000,
+    Hmr3000 = "hmr3000";
     /// True North Revolution `$PTNTHTM`.
-    Revolution,
+    Revolution = "revolution";
     /// PNI TCM3/5/XB binary.
-    Pni,
+    Pni = "pni";
     /// `$PASHR`.
-    Pashr,
+    Pashr = "pashr";
     /// Generic NMEA heading sentences.
-    Nmea,
+    Nmea = "nmea";
+}
+
+impl CompassFormat {
+    /// Whether the device sends lines of text.
+    pub fn is_text(self) -> bool {
+        self != Self::Pni
+    }
+}
+
+impl std::str::FromStr for CompassFormat {
+    type Err = String;
+    fn from_str(name: &str) -> Result<Self, String> {
+        let known = Self::ALL.into_iter().find(|format| format.name() == name);
+        known.ok_or_else(|| {
+            format!("{name:?} is no compass format; known are {}", Self::ALL.map(Self::name).join(", "))
+        })
+    }
 }
 
 /// Where declination comes from when not given as a figure.

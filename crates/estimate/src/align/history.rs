@@ -64,7 +64,10 @@ impl<M: Default, S: Default + Clone> History<M, S> {
         }
     }
 
-    /// Whether a measurement can be fused: `Err` carries `TooNew` or `TooOld`.
+    /// Whether a measurement can be fused.
+    ///
+    /// # Errors
+    /// [`Disposition::TooNew`] or [`Disposition::TooOld`], where it cannot.
     pub fn admit(&mut self, stamp: Stamp) -> Result<(), Disposition> {
         let newest = self.newest_recv.map_or(stamp.t_recv, |t| t.max(stamp.t_recv));
         self.newest_recv = Some(newest);

@@ -5,8 +5,7 @@ use std::sync::Arc;
 use super::*;
 use crate::{MarkerTruth, Scenario};
 use windhover_base::msg::TagFamily;
-use windhover_base::msg::{MarkerDetection, MarkerId};
-use windhover_detect::TagDetector;
+use windhover_detect::{Detector, Limits, TagDetection};
 
 fn frame(scenario: Scenario, seed: u64, t_s: f64) -> (Arc<World>, GrayImage) {
     let world = Arc::new(World::new(scenario, seed));
@@ -16,14 +15,14 @@ fn frame(scenario: Scenario, seed: u64, t_s: f64) -> (Arc<World>, GrayImage) {
 }
 
 /// Every visible tag with what was found of it.
-fn found(world: &World, image: &GrayImage, t_s: f64) -> Vec<(MarkerTruth, Option<MarkerDetection>)> {
+fn found(world: &World, image: &GrayImage, t_s: f64) -> Vec<(MarkerTruth, Option<TagDetection>)> {
     let (t, config) = (world.time(t_s), &world.scenario().rig);
     let mut families: Vec<TagFamily> =
         config.target.iter().flat_map(|t| &t.marker).filter_map(|m| m.family).collect();
     families.sort_unstable();
     families.dedup();
-    let mut detections = Vec::new();
-    TagDetector::new(&families, 10.0, 1).detect(image.view(), &mut detections);
+    let mut detector = Detector::new(&families, Limits { min_px: 10.0, max_hamming: 1 });
+    let detections = detector.detect(image.view());
     let pose = world.camera_pose(t);
     let mut pairs = Vec::new();
     for (target, settings) in config.target.iter().enumerate() {
@@ -31,16 +30,16 @@ fn found(world: &World, image: &GrayImage, t_s: f64) -> Vec<(MarkerTruth, Option
         for (marker, tag) in settings.marker.iter().enumerate() {
             let truth = world.marker(target, marker, &vehicle, &pose, t).expect("below the camera");
             let (Some(family), Some(id), true) = (tag.family, tag.id, truth.visible) else { continue };
-            let wanted = MarkerId::Tag { family, id };
-            pairs.push((truth, detections.iter().find(|d| d.marker == wanted).copied()));
+            let found = detections.iter().find(|d| (d.family, d.id) == (family, id));
+            pairs.push((truth, found.copied()));
         }
     }
     pairs
 }
 
 /// Which true corner a detected one is nearest to, for each of the four.
-fn order(detection: &MarkerDetection, truth: &MarkerTruth) -> [usize; 4] {
-    detection.corners_px.expect("a tag").map(|at| {
+fn order(detection: &TagDetection, truth: &MarkerTruth) -> [usize; 4] {
+    detection.corners_px.map(|at| {
         (0..4)
             .min_by(|a, b| (truth.corners_px[*a] - at).norm().total_cmp(&(truth.corners_px[*b] - at).norm()))
             .expect("there are four")

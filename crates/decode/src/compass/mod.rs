@@ -1,0 +1,139 @@
+//! Compass bytes to attitude samples, in every supported format.
+//!
+//! A format is a file beside this one and a row in [`reader`]; its name in the configuration is a row of
+//! [`CompassFormat`].
+
+mod fields;
+#[cfg(test)]
+mod format_tests;
+mod hmr3000;
+mod nmea;
+mod os5000;
+mod pashr;
+mod pni;
+mod reading;
+mod revolution;
+mod tagged;
+mod tcm2;
+#[cfg(test)]
+mod tests;
+
+pub use reading::{CompassReading, HeardAttitude};
+
+use windhover_base::settings::CompassFormat;
+use windhover_base::time::MonoTime;
+
+use crate::counts::{DecodeCounts, Refusal};
+use crate::lines::{LineFramer, LineStart};
+use crate::sentence::Sentence;
+use reading::heard;
+
+/// What a sentence with a sound checksum says.
+type ReadSentence = fn(&Sentence<'_>) -> Result<Option<CompassReading>, Refusal>;
+/// What a line without `$` says.
+type ReadLine = fn(&[u8]) -> Result<Option<CompassReading>, Refusal>;
+
+/// How a format is read.
+#[derive(Clone, Copy, Debug)]
+enum Reader {
+    /// Sentences `$…*HH`.
+    Sentences(ReadSentence),
+    /// Sentences, and lines without frame and checksum of a device that never sends one.
+    SentencesOrBare(ReadSentence, ReadLine),
+    /// Binary packets of PNI.
+    Packets,
+}
+
+/// The table of formats.
+const fn reader(format: CompassFormat) -> Reader {
+    match format {
+        CompassFormat::Tcm2 => Reader::Sentences(tcm2::read),
+        CompassFormat::Os5000 => Reader::SentencesOrBare(os5000::read, os5000::bare),
+        CompassFormat::Hmr3000 => Reader::Sentences(hmr3000::read),
+        CompassFormat::Revolution => Reader::Sentences(revolution::read),
+        CompassFormat::Pni => Reader::Packets,
+        CompassFormat::Pashr => Reader::Sentences(pashr::read),
+        CompassFormat::Nmea => Reader::Sentences(nmea::read),
+    }
+}
+
+/// Reads a digital compass.
+#[derive(Clone, Debug)]
+pub struct CompassDecoder {
+    counts: DecodeCounts,
+    input: Input,
+}
+
+/// Collects bytes into what a format is made of.
+#[derive(Clone, Debug)]
+enum Input {
+    Text(TextInput),
+    Packets(pni::PacketFramer),
+}
+
+#[derive(Clone, Debug)]
+struct TextInput {
+    lines: LineFramer,
+    sentence: ReadSentence,
+    bare: Option<ReadLine>,
+    /// Whether the device was seen to send checksums: then a line without one is damaged.
+    has_checksums: bool,
+}
+
+impl TextInput {
+    fn new(sentence: ReadSentence, bare: Option<ReadLine>) -> Self {
+        let start = if bare.is_some() { LineStart::Any } else { LineStart::Dollar };
+        Self { lines: LineFramer::new(start), sentence, bare, has_checksums: false }
+    }
+
+    fn push(
+        &mut self,
+        bytes: &[u8],
+        t_recv: MonoTime,
+        counts: &mut DecodeCounts,
+        out: &mut Vec<HeardAttitude>,
+    ) {
+        let (sentence, bare, has_checksums) = (self.sentence, self.bare, &mut self.has_checksums);
+        self.lines.push(bytes, t_recv, counts, |line, counts| {
+            if line.text.contains(&b'*') {
+                *has_checksums = true;
+            } else if *has_checksums || bare.is_none() {
+                return counts.refuse(Refusal::NoChecksum);
+            }
+            let said = match bare.filter(|_| !line.text.starts_with(b"$")) {
+                Some(bare) => bare(line.text),
+                None => Sentence::of_line(line.text).and_then(|line| sentence(&line)),
+            };
+            match said {
+                Ok(Some(reading)) => out.push(heard(reading, line.span, counts)),
+                Ok(None) => counts.ignored += 1,
+                Err(why) => counts.refuse(why),
+            }
+        });
+    }
+}
+
+impl CompassDecoder {
+    /// A decoder for one format.
+    pub fn new(format: CompassFormat) -> Self {
+        let input = match reader(format) {
+            Reader::Sentences(sentence) => Input::Text(TextInput::new(sentence, None)),
+            Reader::SentencesOrBare(sentence, bare) => Input::Text(TextInput::new(sentence, Some(bare))),
+            Reader::Packets => Input::Packets(pni::PacketFramer::default()),
+        };
+        Self { counts: DecodeCounts::default(), input }
+    }
+
+    /// Takes the bytes one read returned at `t_recv`; appends the samples they complete to `out`.
+    pub fn push(&mut self, bytes: &[u8], t_recv: MonoTime, out: &mut Vec<HeardAttitude>) {
+        match &mut self.input {
+            Input::Text(text) => text.push(bytes, t_recv, &mut self.counts, out),
+            Input::Packets(packets) => packets.push(bytes, t_recv, &mut self.counts, out),
+        }
+    }
+
+    /// What was made of the bytes so far.
+    pub const fn counts(&self) -> &DecodeCounts {
+        &self.counts
+    }
+}

@@ -1,0 +1,62 @@
+//! Headings and transducers of plain NMEA 0183, which most compasses can send beside their own sentences.
+
+use super::fields::{heading, tilt};
+use super::reading::CompassReading;
+use crate::counts::Refusal;
+use crate::sentence::Sentence;
+
+/// HDG, HDM, HDT, THS and XDR of any talker.
+pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
+    let mut reading = CompassReading::default();
+    match sentence.formatter() {
+        Some("HDG") => {
+            // Sensor heading plus deviation is magnetic heading; variation is ours to apply.
+            let deviation = signed_east(sentence, 2)?.unwrap_or(0.0);
+            reading.heading_deg = heading(sentence.field(1))?.map(|deg| (deg + deviation).rem_euclid(360.0));
+        }
+        Some("HDM") => reading.heading_deg = heading(sentence.field(1))?,
+        Some("HDT") => {
+            reading.heading_deg = heading(sentence.field(1))?;
+            reading.heading_is_true = true;
+        }
+        Some("THS") => {
+            reading.heading_is_true = true;
+            reading.flagged = matches!(sentence.field(2), "V" | "S" | "M");
+            reading.heading_deg = heading(sentence.field(1))?.filter(|_| !reading.flagged);
+        }
+        Some("XDR") => return transducers(sentence),
+        _ => return Ok(None),
+    }
+    reading.flagged |= reading.heading_deg.is_none();
+    Ok(Some(reading))
+}
+
+/// Degrees and E or W in the next field; east positive.
+fn signed_east(sentence: &Sentence<'_>, index: usize) -> Result<Option<f64>, Refusal> {
+    let Some(size) = sentence.number(index, 0.0, 180.0)? else {
+        return Ok(None);
+    };
+    match sentence.field(index + 1) {
+        "E" => Ok(Some(size)),
+        "W" => Ok(Some(-size)),
+        _ => Err(Refusal::Malformed),
+    }
+}
+
+/// XDR: groups of type, value, unit, name; the angles (type A, unit D) named pitch and roll.
+fn transducers(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
+    let mut reading = CompassReading::default();
+    for group in 0..sentence.fields() / 4 {
+        let at = 1 + group * 4;
+        if (sentence.field(at), sentence.field(at + 2)) != ("A", "D") {
+            continue;
+        }
+        let name = sentence.field(at + 3).to_ascii_uppercase();
+        if name.starts_with("PITCH") || name.starts_with("PTCH") {
+            reading.pitch_deg = tilt(sentence.field(at + 1))?;
+        } else if name.starts_with("ROLL") {
+            reading.roll_deg = tilt(sentence.field(at + 1))?;
+        }
+    }
+    Ok((reading.pitch_deg.is_some() || reading.roll_deg.is_some()).then_some(reading))
+}

@@ -1,0 +1,35 @@
+//! `$PASHR`, attitude of receivers with an inertial unit.
+
+use super::fields::{heading, tilt};
+use super::reading::CompassReading;
+use crate::counts::Refusal;
+use crate::sentence::Sentence;
+
+/// What a sentence says; `None` where it says nothing of attitude.
+pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
+    if sentence.address() == "PASHR" { pashr(sentence) } else { Ok(None) }
+}
+
+/// `PASHR,hhmmss.sss,heading,T,roll,pitch,heave,…,GPS quality,IMU status`: roll comes before pitch.
+/// Without GPS (quality 0) the heading has nothing to hold it.
+fn pashr(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
+    if !sentence.field(1).bytes().next().is_some_and(|byte| byte.is_ascii_digit()) {
+        // PASHR,ATT and its like: another grammar under the same address.
+        return Ok(None);
+    }
+    if sentence.fields() < 5 {
+        return Err(Refusal::Malformed);
+    }
+    let mut reading = CompassReading {
+        heading_deg: heading(sentence.field(2))?,
+        heading_is_true: sentence.field(3) == "T",
+        roll_deg: tilt(sentence.field(4))?,
+        pitch_deg: tilt(sentence.field(5))?,
+        flagged: false,
+    };
+    if sentence.field(10) == "0" {
+        reading.heading_deg = None;
+        reading.flagged = true;
+    }
+    Ok(Some(reading))
+}

@@ -1,0 +1,69 @@
+//! Readings of a compass, and when they came.
+
+use windhover_base::geo::Tilt;
+use windhover_base::msg::AttitudeSample;
+use windhover_base::time::MonoTime;
+
+use crate::counts::DecodeCounts;
+use crate::lines::LineSpan;
+
+/// One reading as the device gives it, degrees; `None` where not given or not valid.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub struct CompassReading {
+    /// Heading, 0 to 360.
+    pub heading_deg: Option<f64>,
+    /// Whether the heading is already true.
+    pub heading_is_true: bool,
+    /// Pitch, nose up positive.
+    pub pitch_deg: Option<f64>,
+    /// Roll, right side down positive.
+    pub roll_deg: Option<f64>,
+    /// Whether the device's own flags made something of this reading invalid.
+    pub flagged: bool,
+}
+
+impl CompassReading {
+    /// The reading as what the estimator takes: radians, tilt only where both angles are valid.
+    pub fn sample(&self) -> AttitudeSample {
+        let tilt = self.pitch_deg.zip(self.roll_deg);
+        AttitudeSample {
+            heading: self.heading_deg.map(f64::to_radians),
+            heading_is_true: self.heading_is_true,
+            tilt: tilt.map(|(pitch, roll)| Tilt { pitch: pitch.to_radians(), roll: roll.to_radians() }),
+        }
+    }
+
+    /// Whether nothing in it was called invalid by the device, and there is something in it.
+    pub fn is_valid(&self) -> bool {
+        !self.flagged && (self.heading_deg.is_some() || self.pitch_deg.is_some() || self.roll_deg.is_some())
+    }
+}
+
+/// A reading and when it was heard.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct HeardAttitude {
+    /// The reading as the estimator takes it.
+    pub sample: AttitudeSample,
+    /// The reading as the device gives it.
+    pub reading: CompassReading,
+    /// When the read returned that completed it.
+    pub t_recv: MonoTime,
+    /// Its length on the wire.
+    pub bytes: usize,
+    /// Bytes of that read after it. Its last byte ended no later than `t_recv` less the
+    /// transmission time of these.
+    pub bytes_after: usize,
+}
+
+/// Stamps a reading and counts it.
+pub(super) fn heard(reading: CompassReading, span: LineSpan, counts: &mut DecodeCounts) -> HeardAttitude {
+    counts.used += 1;
+    counts.flagged += u64::from(reading.flagged);
+    HeardAttitude {
+        sample: reading.sample(),
+        reading,
+        t_recv: span.t_last,
+        bytes: span.bytes,
+        bytes_after: span.bytes_after,
+    }
+}

@@ -1,0 +1,12 @@
+//! PNI TCM2, TCM2.5 and TCM2.6 word format. Source: PNI's manual.
+
+use super::nmea;
+use super::reading::CompassReading;
+use super::tagged::{is_tagged, tagged};
+use crate::counts::Refusal;
+use crate::sentence::Sentence;
+
+/// What a sentence says; `None` where it says nothing of attitude.
+pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
+    if is_tagged(sentence.address()) { tagged(sentence.body) } else { nmea::read(sentence) }
+}

@@ -1,0 +1,266 @@
+//! The tag detector: from an image to tags with their corners.
+
+use super::binarise::{Binariser, Bitmap, Where};
+use super::components::Labeller;
+use super::detection::TagDetection;
+use super::edges::{EdgeSearch, fit_sides};
+use super::family::{Family, Word};
+use super::noise::noise_sigma;
+use super::payload;
+use super::pyramid::{Base, Level, Pyramid};
+use super::quad::{Quad, QuadFinder, SizeLimits, distance, looks_like_tag, may_be_border, polygon_area};
+use super::refine::Refiner;
+use super::roi::Roi;
+use super::simd::Simd;
+use super::tag_model::Refined;
+use nalgebra::{Matrix2, Vector2};
+use windhover_base::msg::{GrayImage, ImageView, TagFamily};
+
+/// Finds square tags. Buffers are kept from image to image: with images of one size the second and later ones
+/// take no memory.
+#[derive(Clone, Debug)]
+pub struct Detector {
+    families: Vec<Family>,
+    min_px: f32,
+    simd: Simd,
+    pyramid: Pyramid,
+    binariser: Binariser,
+    bits: Bitmap,
+    labeller: Labeller,
+    finder: QuadFinder,
+    refiner: Refiner,
+    found: Vec<Found>,
+    detections: Vec<TagDetection>,
+    negative: GrayImage,
+    /// Of a frame pixel, grey levels.
+    noise: f32,
+}
+
+/// What is looked for.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Limits {
+    /// Smallest edge of a tag's border, the square whose size is configured, pixels.
+    pub min_px: f64,
+    /// Most wrong bits that are corrected. Families with few bits correct fewer: 36h11 at most 2, 25h9 at
+    /// most 1, 16h5 none, 41h12 at most 3.
+    pub max_hamming: u8,
+}
+
+impl Default for Limits {
+    /// Tags from 16 pixels, at most two wrong bits.
+    fn default() -> Self {
+        Self { min_px: 16.0, max_hamming: 2 }
+    }
+}
+
+/// A decoded tag.
+#[derive(Clone, Copy, PartialEq, Debug)]
+struct Found {
+    family: TagFamily,
+    word: Word,
+    margin: f32,
+    /// As found, in the tag's own order.
+    corners: Quad,
+    refined: Refined,
+}
+
+/// Where between the local minimum and maximum dark and light are divided, of 256. Low keeps a border whole
+/// where a shadow's edge crosses the tag; a second time higher up for borders that are blurred, which the
+/// coarser levels can afford, and small tags need in the finest. In the coarser ones a third time lower still:
+/// where a deep shadow ends, its paper is not much lighter than ink in the light.
+const FRACTIONS_ONCE: [u16; 1] = [85];
+const FRACTIONS_TWICE: [u16; 2] = [72, 116];
+const FRACTIONS_THRICE: [u16; 3] = [40, 72, 116];
+
+/// Smallest edge in a level at which a border can be told from its surroundings, pixels.
+const LEAST_EDGE_IN_LEVEL: f32 = 12.0;
+
+/// Largest image, pixels on a side.
+pub const LARGEST_IMAGE_PX: usize = 32_767;
+
+impl Detector {
+    /// A detector of tags of these families.
+    pub fn new(families: &[TagFamily], limits: Limits) -> Self {
+        let Limits { min_px, max_hamming } = limits;
+        Self {
+            families: families.iter().map(|&f| Family::new(f, max_hamming)).collect(),
+            min_px: min_px as f32,
+            simd: Simd::best(),
+            pyramid: Pyramid::default(),
+            binariser: Binariser::default(),
+            bits: Bitmap::default(),
+            labeller: Labeller::default(),
+            finder: QuadFinder::default(),
+            refiner: Refiner::new(Simd::best()),
+            found: Vec::new(),
+            detections: Vec::new(),
+            negative: GrayImage::default(),
+            noise: 0.0,
+        }
+    }
+
+    /// The same with other kernels; every kernel gives the same detections.
+    pub fn with_simd(self, simd: Simd) -> Self {
+        Self { simd, refiner: Refiner::new(simd), ..self }
+    }
+
+    /// Looks for tags from this edge on, pixels, from now on.
+    pub fn set_min_px(&mut self, min_px: f64) {
+        self.min_px = min_px as f32;
+    }
+
+    /// Every tag found in a part of an image, in coordinates of the whole image.
+    pub fn detect_roi(&mut self, image: ImageView<'_>, roi: Roi) -> &[TagDetection] {
+        self.search_all(image.crop(roi.u, roi.v, roi.width, roi.height));
+        let origin = Vector2::new(roi.u as f64, roi.v as f64);
+        self.detections.iter_mut().for_each(|found| *found = found.moved(origin));
+        &self.detections
+    }
+
+    /// Every tag found in an image, each once. Images with a side over [`LARGEST_IMAGE_PX`] are not searched.
+    pub fn detect(&mut self, image: ImageView<'_>) -> &[TagDetection] {
+        self.search_all(image);
+        &self.detections
+    }
+
+    fn search_all(&mut self, image: ImageView<'_>) {
+        self.found.clear();
+        self.detections.clear();
+        let sides = [image.width, image.height];
+        if sides.iter().any(|s| !(1..=LARGEST_IMAGE_PX).contains(s)) {
+            return;
+        }
+        if self.families.iter().any(|f| !f.inverted) {
+            self.search(image, false);
+        }
+        if self.families.iter().any(|f| f.inverted) {
+            let mut negative = std::mem::take(&mut self.negative);
+            negate(image, &mut negative);
+            self.search(negative.view(), true);
+            self.negative = negative;
+        }
+        self.detections.extend(self.found.iter().map(detection));
+    }
+
+    /// Searches an image, or its negative for the families whose border is light.
+    fn search(&mut self, image: ImageView<'_>, inverted: bool) {
+        let base = if self.min_px >= LEAST_EDGE_IN_LEVEL * 2.0 {
+            Base::Half
+        } else if self.min_px >= LEAST_EDGE_IN_LEVEL * 1.3 {
+            Base::TwoThirds
+        } else {
+            Base::Full
+        };
+        self.pyramid.build(image, base, 16, self.simd);
+        self.noise = noise_sigma(image);
+        let first = usize::from(base != Base::Full).min(self.pyramid.len() - 1);
+        let last = (first + 2).min(self.pyramid.len() - 1);
+        for n in (first..=last).rev() {
+            let fractions: &[u16] = match (n == first, base) {
+                (true, Base::Half) => &FRACTIONS_ONCE,
+                (true, _) => &FRACTIONS_TWICE,
+                (false, _) => &FRACTIONS_THRICE,
+            };
+            self.search_level(image, n, fractions, inverted);
+        }
+    }
+
+    fn search_level(&mut self, image: ImageView<'_>, n: usize, fractions: &[u16], inverted: bool) {
+        let level = self.pyramid.level(image, n);
+        let limits = SizeLimits { least: (self.min_px / level.scale).max(8.0), most: f32::MAX };
+        let (width, height) = (level.image.width, level.image.height);
+        // Noise alone spans some five sigmas in the 144 pixels of a neighbourhood.
+        let gate = (7.0 * self.noise / level.scale).clamp(12.0, 60.0) as u8;
+        self.binariser.measure(level.image, gate, self.simd);
+        for &fraction in fractions {
+            let is_highest = Some(&fraction) == fractions.last();
+            let at =
+                if self.binariser.is_busy() && !is_highest { Where::LightChanges } else { Where::Everywhere };
+            self.binariser.mark(level.image, fraction, at, &mut self.bits, self.simd);
+            self.labeller.label(&self.bits, self.simd, |c| may_be_border(c, limits, width, height));
+            for (component, outline) in self.labeller.kept() {
+                let Some(quad) = self.finder.quad(component, outline, limits) else { continue };
+                let in_frame = quad.map(|p| p.map(|c| level.to_frame(c)));
+                if self.found.iter().any(|f| same_place(&f.corners, &in_frame)) {
+                    continue;
+                }
+                let Some(straight) = straighten(level, &quad, gate) else { continue };
+                // Of a small tag a side may be drawn to what is beside it: then as it was.
+                let found = [straight, in_frame].iter().find_map(|quad| {
+                    let mut families = self.families.iter().filter(|f| f.inverted == inverted);
+                    families.find_map(|f| decode(image, &self.pyramid, quad, f, &mut self.refiner))
+                });
+                self.found.extend(found);
+            }
+        }
+    }
+}
+
+/// A quadrilateral of a level, in frame coordinates, with its sides fitted to the image; `None` where the
+/// image does not step from dark to light along them.
+fn straighten(level: Level<'_>, quad: &Quad, gate: u8) -> Option<Quad> {
+    // Seen aslant, a cell is narrower one way than the other.
+    let narrow = polygon_area(quad) / longest_edge(quad).max(1.0);
+    let least_step = f32::from(gate) / 3.0;
+    if !looks_like_tag(level.image, quad, (narrow / 16.0).clamp(0.8, 4.0), least_step) {
+        return None;
+    }
+    let search = EdgeSearch { reach: (narrow / 8.0).clamp(1.0, 3.0), least_step };
+    let quad = fit_sides(level.image, quad, search)?;
+    Some(quad.map(|p| p.map(|c| level.to_frame(c))))
+}
+
+fn longest_edge(quad: &Quad) -> f32 {
+    (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).fold(0.0, f32::max)
+}
+
+fn negate(image: ImageView<'_>, to: &mut GrayImage) {
+    (to.width, to.height, to.stride) = (image.width, image.height, image.width);
+    to.data.clear();
+    (0..image.height).for_each(|v| to.data.extend(image.row(v).iter().map(|p| !p)));
+}
+
+fn decode(
+    image: ImageView<'_>,
+    pyramid: &Pyramid,
+    quad: &Quad,
+    family: &Family,
+    refiner: &mut Refiner,
+) -> Option<Found> {
+    let reading = payload::read(image, pyramid, quad, family)?;
+    let word = reading.word;
+    let corners: Quad = std::array::from_fn(|i| quad[(i + word.turns) % 4]);
+    let refined = refiner.refine(image, &corners, family, word.id).unwrap_or_else(|| unrefined(&corners));
+    Some(Found { family: family.family, word, margin: reading.margin, corners, refined })
+}
+
+/// Corners as the coarse fit left them: good to about a tenth of a cell.
+fn unrefined(corners: &Quad) -> Refined {
+    let corners = corners.map(|p| Vector2::new(f64::from(p[0]), f64::from(p[1])));
+    let sigma = 0.5 + 0.01 * (corners[2] - corners[0]).norm();
+    let cov = Matrix2::identity() * sigma * sigma;
+    let center = corners.iter().sum::<Vector2<f64>>() / 4.0;
+    Refined { corners, corner_cov: [cov; 4], center, center_cov: cov / 2.0 }
+}
+
+/// Whether two quadrilaterals are of one tag.
+fn same_place(a: &Quad, b: &Quad) -> bool {
+    let centre = |q: &Quad| [0, 1].map(|k| q.iter().map(|p| p[k]).sum::<f32>() / 4.0);
+    distance(centre(a), centre(b)) < 0.2 * distance(a[0], a[2])
+}
+
+fn detection(found: &Found) -> TagDetection {
+    let refined = &found.refined;
+    let corners = refined.corners;
+    TagDetection {
+        family: found.family,
+        id: found.word.id,
+        hamming: found.word.hamming,
+        margin: found.margin,
+        center_px: refined.center,
+        center_cov_px2: refined.center_cov,
+        corners_px: corners,
+        corner_cov_px2: refined.corner_cov,
+        size_px: (0..4).map(|i| (corners[i] - corners[(i + 1) % 4]).norm()).sum::<f64>() / 4.0,
+    }
+}

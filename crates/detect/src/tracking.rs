@@ -1,0 +1,132 @@
+//! What a flight needs beside single images: the markers of targets searched where they are predicted, the rest
+//! of the frame in strips; discs; and ground features from frame to frame.
+//!
+//! Where an image holds tags is [`Detector`]'s to say; this module is made for the daemon's pipeline.
+
+use super::detector::{Detector, Limits};
+use super::disc_pairs::DiscPairs;
+use super::features::{Circle, FeatureTracker};
+use super::roi::Roi;
+use windhover_base::geo::CameraModel;
+use windhover_base::msg::TagFamily;
+use windhover_base::msg::{
+    FrameObservations, FramePrediction, ImageView, MarkerDetection, MarkerId, MarkerPrediction, RgbImage,
+};
+use windhover_base::settings::{DetectorConfig, MarkerKind, TargetConfig};
+
+/// Frames over which the strips cover the whole image once.
+const STRIPS: usize = 8;
+
+/// Sigmas of a predicted centre that its region of interest covers.
+const ROI_SIGMAS: f64 = 4.0;
+
+/// Finds the configured markers in frames, and ground features between them.
+#[derive(Clone, Debug)]
+pub struct FrameDetector {
+    tags: Option<Detector>,
+    min_px: f64,
+    next_strip: usize,
+    scratch: Vec<MarkerDetection>,
+    discs: Option<DiscPairs>,
+    features: FeatureTracker,
+    occupied: Vec<Circle>,
+}
+
+impl FrameDetector {
+    /// For the markers of `targets`, seen through `lens`.
+    pub fn new(detector: &DetectorConfig, targets: &[TargetConfig], lens: &CameraModel) -> Self {
+        let mut families: Vec<TagFamily> = targets
+            .iter()
+            .flat_map(|t| &t.marker)
+            .filter(|m| m.kind == MarkerKind::Apriltag)
+            .filter_map(|m| m.family)
+            .collect();
+        families.sort_unstable();
+        families.dedup();
+        let limits = Limits { min_px: detector.min_px, max_hamming: detector.max_hamming };
+        let tags = (!families.is_empty()).then(|| Detector::new(&families, limits));
+        Self {
+            tags,
+            min_px: detector.min_px,
+            next_strip: 0,
+            scratch: Vec::new(),
+            discs: DiscPairs::new(targets, lens),
+            features: FeatureTracker::new(detector.ground_features),
+            occupied: Vec::new(),
+        }
+    }
+
+    /// Fills `out` with what is seen; its frame number is the caller's.
+    pub fn process(
+        &mut self,
+        image: ImageView<'_>,
+        rgb: Option<&RgbImage>,
+        prediction: Option<&FramePrediction>,
+        out: &mut FrameObservations,
+    ) {
+        out.markers.clear();
+        out.features.clear();
+        if image.width == 0 || image.height == 0 {
+            return;
+        }
+        self.find_tags(image, prediction, &mut out.markers);
+        if let Some(discs) = &mut self.discs {
+            discs.find(image, rgb, prediction, &mut out.markers);
+        }
+        self.occupied.clear();
+        self.occupied.extend(prediction.iter().flat_map(|p| &p.occupied));
+        self.occupied.extend(out.markers.iter().map(|m| (m.center_px, m.size_px)));
+        self.features.process(image, &self.occupied, &mut out.features);
+    }
+
+    fn find_tags(
+        &mut self,
+        image: ImageView<'_>,
+        prediction: Option<&FramePrediction>,
+        out: &mut Vec<MarkerDetection>,
+    ) {
+        let Some(tags) = &mut self.tags else { return };
+        let smallest = prediction.and_then(|p| p.size_range_px).map_or(0.0, |(low, _)| 0.7 * low);
+        let min_px = self.min_px.max(smallest);
+        tags.set_min_px(min_px);
+        let Some(prediction) = prediction.filter(|p| !p.search) else {
+            out.extend(tags.detect(image).iter().map(MarkerDetection::from));
+            return;
+        };
+        self.scratch.clear();
+        for marker in prediction.markers.iter().filter(|m| matches!(m.marker, MarkerId::Tag { .. })) {
+            if let Some(roi) = roi_of(image, marker) {
+                tags.set_min_px((0.6 * marker.size_px).max(self.min_px));
+                let found = tags.detect_roi(image, roi);
+                self.scratch.extend(found.iter().map(MarkerDetection::from));
+            }
+        }
+        tags.set_min_px(min_px);
+        let overlap = prediction.size_range_px.map_or(128.0, |(_, high)| 1.5 * high);
+        let found = tags.detect_roi(image, strip(image, self.next_strip, overlap));
+        self.scratch.extend(found.iter().map(MarkerDetection::from));
+        self.next_strip = (self.next_strip + 1) % STRIPS;
+        for found in &self.scratch {
+            if !out.iter().any(|o| o.marker == found.marker && near(o, found)) {
+                out.push(*found);
+            }
+        }
+    }
+}
+
+fn near(a: &MarkerDetection, b: &MarkerDetection) -> bool {
+    (a.center_px - b.center_px).norm() < 0.5 * a.size_px
+}
+
+/// Where a marker is looked for: its own size around it, its diagonal, and the doubt about its place.
+fn roi_of(image: ImageView<'_>, marker: &MarkerPrediction) -> Option<Roi> {
+    let radius = marker.size_px + ROI_SIGMAS * marker.sigma_px + 8.0;
+    radius.is_finite().then(|| Roi::around(image, marker.center_px, radius)).flatten()
+}
+
+fn strip(image: ImageView<'_>, index: usize, overlap: f64) -> Roi {
+    let top = image.height * index / STRIPS;
+    let bottom = image.height * (index + 1) / STRIPS;
+    let overlap = overlap.clamp(0.0, image.height as f64) as usize;
+    Roi { u: 0, v: top, width: image.width, height: (bottom - top + overlap).min(image.height - top) }
+}

@@ -1,0 +1,5 @@
+//! The detector on generated images: tags, discs, and what any image may hold.
+
+mod common;
+mod discs;
+mod tags;

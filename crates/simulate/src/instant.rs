@@ -1,0 +1,55 @@
+//! The truth at an instant, of the helicopter and of a vehicle.
+
+use nalgebra::{Rotation3, Vector2, Vector3};
+
+/// Grid of the integrated motions, seconds.
+pub(super) const STEP_S: f64 = 0.005;
+
+/// The helicopter at an instant: its body frame's origin.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct OwnshipTruth {
+    /// North, east, down of the scenario's origin, metres.
+    pub position_ned_m: Vector3<f64>,
+    /// Velocity, m/s.
+    pub velocity_ned_mps: Vector3<f64>,
+    /// Acceleration, m/s².
+    pub acceleration_ned_mps2: Vector3<f64>,
+    /// Attitude.
+    pub ned_from_body: Rotation3<f64>,
+    /// Angular rate in the body frame, rad/s.
+    pub body_rate_radps: Vector3<f64>,
+    /// Azimuth of the nose, radians.
+    pub heading_rad: f64,
+}
+
+/// A vehicle at an instant: the ground under the middle of its rear axle.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub struct VehicleTruth {
+    /// Metres north of the origin.
+    pub north_m: f64,
+    /// Metres east of the origin.
+    pub east_m: f64,
+    /// True heading, radians in (−π, π].
+    pub heading_rad: f64,
+    /// Signed speed, m/s.
+    pub speed_mps: f64,
+    /// Yaw rate, rad/s, clockwise from above positive.
+    pub yaw_rate_radps: f64,
+}
+
+impl VehicleTruth {
+    /// A point of the vehicle frame (forward, right, down, metres) in NED.
+    pub fn ned_of(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        let (s, c) = self.heading_rad.sin_cos();
+        Vector3::new(
+            self.north_m + c * point.x - s * point.y,
+            self.east_m + s * point.x + c * point.y,
+            point.z,
+        )
+    }
+
+    /// North and east of the point `ahead_m` metres ahead of the rear axle.
+    pub fn reference(&self, ahead_m: f64) -> Vector2<f64> {
+        self.ned_of(&Vector3::new(ahead_m, 0.0, 0.0)).xy()
+    }
+}

@@ -1,0 +1,8 @@
+//! Flights through the pipeline and the commands: simulated, imported, calibrated with, continued.
+
+mod calibration_doc;
+mod compass_conventions;
+mod contract;
+mod import;
+mod simulated_lines;
+mod warm_start;
