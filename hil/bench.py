@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 """Flies the virtual payload computer: boots it, feeds a simulated flight in real time, and asserts.
 
-    hil/bench.py --image target/hil --windhover target/release/windhover \\
-                 --tools target/release/examples --capture CAPTURE.mcap --truth TRUTH.csv [--long] [SCENARIO…]
+    hil/bench.py [--image target/hil] [--windhover target/release/windhover] [--tools target/release/examples]
+                 [--long] [SCENARIO…]
 
-Without scenarios the short set runs; scenarios that are named share one boot. Results go to
-<image>/results.json, each machine's files beside it.
+The image and the flight are those that hil/image.sh made. Without scenarios the short set runs; scenarios that
+are named share one boot. Results go to <image>/results.json, each machine's files beside it.
 """
 
 import argparse
@@ -61,12 +61,14 @@ def ended(flight, args):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    for option in ("image", "windhover", "tools", "capture", "truth"):
-        parser.add_argument(f"--{option}", required=True)
+    parser.add_argument("--image", default="target/hil")
+    parser.add_argument("--windhover", default="target/release/windhover")
+    parser.add_argument("--tools", default="target/release/examples", help="where what feeds the machine was built")
     parser.add_argument("--long", action="store_true", help="every scenario")
     parser.add_argument("--stay", action="store_true", help="after a failure and at the end, wait for Enter before the machine ends")
     parser.add_argument("scenario", nargs="*")
     args = parser.parse_args()
+    args.capture, args.truth = (str(Path(args.image) / name) for name in ("flight.mcap", "flight.truth.csv"))
     for tool in ("feed", "frames", "stream"):
         setattr(args, tool, str(Path(args.tools) / f"hil_{tool}"))
     every = {scenario.__name__: scenario for rows in (SHORT, LONG) for row in rows for scenario in row}

@@ -70,6 +70,31 @@ fn modules_name_only_what_stands_above_them() {
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 
+/// `io` moves events and records: it decodes, detects and estimates nothing. Of `windhover_decode` it has the
+/// grammar of sentences alone, because a receiver is configured in the sentences it speaks.
+#[test]
+fn io_names_no_stage() {
+    let stages = [
+        "crate::pipeline",
+        "windhover_detect",
+        "windhover_estimate",
+        "windhover_calibrate",
+        "windhover_simulate",
+        "GnssDecoder",
+        "CompassDecoder",
+    ];
+    let mut files = Vec::new();
+    sources(&root().join("io"), &mut files);
+    assert!(files.len() > 50, "the sources of io were not found");
+    let named = |file: &PathBuf| {
+        let code = code(file);
+        let found = stages.into_iter().filter(|stage| code.contains(stage));
+        found.map(|stage| format!("{} names {stage}", file.display())).collect::<Vec<_>>()
+    };
+    let wrong: Vec<String> = files.iter().filter(|f| !is_test_file(f)).flat_map(named).collect();
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
 #[test]
 fn core_computes_and_nothing_else() {
     let (modules, core) = modules();

@@ -20,6 +20,10 @@ use windhover::io::store::{Recording, Store, StoreHandle, StoreNotice, inspect};
 use windhover_base::msg::{Event, EventBody, Source};
 use windhover_base::time::MonoTime;
 
+#[path = "common/leave_out.rs"]
+mod leave_out;
+use leave_out::leave_out;
+
 /// A mount point and what is in it.
 struct Slot(TempDir);
 
@@ -29,7 +33,7 @@ impl Slot {
         let slot = Self(tempfile::tempdir().unwrap());
         std::fs::create_dir(slot.path()).unwrap();
         if !slot.put_in("size=64m") {
-            println!("SKIPPED: mounting takes privileges this user has not");
+            leave_out("card", "mounting takes privileges this user has not");
             return None;
         }
         Some(slot)
@@ -129,7 +133,7 @@ impl FailingCard {
         let made = quietly(Command::new("mkfs.ext4").args(["-q", "-F", "-m", "1"]).arg(card.image()));
         card.slot.take_out();
         if !made || !card.put_in() {
-            println!("SKIPPED: no mkfs.ext4 or no loop device here");
+            leave_out("a failing card", "no mkfs.ext4 or no loop device here");
             return None;
         }
         Some(card)
@@ -239,7 +243,7 @@ fn a_card_of_somebody_else_is_told_and_used_once_it_is_handed_over() {
     let tests = std::env::current_exe().unwrap();
     let built = tests.parent().and_then(Path::parent).unwrap().join("examples/store_load");
     if !built.exists() {
-        println!("SKIPPED: {} is not built (cargo build --example store_load)", built.display());
+        leave_out("a card of somebody else", "the example store_load is not built");
         return;
     }
     // Where nobody may look and execute.

@@ -7,7 +7,9 @@ use std::sync::Arc;
 use windhover::config::Config;
 use windhover::pipeline::Pipeline;
 use windhover_base::geo::wrap_angle;
-use windhover_base::msg::{AttitudeSample, GnssEpoch, Measurement, NoticeKind, Output, Stamped, TimedOutput};
+use windhover_base::msg::{
+    AttitudeSample, GnssEpoch, NoticeKind, Output, SensorReading, Stamped, TimedOutput,
+};
 use windhover_base::settings::CompassFormat;
 use windhover_base::time::{MonoTime, Span};
 use windhover_simulate::{Flight, FrameStorage, Sample, Scenario, SensorSuite, World};
@@ -20,13 +22,13 @@ fn config_of(scenario: &Scenario) -> Config {
 }
 
 fn decoded(flight: Flight) -> Decoded {
-    let mut pipeline = Pipeline::new(&config_of(flight.world().scenario()));
+    let mut pipeline = Pipeline::new((&config_of(flight.world().scenario())).into());
     let (mut outputs, mut fixes, mut attitudes) = (Vec::new(), Vec::new(), Vec::new());
     let mut sort = |outputs: &mut Vec<TimedOutput>| {
         for timed in outputs.drain(..) {
             match timed.output {
-                Output::Measured(Measurement::Gnss(fix)) => fixes.push(fix),
-                Output::Measured(Measurement::Attitude(attitude)) => attitudes.push(attitude),
+                Output::Reading(SensorReading::Gnss(fix)) => fixes.push(fix),
+                Output::Reading(SensorReading::Attitude(attitude)) => attitudes.push(attitude),
                 _ => {}
             }
         }
@@ -195,7 +197,7 @@ fn a_terrain_tile_that_is_missing_is_an_event_of_its_own() {
     config.ground.elevation_msl_m = None;
     config.ground.source = None;
     config.ground.terrain = Some("N30W086.hgt".into());
-    let mut pipeline = Pipeline::new(&config);
+    let mut pipeline = Pipeline::new((&config).into());
     // When the first fixes come.
     let mut outputs = Vec::new();
     for event in Flight::new(world, FrameStorage::None, 1) {

@@ -20,6 +20,10 @@ use windhover::io::store::volume::Volume;
 use windhover::io::store::{Store, StoreNotice};
 use windhover_base::msg::{Event, EventBody, Source};
 
+#[path = "common/leave_out.rs"]
+mod leave_out;
+use leave_out::leave_out;
+
 fn windhover(root: &Path, arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_windhover"))
         .args(["store", "--path"])
@@ -136,7 +140,7 @@ fn python() -> Option<&'static str> {
 #[test]
 fn python_reads_what_was_cut_and_sealed() {
     let Some(python) = python() else {
-        println!("SKIPPED: no Python with the mcap package (pip install mcap)");
+        leave_out("a cut flight read by Python", "no Python with the mcap package (pip install mcap)");
         return;
     };
     let dir = tempfile::tempdir().unwrap();
@@ -242,7 +246,7 @@ fn kill_once(seed: u64) {
 
 fn kill_many(times: u64, first_seed: u64) {
     if !recorder().exists() {
-        println!("SKIPPED: {} is not built (cargo build --example store_load)", recorder().display());
+        leave_out("kill -9", "the example store_load is not built");
         return;
     }
     std::thread::scope(|scope| {

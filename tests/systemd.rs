@@ -2,6 +2,10 @@
 
 use std::process::Command;
 
+#[path = "common/leave_out.rs"]
+mod leave_out;
+use leave_out::leave_out;
+
 /// The unit file.
 const UNIT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/systemd/windhover.service");
 
@@ -12,7 +16,7 @@ const EXPOSURE: &str = "--threshold=15";
 fn the_unit_exposes_little() {
     let run = Command::new("systemd-analyze").args(["security", "--offline=true", EXPOSURE, UNIT]).output();
     let Ok(output) = run else {
-        eprintln!("skipped: systemd-analyze is not installed");
+        leave_out("the unit", "systemd-analyze is not installed");
         return;
     };
     let report = String::from_utf8_lossy(&output.stdout).into_owned();
@@ -48,7 +52,7 @@ fn the_cards_units_are_what_systemd_takes() {
         let path = format!("{}/systemd/card/{unit}", env!("CARGO_MANIFEST_DIR"));
         let run = Command::new("systemd-analyze").args(["verify", "--man=no", &path]).output();
         let Ok(output) = run else {
-            eprintln!("skipped: systemd-analyze is not installed");
+            leave_out("the unit", "systemd-analyze is not installed");
             return;
         };
         let said = String::from_utf8_lossy(&output.stderr).into_owned();

@@ -42,7 +42,7 @@ fn first_tracking(out: &[Output]) -> Option<(MonoTime, f64)> {
 fn flown() -> (Vec<Event>, WarmState) {
     let events = events();
     let (before, after) = events.split_at(events.len() / 2);
-    let mut pipeline = Pipeline::new(&config());
+    let mut pipeline = Pipeline::new((&config()).into());
     assert!(pipeline.warm_state().is_none(), "nothing is settled before the first event");
     outputs(&mut pipeline, before);
     let told =
@@ -61,11 +61,11 @@ fn a_restarted_pipeline_tracks_at_once_and_knows_its_sensors() {
     let (after, warm) = flown();
     let learnt = warm.filter.clone().expect("the filter had started");
     let begin = after[0].t_recv;
-    let mut pipeline = Pipeline::new(&config());
+    let mut pipeline = Pipeline::new((&config()).into());
     let out = outputs(&mut pipeline, &continued(warm.clone(), &after));
     let (tracking, sigma) = first_tracking(&out).expect("it tracks again");
     assert!(tracking - begin < Span::from_s(2.0), "after {:?}", tracking - begin);
-    let cold = outputs(&mut Pipeline::new(&config()), &after);
+    let cold = outputs(&mut Pipeline::new((&config()).into()), &after);
     let (_, cold_sigma) = first_tracking(&cold).expect("a cold one tracks too");
     assert!(sigma < cold_sigma, "{sigma} warm, {cold_sigma} cold");
     let datum = out.iter().find_map(|o| if let Output::Datum(_, d) = o { Some(*d) } else { None });
@@ -83,12 +83,12 @@ fn a_restarted_pipeline_tracks_at_once_and_knows_its_sensors() {
 #[test]
 fn a_state_of_another_place_or_damaged_is_not_used() {
     let (after, warm) = flown();
-    let cold = outputs(&mut Pipeline::new(&config()), &after).len();
+    let cold = outputs(&mut Pipeline::new((&config()).into()), &after).len();
     let mut elsewhere = warm.clone();
     elsewhere.site.datum[0] += 1.0;
     elsewhere.arrivals.clear();
     elsewhere.filter.as_mut().expect("there is one").mean[3] = f64::NAN;
-    let out = outputs(&mut Pipeline::new(&config()), &continued(elsewhere, &after));
+    let out = outputs(&mut Pipeline::new((&config()).into()), &continued(elsewhere, &after));
     assert_eq!(out.len(), cold);
     let frames = after.iter().filter(|e| matches!(e.body, EventBody::Frame(_))).count();
     assert!(frames > 10 && first_tracking(&out).is_some());

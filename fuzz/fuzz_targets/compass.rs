@@ -3,8 +3,8 @@
 
 use libfuzzer_sys::fuzz_target;
 use windhover_base::settings::CompassFormat;
-use windhover_decode::CompassDecoder;
 use windhover_base::time::MonoTime;
+use windhover_decode::CompassDecoder;
 
 const FORMATS: [CompassFormat; 7] = [
     CompassFormat::Tcm2,

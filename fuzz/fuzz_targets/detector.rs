@@ -2,9 +2,9 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
+use windhover_base::msg::ImageView;
 use windhover_base::msg::TagFamily;
 use windhover_detect::TagDetector;
-use windhover_base::msg::ImageView;
 
 // The first three bytes choose width, stride and smallest tag; the rest are pixels.
 fuzz_target!(|data: &[u8]| {

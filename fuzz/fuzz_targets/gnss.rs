@@ -2,8 +2,8 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use windhover_decode::GnssDecoder;
 use windhover_base::time::{MonoTime, Span};
+use windhover_decode::GnssDecoder;
 
 // The first byte sets how long reads are and how far apart, so that the clocked paths run as well.
 fuzz_target!(|data: &[u8]| {

@@ -34,7 +34,7 @@ pub struct OpenStore {
 pub fn open(config: &Config, clock: HostClock, flight_store: &FlightStore) -> Option<OpenStore> {
     // A configuration that was checked can be written.
     let text = config.to_toml().unwrap_or_default();
-    let (store, notices) = config.store.enabled.then(|| Store::start(config, text, clock))?;
+    let (store, notices) = config.store.enabled.then(|| Store::start(&config.store, text, clock))?;
     flight_store.set(Some(store.handle()));
     Some(OpenStore { store, notices })
 }

@@ -2,16 +2,16 @@
 //! its first dated fix.
 
 use super::flight::Flight;
-use crate::config::Config;
 use windhover_base::geo::{DeclinationError, Geodetic, declination};
+use windhover_base::settings::CompassConfig;
 use windhover_base::time::UtcTime;
 
 /// Radians, east positive; zero where the configuration names neither figure nor model.
-pub fn of_flight(config: &Config, flight: &Flight) -> Result<f64, DeclinationError> {
-    if let Some(degrees) = config.compass.declination_deg {
+pub fn of_flight(compass: &CompassConfig, flight: &Flight) -> Result<f64, DeclinationError> {
+    if let Some(degrees) = compass.declination_deg {
         return Ok(degrees.to_radians());
     }
-    if config.compass.declination.is_none() {
+    if compass.declination.is_none() {
         return Ok(0.0);
     }
     let dated = flight.epochs.iter().find_map(|e| Some((e.utc_ns?, e.lat_deg?, e.lon_deg?, e.alt_msl_m?)));

@@ -192,7 +192,7 @@ impl LinkTask {
 
     async fn open_mavlink(&self) {
         let config = Arc::clone(&self.config);
-        match blocking(move || MavlinkSender::open(&config)).await {
+        match blocking(move || MavlinkSender::open(&config.mavlink, &config.target, &config.ground)).await {
             Ok(sender) => self.downlink.lines().mavlink = Some(sender),
             Err(error) => self.fault(&error),
         }

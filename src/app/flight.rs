@@ -12,7 +12,7 @@ use crate::io::mcap_read::{RawMessage, ReadError};
 use crate::io::proto::{foxglove as fox, host_time, windhover as wh};
 use crate::io::records::topic;
 use windhover_base::geo::Geodetic;
-use windhover_base::msg::{EventBody, FramePayload, Source};
+use windhover_base::msg::{EventBody, FramePayload};
 use windhover_base::time::{MonoTime, UtcTime};
 
 /// What was estimated of one target.
@@ -74,10 +74,8 @@ pub struct Flight {
     pub notices: Vec<fox::Log>,
     /// Losses, arrivals and departures of devices.
     pub source_events: Vec<wh::SourceEvent>,
-    /// Reads of the GPS line: when, and how many bytes.
-    pub gps_reads: Vec<(MonoTime, usize)>,
-    /// Reads of the compass line.
-    pub compass_reads: Vec<(MonoTime, usize)>,
+    /// Reads of bytes, of all sources.
+    pub reads: usize,
     /// Frames, in the order of their numbers.
     pub frames: Vec<FrameArrival>,
 }
@@ -97,12 +95,7 @@ impl Flight {
             }
             flight.ended = flight.ended.max(t);
             match item.event.map(|event| event.body) {
-                Some(EventBody::Bytes { source: Source::Gps, data: bytes }) => {
-                    flight.gps_reads.push((t, bytes.len()))
-                }
-                Some(EventBody::Bytes { source: Source::Compass, data: bytes }) => {
-                    flight.compass_reads.push((t, bytes.len()))
-                }
+                Some(EventBody::Bytes { .. }) => flight.reads += 1,
                 Some(EventBody::Frame(frame)) => flight.frames.push(FrameArrival {
                     t_recv: t,
                     t_exposure: frame.t_exposure,

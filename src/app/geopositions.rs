@@ -6,10 +6,9 @@ use nalgebra::Vector3;
 use super::flight::Flight;
 use super::recording::recording;
 use super::truth::Truth;
-use crate::config::Config;
 use windhover_base::geo::{Geodetic, Ground, LocalFrame, Tilt, locate, rot_z};
 use windhover_base::msg::{AttitudeSample, GnssEpoch, MarkerDetection, MarkerId, Stamped};
-use windhover_base::settings::MarkerConfig;
+use windhover_base::settings::{MarkerConfig, Rig};
 
 /// Farthest slant used, metres.
 const LIMIT_M: f64 = 500.0;
@@ -18,9 +17,14 @@ const OLDEST_S: f64 = 1.0;
 
 /// (north, east) errors, metres, of every sighting of a marker of the first target. The truth is of
 /// the target's reference point, or, where it is a single surveyed row, of that point at rest.
-pub fn errors(flight: &Flight, config: &Config, declination_rad: f64, truth: &Truth) -> Vec<[f64; 2]> {
+pub fn errors(
+    flight: &Flight,
+    (rig, ground_msl_m): (&Rig, f64),
+    declination_rad: f64,
+    truth: &Truth,
+) -> Vec<[f64; 2]> {
     let recording = recording(flight);
-    let Some(target) = config.target.first() else { return Vec::new() };
+    let Some(target) = rig.target.first() else { return Vec::new() };
     let mut found = Vec::new();
     let (mut fixes, mut samples) = (recording.gnss.iter().peekable(), recording.attitude.iter().peekable());
     let (mut fix, mut sample) = (None, None);
@@ -43,7 +47,14 @@ pub fn errors(flight: &Flight, config: &Config, declination_rad: f64, truth: &Tr
             let from_reference = Vector3::from(marker.position_m) - Vector3::x() * target.reference_m;
             let offset = rot_z(heading) * from_reference;
             let at = Geodetic { lat_deg: row.lat_deg, lon_deg: row.lon_deg, height_m: 0.0 };
-            found.extend(error(config, declination_rad, fix, (age_s, sample), seen, (marker, offset, at)));
+            found.extend(error(
+                (rig, ground_msl_m),
+                declination_rad,
+                fix,
+                (age_s, sample),
+                seen,
+                (marker, offset, at),
+            ));
         }
     }
     found
@@ -54,14 +65,14 @@ fn is(marker: &MarkerConfig, seen: &MarkerDetection) -> bool {
 }
 
 fn error(
-    config: &Config,
+    (rig, ground_msl_m): (&Rig, f64),
     declination_rad: f64,
     fix: &Stamped<GnssEpoch>,
     (age_s, sample): (f64, &Stamped<AttitudeSample>),
     seen: &MarkerDetection,
     (marker, offset, truth): (&MarkerConfig, Vector3<f64>, Geodetic),
 ) -> Option<[f64; 2]> {
-    let compass = &config.compass;
+    let compass = &rig.compass;
     let (heading, tilt) = (sample.value.heading?, sample.value.tilt?);
     let declination = if sample.value.heading_is_true { 0.0 } else { declination_rad };
     let level = Tilt {
@@ -72,17 +83,16 @@ fn error(
     let ned_from_body = compass.angles.ned_from_body(heading, level)?;
     let (lat_deg, lon_deg, alt) = (fix.value.lat_deg?, fix.value.lon_deg?, fix.value.alt_msl_m?);
     // The frame of the truth, at the ground: heights are above mean sea level on both sides.
-    let ground_m = config.ground.elevation_msl_m.unwrap_or(0.0);
-    let frame = LocalFrame::new(Geodetic { height_m: ground_m, ..truth });
+    let frame = LocalFrame::new(Geodetic { height_m: ground_msl_m, ..truth });
     let antenna = frame.ned(Geodetic { lat_deg, lon_deg, height_m: alt })
         + fix.value.vel_ned_mps.unwrap_or_default() * age_s;
-    let lever = config.camera.mount.position() - Vector3::from(config.gps.antenna_position_m);
+    let lever = rig.camera.mount.position() - Vector3::from(rig.gps.antenna_position_m);
     let eye = antenna + ned_from_body * lever;
-    let ned_from_camera = ned_from_body * config.camera.mount.body_from_camera();
+    let ned_from_camera = ned_from_body * rig.camera.mount.body_from_camera();
     let ground = Ground::Flat { down_m: 0.0 };
     let above_m = -marker.position_m[2];
     let at =
-        locate(&config.camera.intrinsics, &eye, &ned_from_camera, seen.center_px, &ground, above_m, LIMIT_M);
+        locate(&rig.camera.intrinsics, &eye, &ned_from_camera, seen.center_px, &ground, above_m, LIMIT_M);
     let off = at.ok()?.ned_m - offset;
     Some([off.x, off.y])
 }

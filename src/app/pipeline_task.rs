@@ -52,7 +52,7 @@ pub fn run(parts: Parts) {
         origin: Origin::here(&config, context.clock),
         flight_store,
         outlets,
-        pipeline: Pipeline::with_terrain(&config, terrain),
+        pipeline: Pipeline::with_terrain((&*config).into(), terrain),
         latencies: Latencies::default(),
         outputs: Vec::new(),
     };

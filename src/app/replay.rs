@@ -54,7 +54,7 @@ pub enum ReplayError {
 }
 
 /// What happens during a replay, for whoever watches.
-pub enum Step<'a> {
+pub enum ReplayStep<'a> {
     /// The pipeline said something.
     Output(&'a Output),
     /// Bytes of the recording done, and in all.
@@ -65,7 +65,7 @@ pub enum Step<'a> {
 
 /// What a replay did.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
-pub struct Summary {
+pub struct ReplaySummary {
     /// Events replayed.
     pub events: u64,
     /// Frames among them.
@@ -90,10 +90,10 @@ pub fn replay(
     config: &Config,
     out: Option<&Path>,
     realtime: bool,
-    watch: &mut dyn FnMut(Step<'_>),
-) -> Result<Summary, ReplayError> {
+    watch: &mut dyn FnMut(ReplayStep<'_>),
+) -> Result<ReplaySummary, ReplayError> {
     let reader = CaptureReader::open(recording)?;
-    let mut run = Run::new(config, out, realtime);
+    let mut run = ReplayRun::new(config, out, realtime);
     let want_rgb = run.pipeline.wants_rgb();
     let (sender, receiver) = sync_channel(AHEAD);
     thread::scope(|scope| {
@@ -137,28 +137,28 @@ fn read_ahead(mut reader: CaptureReader, want_rgb: bool, sender: &SyncSender<Ahe
     }
 }
 
-struct Run {
+struct ReplayRun {
     pipeline: Pipeline,
     outlets: Outlets<FlightFile>,
     outputs: Vec<TimedOutput>,
-    summary: Summary,
+    summary: ReplaySummary,
     clock: HostClock,
     started: MonoTime,
     pace: Option<Pace>,
     first: Option<MonoTime>,
 }
 
-impl Run {
+impl ReplayRun {
     fn new(config: &Config, out: Option<&Path>, realtime: bool) -> Self {
         let clock = HostClock::start();
         // A configuration that was checked can be written.
         let text = config.to_toml().unwrap_or_default();
         let file = out.map(|path| FlightFile::new(path.to_owned(), text, config.camera.clone()));
         Self {
-            pipeline: Pipeline::with_terrain(config, config_file::terrain_of(config)),
+            pipeline: Pipeline::with_terrain(config.into(), config_file::terrain_of(config)),
             outlets: Outlets::new(OutputEncoder::new(&config.target), file.into_iter().collect()),
             outputs: Vec::new(),
-            summary: Summary::default(),
+            summary: ReplaySummary::default(),
             clock,
             started: clock.now(),
             pace: realtime.then(Pace::default),
@@ -166,17 +166,21 @@ impl Run {
         }
     }
 
-    fn all(&mut self, receiver: Receiver<Ahead>, watch: &mut dyn FnMut(Step<'_>)) -> Result<(), ReplayError> {
+    fn all(
+        &mut self,
+        receiver: Receiver<Ahead>,
+        watch: &mut dyn FnMut(ReplayStep<'_>),
+    ) -> Result<(), ReplayError> {
         for ahead in receiver {
             let (item, prepared, (done, total)) = match ahead {
                 Ahead::Warning(words) => {
-                    watch(Step::Warning(&words));
+                    watch(ReplayStep::Warning(&words));
                     continue;
                 }
                 Ahead::Item(item, prepared, progress) => (item, prepared, progress),
             };
             let t = item.raw.log_time;
-            watch(Step::Progress(done, total));
+            watch(ReplayStep::Progress(done, total));
             self.outlets.sinks.iter_mut().try_for_each(|file| file.copy(&item.raw))?;
             let Some(event) = item.event else { continue };
             if let Some(pace) = &mut self.pace {
@@ -199,9 +203,9 @@ impl Run {
         self.summary.frames += u64::from(matches!(body, EventBody::Frame(_)));
     }
 
-    fn deliver(&mut self, watch: &mut dyn FnMut(Step<'_>)) -> Result<(), ReplayError> {
+    fn deliver(&mut self, watch: &mut dyn FnMut(ReplayStep<'_>)) -> Result<(), ReplayError> {
         for timed in self.outputs.drain(..) {
-            watch(Step::Output(&timed.output));
+            watch(ReplayStep::Output(&timed.output));
             self.outlets.output(&timed);
         }
         self.outlets.sinks.iter_mut().try_for_each(FlightFile::check)?;

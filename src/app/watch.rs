@@ -15,7 +15,7 @@ use crate::config::{Config, PowerConfig};
 use crate::io::clock::HostClock;
 use crate::io::notify::ServiceManager;
 use crate::io::power::{PowerState, PowerWatch};
-use windhover_base::msg::Source;
+use windhover_base::msg::SourceHealth;
 use windhover_base::time::{MonoTime, Span};
 
 /// Everything the health task keeps.
@@ -186,9 +186,8 @@ impl Watch {
     fn show_status(&self) {
         let text = if self.ready {
             let health = self.status.with(|shown| shown.health.clone()).unwrap_or_default();
-            let rate =
-                |&source: &Source| format!("{} {:.1} Hz", source.name(), health.source(source).rate_hz);
-            let rates: Vec<String> = Source::ALL.iter().map(rate).collect();
+            let rate = |of: &SourceHealth| format!("{} {:.1} Hz", of.source.name(), of.rate_hz);
+            let rates: Vec<String> = health.sources.iter().map(rate).collect();
             let targets = self.config.target.iter().zip(&health.targets);
             let targets: Vec<String> =
                 targets.map(|(t, h)| format!("{} {}", t.name, h.last.status.name())).collect();

@@ -85,7 +85,12 @@ pub(super) fn run(args: &Args) -> CliResult {
 fn overlay(args: &Args, flight: Option<&Flight>, config: &Config) -> Result<Option<Overlay>, CliError> {
     let (Some(flight), Some(path)) = (flight, &args.truth) else { return Ok(None) };
     let truth = Truth::read(path)?;
-    let errors_m = geopositions::errors(flight, config, declination::of_flight(config, flight)?, &truth);
+    let errors_m = geopositions::errors(
+        flight,
+        (&config.rig(), config.ground.elevation_msl_m.unwrap_or(0.0)),
+        declination::of_flight(&config.compass, flight)?,
+        &truth,
+    );
     if errors_m.is_empty() {
         return Err(CliError::failed(format!(
             "{} has no marker of the first target beside a fix, a compass sample and a row of truth (a bare capture must be replayed first)",

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{CliError, CliResult};
-use crate::app::replay::{self, ReplayError, Step};
+use crate::app::replay::{self, ReplayError, ReplayStep};
 use crate::app::{config_file, events, health};
 use crate::config::Config;
 use windhover_base::msg::Output;
@@ -48,12 +48,12 @@ pub(super) fn run(args: &Args) -> CliResult {
     let bar = progress_bar();
     let summary =
         replay::replay(&args.capture, &config, args.out.as_deref(), args.realtime, &mut |step| match step {
-            Step::Progress(done, total) => {
+            ReplayStep::Progress(done, total) => {
                 bar.set_length(total);
                 bar.set_position(done);
             }
-            Step::Warning(words) => bar.suspend(|| eprintln!("windhover: {words}")),
-            Step::Output(output) => {
+            ReplayStep::Warning(words) => bar.suspend(|| eprintln!("windhover: {words}")),
+            ReplayStep::Output(output) => {
                 if args.log
                     && let Some(line) = log_line(output, &config)
                 {

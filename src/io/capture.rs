@@ -31,7 +31,7 @@ pub struct CaptureItem {
 /// Events of a capture in the order they were heard.
 pub struct CaptureReader {
     reader: McapReader,
-    waiting: BinaryHeap<Waiting>,
+    waiting: BinaryHeap<Reordered>,
     waiting_bytes: usize,
     newest: MonoTime,
     read: u64,
@@ -41,23 +41,23 @@ pub struct CaptureReader {
 }
 
 /// Orders the heap: earliest first, file order among equals.
-struct Waiting {
+struct Reordered {
     raw: RawMessage,
     order: u64,
 }
 
-impl PartialEq for Waiting {
+impl PartialEq for Reordered {
     fn eq(&self, other: &Self) -> bool {
         self.cmp(other).is_eq()
     }
 }
-impl Eq for Waiting {}
-impl PartialOrd for Waiting {
+impl Eq for Reordered {}
+impl PartialOrd for Reordered {
     fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
         Some(self.cmp(other))
     }
 }
-impl Ord for Waiting {
+impl Ord for Reordered {
     fn cmp(&self, other: &Self) -> std::cmp::Ordering {
         (other.raw.log_time, other.order).cmp(&(self.raw.log_time, self.order))
     }
@@ -138,7 +138,7 @@ impl Iterator for CaptureReader {
                     self.newest = self.newest.max(raw.log_time);
                 }
                 self.waiting_bytes += raw.data.len() + MESSAGE_COST;
-                self.waiting.push(Waiting { raw, order: self.read });
+                self.waiting.push(Reordered { raw, order: self.read });
                 self.read += 1;
                 continue;
             }

@@ -6,35 +6,36 @@
 
 mod lines;
 mod monitor;
+mod settings;
 mod site;
 mod ticks;
 
+pub use settings::PipelineSettings;
 pub use ticks::next_tick;
 
 use std::sync::Arc;
 
-use crate::config::Config;
 use crate::pixels::{self, DecodedFrame, FrameFault};
-use lines::Lines;
+use lines::SourceLines;
 use monitor::{Monitor, notice};
 use site::SiteFinder;
 use ticks::Ticks;
 use windhover_base::geo::{Geodetic, Tile};
 use windhover_base::msg::{
-    AttitudeSample, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload, FramePrediction,
-    GnssEpoch, MarkerDetection, MarkerId, Measurement, NoticeKind, Output, Source, Stamped, TargetEstimate,
-    TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
+    AttitudeSample, Delivery, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload,
+    FramePrediction, GnssEpoch, MarkerDetection, MarkerId, NoticeKind, Output, SensorReading, Source,
+    Stamped, TargetEstimate, TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
 };
-use windhover_base::settings::MarkerKind;
+use windhover_base::settings::{MarkerKind, TargetConfig};
 use windhover_base::time::{MonoTime, Span};
 use windhover_detect::FrameDetector;
 use windhover_estimate::{Estimator, PaperEstimator};
 
 /// Events in, outputs out.
 pub struct Pipeline {
-    config: Config,
+    settings: PipelineSettings,
     want_rgb: bool,
-    lines: Lines,
+    lines: SourceLines,
     detector: FrameDetector,
     observations: FrameObservations,
     prediction: FramePrediction,
@@ -48,7 +49,7 @@ pub struct Pipeline {
     now: MonoTime,
     last_exposure: Option<MonoTime>,
     outputs: Vec<Output>,
-    measured: Vec<Measurement>,
+    readings: Vec<SensorReading>,
     estimated: Vec<EstimatorOutput>,
     papered: Vec<TargetEstimate>,
 }
@@ -61,31 +62,36 @@ struct Estimators {
 }
 
 impl Pipeline {
-    /// A pipeline with this configuration, before its first event.
-    pub fn new(config: &Config) -> Self {
-        Self::with_terrain(config, None)
+    /// A pipeline with these settings, before its first event.
+    pub fn new(settings: PipelineSettings) -> Self {
+        Self::with_terrain(settings, None)
     }
 
     /// The same over the terrain tile that `ground.terrain` of the configuration names.
-    pub fn with_terrain(config: &Config, terrain: Option<Arc<Tile>>) -> Self {
+    pub fn with_terrain(settings: PipelineSettings, terrain: Option<Arc<Tile>>) -> Self {
+        let rig = &settings.rig;
+        let mut lines = SourceLines::new(rig);
+        let there = |source: &Source| source.delivers() == Delivery::Frames || lines.of(*source).is_some();
+        let watched = Source::ALL.iter().copied().filter(there).collect();
+        let names = rig.target.iter().map(|target| target.name.clone()).collect();
         Self {
-            config: config.clone(),
-            want_rgb: wants_rgb(config),
-            lines: Lines::new(&config.gps, &config.compass),
-            detector: FrameDetector::new(&config.detector, &config.target, &config.camera.intrinsics),
+            want_rgb: wants_rgb(&rig.target),
+            lines,
+            detector: FrameDetector::new(&settings.detector, &rig.target, &rig.camera.intrinsics),
             observations: FrameObservations::default(),
             prediction: FramePrediction::default(),
-            finder: SiteFinder::new(terrain),
+            finder: SiteFinder::new(&settings, terrain),
             estimators: None,
             warm: None,
-            monitor: Monitor::new(config),
+            monitor: Monitor::new(watched, names),
             ticks: Ticks::default(),
             now: MonoTime::default(),
             last_exposure: None,
             outputs: Vec::new(),
-            measured: Vec::new(),
+            readings: Vec::new(),
             estimated: Vec::new(),
             papered: Vec::new(),
+            settings,
         }
     }
 
@@ -139,8 +145,8 @@ impl Pipeline {
         self.monitor.advance(t, out);
         for &source in Source::ALL {
             if let Some(line) = self.lines.of(source) {
-                line.tick(t, seq, &mut self.measured);
-                self.take_measured(source, t, out);
+                line.tick(t, seq, &mut self.readings);
+                self.take_readings(source, t, out);
             }
         }
         if let Some(estimators) = &mut self.estimators {
@@ -180,8 +186,8 @@ impl Pipeline {
         let mut outputs = std::mem::take(&mut self.outputs);
         for &source in Source::ALL {
             if let Some(line) = self.lines.of(source) {
-                line.finish(&mut self.measured);
-                self.take_measured(source, self.now, &mut outputs);
+                line.finish(&mut self.readings);
+                self.take_readings(source, self.now, &mut outputs);
             }
         }
         if let Some(estimators) = &mut self.estimators {
@@ -205,18 +211,18 @@ impl Pipeline {
     fn bytes(&mut self, source: Source, bytes: &[u8], event: &Event, out: &mut Vec<Output>) {
         let t = event.t_recv;
         let Some(line) = self.lines.of(source) else { return };
-        line.push(bytes, t, event.seq, &mut self.measured);
+        line.push(bytes, t, event.seq, &mut self.readings);
         let (refused, why) = lines::refused(line.counts());
         self.monitor.refused(source, t, refused, &why, out);
-        self.take_measured(source, t, out);
+        self.take_readings(source, t, out);
     }
 
-    fn take_measured(&mut self, source: Source, t: MonoTime, out: &mut Vec<Output>) {
-        for measurement in std::mem::take(&mut self.measured) {
+    fn take_readings(&mut self, source: Source, t: MonoTime, out: &mut Vec<Output>) {
+        for reading in std::mem::take(&mut self.readings) {
             self.monitor.heard(source, t, out);
-            match measurement {
-                Measurement::Gnss(epoch) => self.gnss(&epoch, t, out),
-                Measurement::Attitude(sample) => self.attitude(&sample, out),
+            match reading {
+                SensorReading::Gnss(epoch) => self.gnss(&epoch, t, out),
+                SensorReading::Attitude(sample) => self.attitude(&sample, out),
             }
         }
         self.take_estimated(t, out);
@@ -224,7 +230,7 @@ impl Pipeline {
 
     fn gnss(&mut self, epoch: &Stamped<GnssEpoch>, t: MonoTime, out: &mut Vec<Output>) {
         self.monitor.fix(t, epoch.value.fix, epoch.value.sats, self.lines.gps.clock_sigma(), out);
-        out.push(Output::Measured(Measurement::Gnss(*epoch)));
+        out.push(Output::Reading(SensorReading::Gnss(*epoch)));
         if self.estimators.is_none() {
             self.settle(&epoch.value, t, out);
         }
@@ -235,7 +241,7 @@ impl Pipeline {
     }
 
     fn attitude(&mut self, sample: &Stamped<AttitudeSample>, out: &mut Vec<Output>) {
-        out.push(Output::Measured(Measurement::Attitude(*sample)));
+        out.push(Output::Reading(SensorReading::Attitude(*sample)));
         if let Some(estimators) = &mut self.estimators {
             estimators.joint.attitude(sample, &mut self.estimated);
             estimators.paper.attitude(sample, &mut self.papered);
@@ -243,7 +249,7 @@ impl Pipeline {
     }
 
     fn settle(&mut self, epoch: &GnssEpoch, t: MonoTime, out: &mut Vec<Output>) {
-        let Some(settled) = self.finder.offer(epoch, &self.config) else { return };
+        let Some(settled) = self.finder.offer(epoch) else { return };
         if let Some(words) = settled.declination_notice {
             out.push(notice(t, NoticeKind::Declination, Some(Source::Compass), words));
         }
@@ -257,12 +263,12 @@ impl Pipeline {
         );
         out.push(notice(t, NoticeKind::DatumSet, Some(Source::Gps), words));
         out.push(Output::Datum(t, datum));
-        let (rig, filter) = (self.config.rig(), self.config.filter());
-        let mut joint = Estimator::new(&rig, &filter, &settled.site);
+        let (rig, filter) = (&self.settings.rig, &self.settings.filter);
+        let mut joint = Estimator::new(rig, filter, &settled.site);
         if let Some(warm) = self.warm.take().filter(|_| settled.continued) {
             joint.resume(warm);
         }
-        let paper = PaperEstimator::new(&rig, &filter, &settled.site);
+        let paper = PaperEstimator::new(rig, filter, &settled.site);
         self.estimators = Some(Estimators { joint, paper, site: settled.warm });
     }
 
@@ -274,7 +280,7 @@ impl Pipeline {
         out: &mut Vec<Output>,
     ) {
         let t = event.t_recv;
-        let t_valid = payload.t_exposure + Span::from_ms(self.config.camera.exposure_offset_ms);
+        let t_valid = payload.t_exposure + Span::from_ms(self.settings.rig.camera.exposure_offset_ms);
         if self.last_exposure.is_some_and(|last| payload.t_exposure <= last) {
             let words = format!("frame {} is stamped no later than the one before", payload.index);
             out.push(notice(t, NoticeKind::ClockJump, Some(Source::Camera), words));
@@ -283,7 +289,7 @@ impl Pipeline {
         self.observations.frame = payload.index;
         self.observations.markers.clear();
         self.observations.features.clear();
-        let (width, height) = (self.config.camera.width, self.config.camera.height);
+        let (width, height) = (self.settings.rig.camera.width, self.settings.rig.camera.height);
         match decoded.and_then(|d| pixels::check_size(&d, width, height).map(|()| d)) {
             Ok(decoded) => {
                 self.monitor.heard(Source::Camera, t, out);
@@ -310,7 +316,7 @@ impl Pipeline {
     }
 
     fn note_seen(&mut self) {
-        for (index, target) in self.config.target.iter().enumerate() {
+        for (index, target) in self.settings.rig.target.iter().enumerate() {
             let of_target = |seen: &MarkerDetection| match seen.marker {
                 MarkerId::Disc { target, .. } => target == index,
                 MarkerId::Tag { family, id } => {
@@ -326,7 +332,7 @@ impl Pipeline {
     /// One estimate a frame and target, whatever was seen.
     fn estimate(&mut self, t_valid: MonoTime, event: &Event, out: &mut Vec<Output>) {
         let Some(estimators) = &mut self.estimators else {
-            for target in 0..self.config.target.len() {
+            for target in 0..self.settings.rig.target.len() {
                 let frame = self.observations.frame;
                 let status = TrackStatus::Lost;
                 let lost = TargetEstimate { t_valid, frame, target, status, state: None };
@@ -366,7 +372,7 @@ impl Pipeline {
 }
 
 /// Colours matter only where a disc is told by its colour.
-fn wants_rgb(config: &Config) -> bool {
-    let mut markers = config.target.iter().flat_map(|t| &t.marker);
+fn wants_rgb(targets: &[TargetConfig]) -> bool {
+    let mut markers = targets.iter().flat_map(|t| &t.marker);
     markers.any(|m| m.kind == MarkerKind::Disc && m.color.is_some())
 }

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use crate::config::Config;
 use windhover_base::msg::{
     Disposition, FixKind, Health, Notice, NoticeKind, Output, PerSource, Source, SourceHealth,
     TargetEstimate, TargetHealth, TrackStatus,
@@ -27,6 +26,7 @@ struct SourceCount {
 /// Watches what flows and says what an operator should know.
 pub(super) struct Monitor {
     names: Vec<String>,
+    watched: Vec<Source>,
     sources: PerSource<SourceCount>,
     fix: FixKind,
     sats: Option<u32>,
@@ -38,7 +38,8 @@ pub(super) struct Monitor {
 }
 
 impl Monitor {
-    pub(super) fn new(config: &Config) -> Self {
+    /// Watches these sources and targets of these names.
+    pub(super) fn new(watched: Vec<Source>, names: Vec<String>) -> Self {
         let lost = |target| TargetEstimate {
             t_valid: MonoTime::default(),
             frame: 0,
@@ -47,14 +48,13 @@ impl Monitor {
             state: None,
         };
         Self {
-            names: config.target.iter().map(|t| t.name.clone()).collect(),
+            watched,
             sources: PerSource::default(),
             fix: FixKind::None,
             sats: None,
             clock_sigma: None,
-            targets: (0..config.target.len())
-                .map(|i| TargetHealth { frames_seen: 0, last: lost(i) })
-                .collect(),
+            targets: (0..names.len()).map(|i| TargetHealth { frames_seen: 0, last: lost(i) }).collect(),
+            names,
             dispositions: BTreeMap::new(),
             began: None,
             next_health: None,
@@ -80,7 +80,7 @@ impl Monitor {
 
     fn silences(&mut self, t: MonoTime, out: &mut Vec<Output>) {
         let began = self.began.unwrap_or(t);
-        for &source in Source::ALL {
+        for &source in &self.watched {
             let count = &mut self.sources[source];
             let quiet = t - count.last.unwrap_or(began);
             if !count.silent && quiet >= source.silent_after() {
@@ -107,7 +107,7 @@ impl Monitor {
         };
         let health = Health {
             t,
-            sources: Source::ALL.iter().map(&mut figures).collect(),
+            sources: self.watched.iter().map(&mut figures).collect(),
             fix: self.fix,
             sats: self.sats,
             clock_sigma: self.clock_sigma,
@@ -225,4 +225,35 @@ impl Monitor {
 /// A notice as an output.
 pub(super) fn notice(t: MonoTime, kind: NoticeKind, source: Option<Source>, detail: String) -> Output {
     Output::Notice(Notice { t, kind, source, detail })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_the_sources_there_are_can_be_silent() {
+        // Given a pipeline that has a receiver and a camera.
+        let mut monitor = Monitor::new(vec![Source::Gps, Source::Camera], vec!["ugv".into()]);
+        let mut out = Vec::new();
+        let at = |s: f64| MonoTime::from_ns(0) + Span::from_s(s);
+        monitor.advance(at(0.0), &mut out);
+        // When frames come and nothing else.
+        for n in 1..=40 {
+            monitor.heard(Source::Camera, at(0.1 * f64::from(n)), &mut out);
+            monitor.advance(at(0.1 * f64::from(n)), &mut out);
+        }
+        // Then the receiver is silent, once, and health is of the two.
+        let silent = out.iter().filter_map(|o| match o {
+            Output::Notice(notice) if notice.kind == NoticeKind::SourceSilent => notice.source,
+            _ => None,
+        });
+        assert_eq!(silent.collect::<Vec<_>>(), [Source::Gps]);
+        let healths = out.iter().filter_map(|o| match o {
+            Output::Health(health) => Some(health.sources.iter().map(|s| s.source).collect::<Vec<_>>()),
+            _ => None,
+        });
+        assert!(healths.clone().count() >= 3);
+        healths.for_each(|sources| assert_eq!(sources, [Source::Gps, Source::Camera]));
+    }
 }

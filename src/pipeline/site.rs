@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use crate::config::Config;
+use super::settings::PipelineSettings;
 use windhover_base::geo::{self, Geodetic, Ground, LocalFrame, Terrain, Tile};
 use windhover_base::msg::{FixKind, GnssEpoch, WarmSite};
-use windhover_base::settings::{Declination, GroundSource};
+use windhover_base::settings::{Datum, Declination, GroundConfig, GroundSource};
 use windhover_estimate::Site;
 
 /// Fixes whose median height is the ground where the ground is where the aircraft took off.
@@ -18,6 +18,10 @@ pub(super) struct SiteFinder {
     first: Option<Geodetic>,
     heights_m: Vec<f64>,
     seen: usize,
+    ground: GroundConfig,
+    datum: Option<Datum>,
+    declination_deg: Option<f64>,
+    declination: Option<Declination>,
     terrain: Option<Arc<Tile>>,
     warm: Option<WarmSite>,
 }
@@ -34,8 +38,19 @@ pub(super) struct SettledSite {
 }
 
 impl SiteFinder {
-    pub(super) fn new(terrain: Option<Arc<Tile>>) -> Self {
-        Self { first: None, heights_m: Vec::with_capacity(TAKEOFF_FIXES), seen: 0, terrain, warm: None }
+    pub(super) fn new(settings: &PipelineSettings, terrain: Option<Arc<Tile>>) -> Self {
+        let compass = &settings.rig.compass;
+        Self {
+            first: None,
+            heights_m: Vec::with_capacity(TAKEOFF_FIXES),
+            seen: 0,
+            ground: settings.ground.clone(),
+            datum: settings.datum,
+            declination_deg: compass.declination_deg,
+            declination: compass.declination,
+            terrain,
+            warm: None,
+        }
     }
 
     /// Settles on an earlier run's site at the first fix.
@@ -44,19 +59,19 @@ impl SiteFinder {
     }
 
     /// Takes a fix; the site when it is settled.
-    pub(super) fn offer(&mut self, epoch: &GnssEpoch, config: &Config) -> Option<SettledSite> {
+    pub(super) fn offer(&mut self, epoch: &GnssEpoch) -> Option<SettledSite> {
         let at = position(epoch)?;
         let first = *self.first.get_or_insert(at);
-        if let Some(warm) = self.warm.take().filter(|warm| agrees(warm, &at, config)) {
-            return Some(SettledSite { continued: true, ..self.settled(warm, None, config) });
+        if let Some(warm) = self.warm.take().filter(|warm| self.agrees(warm, &at)) {
+            return Some(SettledSite { continued: true, ..self.settled(warm, None) });
         }
         self.seen += 1;
         let geoid_m = epoch.geoid_m.unwrap_or(0.0);
         let elevation_msl_m = self
             .tile_at(first)
             .map(|t| t.height_msl_m(first.lat_deg, first.lon_deg))
-            .or(config.ground.elevation_msl_m);
-        let ground_height_m = match (elevation_msl_m, config.ground.source) {
+            .or(self.ground.elevation_msl_m);
+        let ground_height_m = match (elevation_msl_m, self.ground.source) {
             (Some(elevation_msl_m), _) => elevation_msl_m + geoid_m,
             (None, Some(GroundSource::Takeoff)) => {
                 self.heights_m.push(at.height_m);
@@ -67,25 +82,25 @@ impl SiteFinder {
             }
             (None, None) => first.height_m,
         };
-        let (declination_rad, declination_notice) = self.declination(epoch, at, config)?;
-        let datum = config
+        let (declination_rad, declination_notice) = self.declination(epoch, at)?;
+        let datum = self
             .datum
             .map_or([first.lat_deg, first.lon_deg, ground_height_m], |d| [d.lat_deg, d.lon_deg, d.height_m]);
         let warm = WarmSite { datum, ground_height_m, geoid_m, declination_rad };
-        Some(self.settled(warm, declination_notice, config))
+        Some(self.settled(warm, declination_notice))
     }
 
     fn tile_at(&self, at: Geodetic) -> Option<Arc<Tile>> {
         self.terrain.clone().filter(|tile| tile.covers(at.lat_deg, at.lon_deg))
     }
 
-    fn settled(&self, warm: WarmSite, declination_notice: Option<String>, config: &Config) -> SettledSite {
+    fn settled(&self, warm: WarmSite, declination_notice: Option<String>) -> SettledSite {
         let [lat_deg, lon_deg, height_m] = warm.datum;
         let datum = Geodetic { lat_deg, lon_deg, height_m };
         let frame = LocalFrame::new(datum);
         let first = self.first.unwrap_or(datum);
         let tile = self.tile_at(first);
-        let ground_notice = (tile.is_none() && config.ground.terrain.is_some()).then(|| {
+        let ground_notice = (tile.is_none() && self.ground.terrain.is_some()).then(|| {
             "no terrain tile covers the first fix (it could not be read, or is of another place): level ground at that fix's height instead".to_owned()
         });
         let ground = match tile {
@@ -100,11 +115,11 @@ impl SiteFinder {
     }
 
     /// Declination in radians and what to say of it; `None` while waiting for a date.
-    fn declination(&self, epoch: &GnssEpoch, at: Geodetic, config: &Config) -> Option<(f64, Option<String>)> {
-        if let Some(figure) = config.compass.declination_deg {
+    fn declination(&self, epoch: &GnssEpoch, at: Geodetic) -> Option<(f64, Option<String>)> {
+        if let Some(figure) = self.declination_deg {
             return Some((figure.to_radians(), None));
         }
-        let Some(Declination::Wmm) = config.compass.declination else {
+        let Some(Declination::Wmm) = self.declination else {
             return Some((0.0, None));
         };
         let Some(utc) = epoch.utc else {
@@ -122,25 +137,25 @@ impl SiteFinder {
             Err(error) => (0.0, Some(error.to_string())),
         })
     }
+
+    /// Whether an earlier run's site is here and is what the configuration asks for.
+    fn agrees(&self, warm: &WarmSite, at: &Geodetic) -> bool {
+        let [lat_deg, lon_deg, height_m] = warm.datum;
+        let near = (lat_deg - at.lat_deg).abs() < SAME_FLIGHT_DEG
+            && (lon_deg - at.lon_deg).abs() < SAME_FLIGHT_DEG / at.lat_deg.to_radians().cos().max(0.01);
+        // Stored numbers may have lost their last digit.
+        let equal = |a: f64, b: f64| (a - b).abs() <= 1e-9 * a.abs().max(1.0);
+        let as_configured =
+            self.datum.is_none_or(|d| {
+                equal(d.lat_deg, lat_deg) && equal(d.lon_deg, lon_deg) && equal(d.height_m, height_m)
+            }) && self.ground.elevation_msl_m.is_none_or(|e| equal(e + warm.geoid_m, warm.ground_height_m))
+                && self.declination_deg.is_none_or(|d| equal(d.to_radians(), warm.declination_rad));
+        near && as_configured && height_m.is_finite() && warm.ground_height_m.is_finite()
+    }
 }
 
 /// Farthest from an earlier run's datum that a flight is still the same one, degrees (some 10 km).
 const SAME_FLIGHT_DEG: f64 = 0.1;
-
-/// Whether an earlier run's site is here and is what the configuration asks for.
-fn agrees(warm: &WarmSite, at: &Geodetic, config: &Config) -> bool {
-    let [lat_deg, lon_deg, height_m] = warm.datum;
-    let near = (lat_deg - at.lat_deg).abs() < SAME_FLIGHT_DEG
-        && (lon_deg - at.lon_deg).abs() < SAME_FLIGHT_DEG / at.lat_deg.to_radians().cos().max(0.01);
-    // Stored numbers may have lost their last digit.
-    let equal = |a: f64, b: f64| (a - b).abs() <= 1e-9 * a.abs().max(1.0);
-    let as_configured =
-        config.datum.is_none_or(|d| {
-            equal(d.lat_deg, lat_deg) && equal(d.lon_deg, lon_deg) && equal(d.height_m, height_m)
-        }) && config.ground.elevation_msl_m.is_none_or(|e| equal(e + warm.geoid_m, warm.ground_height_m))
-            && config.compass.declination_deg.is_none_or(|d| equal(d.to_radians(), warm.declination_rad));
-    near && as_configured && height_m.is_finite() && warm.ground_height_m.is_finite()
-}
 
 /// A three-dimensional position above the ellipsoid.
 fn position(epoch: &GnssEpoch) -> Option<Geodetic> {
@@ -159,6 +174,7 @@ fn median(values: &mut [f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Config;
 
     #[test]
     fn level_ground_lies_under_the_first_fix_however_far_the_datum_is() {
@@ -178,7 +194,7 @@ mod tests {
             ..GnssEpoch::default()
         };
         // When the site is settled by the first fix.
-        let settled = SiteFinder::new(None).offer(&epoch, &config).expect("a declination is given");
+        let settled = SiteFinder::new(&(&config).into(), None).offer(&epoch).expect("a declination is given");
         // Then the ground under it is at its elevation.
         let (frame, at) = (settled.site.frame, Geodetic { lat_deg: 30.07, lon_deg: -85.57, height_m: 6.0 });
         let ned = frame.ned(at);

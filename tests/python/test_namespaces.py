@@ -104,13 +104,13 @@ class Namespaces(unittest.TestCase):
 
     def setUp(self):
         if os.geteuid() != 0:
-            self.skipTest("two network namespaces need root")
+            rig.leave_out(self, "two network namespaces need root")
         if not all(map(shutil.which, ("ip", "tc", "nft"))):
-            self.skipTest("two network namespaces need ip, tc and nft (Debian: iproute2, nftables)")
+            rig.leave_out(self, "two network namespaces need ip, tc and nft (Debian: iproute2, nftables)")
         try:
             self.wire = Wire()
         except RuntimeError as error:
-            self.skipTest(f"this kernel or container does not allow it: {error}")
+            rig.leave_out(self, f"this kernel or container does not allow it: {error}")
         self.addCleanup(self.wire.close)
         folder = tempfile.TemporaryDirectory()
         self.addCleanup(folder.cleanup)

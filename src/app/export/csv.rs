@@ -23,13 +23,13 @@ const OWNSHIP_COLUMNS: &str =
     "time_ns,frame,lat_deg,lon_deg,height_m,north_m,east_m,down_m,vn_mps,ve_mps,vd_mps,qw,qx,qy,qz";
 
 /// A file being written, remembered by name for errors.
-struct Table {
+struct CsvTable {
     path: PathBuf,
     file: BufWriter<File>,
     rows: u64,
 }
 
-impl Table {
+impl CsvTable {
     fn create(out: &Path, name: &str, columns: &str) -> Result<Self, ExportError> {
         let path = out.join(name);
         let file = File::create(&path).map_err(|source| write_error(&path, source))?;
@@ -53,11 +53,11 @@ impl Table {
 
 pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, ExportError> {
     let with_covariance = format!("{ESTIMATE_COLUMNS}{COVARIANCE_COLUMNS}");
-    let mut estimates = Table::create(out, "estimates.csv", &with_covariance)?;
-    let mut smoothed = Table::create(out, "smoothed.csv", &with_covariance)?;
-    let mut paper = Table::create(out, "paper.csv", ESTIMATE_COLUMNS)?;
-    let mut detections = Table::create(out, "detections.csv", DETECTION_COLUMNS)?;
-    let mut ownship = Table::create(out, "ownship.csv", OWNSHIP_COLUMNS)?;
+    let mut estimates = CsvTable::create(out, "estimates.csv", &with_covariance)?;
+    let mut smoothed = CsvTable::create(out, "smoothed.csv", &with_covariance)?;
+    let mut paper = CsvTable::create(out, "paper.csv", ESTIMATE_COLUMNS)?;
+    let mut detections = CsvTable::create(out, "detections.csv", DETECTION_COLUMNS)?;
+    let mut ownship = CsvTable::create(out, "ownship.csv", OWNSHIP_COLUMNS)?;
     let mut datum: Option<Datum> = None;
     let mut damaged = Vec::new();
     for message in reader.by_ref() {
@@ -92,7 +92,7 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
         rows += table.close(&mut exported.files)?;
     }
     if let Some(datum) = datum {
-        let mut table = Table::create(out, "datum.csv", "lat_deg,lon_deg,height_m")?;
+        let mut table = CsvTable::create(out, "datum.csv", "lat_deg,lon_deg,height_m")?;
         table.row(&format!("{:.10},{:.10},{:.4}", datum.lat_deg, datum.lon_deg, datum.height_m))?;
         rows += table.close(&mut exported.files)?;
     }

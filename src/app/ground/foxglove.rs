@@ -50,14 +50,14 @@ struct Said {
     data: Bytes,
 }
 
-struct Channel {
+struct FoxgloveChannel {
     topic: String,
     schema_name: String,
     schema: Arc<[u8]>,
     last: Option<Said>,
 }
 
-impl Channel {
+impl FoxgloveChannel {
     fn advertised(&self, id: u64) -> Value {
         json!({"id": id, "topic": self.topic, "encoding": "protobuf", "schemaName": self.schema_name,
             "schemaEncoding": "protobuf",
@@ -74,7 +74,7 @@ enum News {
 #[derive(Default)]
 struct Channels {
     /// The channel of a number is at the number less one.
-    all: Vec<Channel>,
+    all: Vec<FoxgloveChannel>,
     numbers: HashMap<(String, String), u64>,
     schemas: BTreeMap<String, Arc<[u8]>>,
 }
@@ -162,7 +162,12 @@ impl Channels {
             }
             (schema, _) => schema.into(),
         };
-        self.all.push(Channel { topic: key.0.clone(), schema_name: key.1.clone(), schema, last: None });
+        self.all.push(FoxgloveChannel {
+            topic: key.0.clone(),
+            schema_name: key.1.clone(),
+            schema,
+            last: None,
+        });
         let number = self.all.len() as u64;
         self.numbers.insert(key, number);
         let _ = news.send(News::Channel(number));

@@ -195,7 +195,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
             Err(source) => return Err(GroundError::Zenoh { words, source }),
         },
     };
-    let outlets = Outlets {
+    let outputs = StationOutputs {
         to_disk,
         view,
         live,
@@ -203,7 +203,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
         #[cfg(feature = "zenoh")]
         fleet,
     };
-    let taken = tokio::spawn(intake(records, ended.subscribe(), outlets));
+    let taken = tokio::spawn(intake(records, ended.subscribe(), outputs));
     let outcome = tokio::select! {
         _ = linked => Ok(()),
         Some(error) = failure.recv() => Err(error.into()),
@@ -216,7 +216,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
 }
 
 /// Where records go.
-struct Outlets {
+struct StationOutputs {
     to_disk: std::sync::mpsc::SyncSender<Arrival>,
     view: Arc<Mutex<View>>,
     live: broadcast::Sender<Arc<str>>,
@@ -225,7 +225,7 @@ struct Outlets {
     fleet: Option<fleet::Fleet>,
 }
 
-impl Outlets {
+impl StationOutputs {
     /// To everybody who looks; gives the message for the pages, where it makes one.
     fn show(&self, arrival: &Arrival) -> Option<Arc<str>> {
         if let Some(scope) = &self.scope {
@@ -256,7 +256,7 @@ impl Outlets {
 async fn intake(
     mut records: mpsc::Receiver<FromPayload>,
     mut ended: watch::Receiver<bool>,
-    outlets: Outlets,
+    outputs: StationOutputs,
 ) {
     loop {
         let message = tokio::select! {
@@ -267,22 +267,22 @@ async fn intake(
         let news = match message {
             None => return,
             Some(FromPayload::Record(arrival)) => {
-                let news = outlets.show(&arrival);
-                if !outlets.keep(arrival).await {
+                let news = outputs.show(&arrival);
+                if !outputs.keep(arrival).await {
                     return;
                 }
                 news
             }
             Some(FromPayload::Thumbnail { payload, thumbnail }) => {
-                if let Some(scope) = &outlets.scope {
+                if let Some(scope) = &outputs.scope {
                     scope.thumbnail(&payload, &thumbnail);
                 }
-                Some(lock(&outlets.view).thumbnail(&payload, thumbnail))
+                Some(lock(&outputs.view).thumbnail(&payload, thumbnail))
             }
         };
         if let Some(news) = news {
             // Nobody may be looking.
-            let _ = outlets.live.send(news);
+            let _ = outputs.live.send(news);
         }
     }
 }

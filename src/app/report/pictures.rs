@@ -33,7 +33,7 @@ pub(super) struct Quality {
 }
 
 /// A frame made small.
-pub(super) struct Picture {
+pub(super) struct FramePicture {
     jpeg: Vec<u8>,
     /// Of the frame itself, pixels.
     width: usize,
@@ -46,7 +46,7 @@ pub(super) struct Picture {
 /// What was taken from the frames.
 #[derive(Default)]
 pub(super) struct Pictures {
-    shown: Vec<Picture>,
+    shown: Vec<FramePicture>,
     /// Quality by time of exposure.
     pub(super) quality: Vec<(MonoTime, Quality)>,
     /// Frames of the sample that could not be read.
@@ -107,11 +107,11 @@ fn quality(image: &GrayImage) -> Quality {
     Quality { mean, spread, sharpness: sharpness.unwrap_or(0) as f64 }
 }
 
-fn picture(image: &GrayImage, number: u32, t_s: f64, flight: &Flight) -> Option<Picture> {
+fn picture(image: &GrayImage, number: u32, t_s: f64, flight: &Flight) -> Option<FramePicture> {
     let small = shrunk(image);
     let jpeg = jpeg::encode(&small.data, Layout::Grey, (small.width, small.height), JPEG_QUALITY).ok()?;
     let seen = flight.detections.iter().find(|d| d.frame == number).cloned().unwrap_or_default();
-    Some(Picture { jpeg, width: image.width, height: image.height, t_s, number, seen })
+    Some(FramePicture { jpeg, width: image.width, height: image.height, t_s, number, seen })
 }
 
 /// Each pixel the mean of a block, so that the picture is no wider than [`WIDEST`].
@@ -159,7 +159,7 @@ pub(super) fn section(pictures: &Pictures) -> Option<Section> {
 }
 
 /// Outlines in the frame's own pixels; the centre of the first pixel is (½, ½) of the picture.
-fn overlay(p: &Picture) -> String {
+fn overlay(p: &FramePicture) -> String {
     let mut out = format!("<svg viewBox=\"0 0 {} {}\">", p.width, p.height);
     let size = p.width as f64 / 45.0;
     for m in &p.seen.markers {

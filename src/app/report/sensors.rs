@@ -82,7 +82,7 @@ pub(super) fn quantile(values: &[f64], share: f64) -> f64 {
 /// The section; nothing where nothing was heard.
 pub(super) fn section(context: &Context<'_>) -> Option<Section> {
     let streams = streams(context);
-    if streams.is_empty() && context.flight.gps_reads.is_empty() && context.flight.compass_reads.is_empty() {
+    if streams.is_empty() && context.flight.reads == 0 {
         return None;
     }
     let mut body = timing_table(context, &streams);

@@ -7,7 +7,7 @@ use crate::app::flight_store::FlightStore;
 use crate::app::sink::{OutgoingRecord, Sink};
 use crate::io::records;
 use crate::io::store::StoreHandle;
-use windhover_base::msg::{Event, GnssEpoch, MarkerDetection, Measurement, Output, Stamped, TimedOutput};
+use windhover_base::msg::{Event, GnssEpoch, MarkerDetection, Output, SensorReading, Stamped, TimedOutput};
 use windhover_base::settings::CameraConfig;
 use windhover_base::time::{MonoTime, UtcTime};
 
@@ -58,7 +58,7 @@ impl Sink for CardSink {
     fn output(&mut self, output: &TimedOutput) {
         let Some(store) = self.flight_store.get() else { return };
         match &output.output {
-            Output::Measured(Measurement::Gnss(epoch)) => self.date(epoch, &store),
+            Output::Reading(SensorReading::Gnss(epoch)) => self.date(epoch, &store),
             Output::Detections { markers, .. } => store.watch(pixels(markers)),
             _ => {}
         }

@@ -84,7 +84,7 @@ pub(super) fn run(args: &Args) -> CliResult {
         }
     };
     let first = flights.first().ok_or_else(|| CliError::usage("no flight was given"))?;
-    let declination = declination::of_flight(&config, first)?;
+    let declination = declination::of_flight(&config.compass, first)?;
     let recordings: Vec<_> = flights.iter().map(recording::recording).collect();
     let surveyed = surveyed_markers(args, &config);
     let found = boresight(&config.rig(), declination, &recordings, &surveyed).map_err(CliError::failed)?;

@@ -7,7 +7,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::door::{CALL, Door};
-use super::events::LinkEvent;
+use super::link_events::LinkEvent;
 use super::peer::Peer;
 use super::quic::transport;
 use super::tls::refusal;

@@ -9,8 +9,8 @@ use quinn::{Connection, Endpoint, EndpointConfig, VarInt};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 
-use super::events::{Events, LinkError, LinkEvent};
 use super::keys::{Role, peer_of};
+use super::link_events::{Events, LinkError, LinkEvent};
 use super::peer::{Peer, close};
 use super::quic::{RandomIds, bind, server_config};
 use super::tls::{Identity, KeyFiles, peer_certificate, refusal};

@@ -5,7 +5,7 @@
 mod backlog;
 mod dial;
 mod door;
-mod events;
+mod link_events;
 mod governor;
 pub mod keys;
 mod live;
@@ -27,7 +27,7 @@ pub mod tls;
 pub mod wire;
 
 pub use backlog::{Backlog, Extent, Found, MemoryBacklog, Unread};
-pub use events::{LinkError, LinkEvent};
+pub use link_events::{LinkError, LinkEvent};
 pub use live::{Class, downlink_class};
 pub use payload::{EarlyRecords, LinkHandle, PayloadLink, PayloadSettings};
 pub use payload_shared::{LinkStatus, StationStatus};

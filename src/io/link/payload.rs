@@ -10,8 +10,8 @@ use tokio::time::Instant;
 
 use super::backlog::{Backlog, MemoryBacklog};
 use super::door::Door;
-use super::events::{Events, LinkError, LinkEvent};
 use super::keys::Role;
+use super::link_events::{Events, LinkError, LinkEvent};
 use super::live::downlink_class;
 use super::pace::Bucket;
 use super::payload_shared::{Connected, LinkStatus, PayloadShared, StationStatus};

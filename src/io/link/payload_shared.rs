@@ -8,7 +8,7 @@ use std::time::Duration;
 use tokio::sync::watch;
 
 use super::backlog::{Backlog, Extent, Found, MemoryBacklog, Unread};
-use super::events::Events;
+use super::link_events::Events;
 use super::pace::Bucket;
 use super::peer::Peer;
 use super::thumbnail::Picture;

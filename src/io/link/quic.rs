@@ -7,8 +7,8 @@ use std::time::Duration;
 use quinn::{AckFrequencyConfig, ServerConfig, TransportConfig, VarInt};
 use ring::rand::SecureRandom as _;
 
-use super::events::LinkError;
 use super::keys::KeyError;
+use super::link_events::LinkError;
 use super::sense::SenseFactory;
 use super::tls::Identity;
 

@@ -17,7 +17,7 @@ const RUNS: usize = 4_096;
 
 /// One run of a payload.
 #[derive(Clone, Debug, Default)]
-struct Run {
+struct RunNumbers {
     flight: String,
     first: u32,
     end: u32,
@@ -28,7 +28,7 @@ struct Run {
     stored: RangeSet,
 }
 
-impl Run {
+impl RunNumbers {
     /// What is missing below a number.
     fn missing(&self, end: u32) -> impl Iterator<Item = (u32, u32)> + '_ {
         self.have.missing(self.first.max(self.gone_below()), end)
@@ -63,7 +63,7 @@ pub struct Progress {
 /// Everything a station knows of one payload's numbers.
 #[derive(Clone, Debug, Default)]
 pub struct ReceivedNumbers {
-    runs: BTreeMap<u32, Run>,
+    runs: BTreeMap<u32, RunNumbers>,
     repeated: u64,
 }
 
@@ -76,7 +76,12 @@ impl ReceivedNumbers {
                 return;
             }
             let have = recall(&extent.flight, extent.run);
-            let run = Run { stored: have.clone(), have, flight: extent.flight.clone(), ..Run::default() };
+            let run = RunNumbers {
+                stored: have.clone(),
+                have,
+                flight: extent.flight.clone(),
+                ..RunNumbers::default()
+            };
             self.runs.insert(extent.run, run);
         }
         if let Some(run) = self.runs.get_mut(&extent.run) {

@@ -7,8 +7,8 @@ use std::sync::{Arc, Mutex};
 use tokio::sync::{mpsc, watch};
 
 use super::door::Door;
-use super::events::{Events, LinkError, LinkEvent};
 use super::keys::Role;
+use super::link_events::{Events, LinkError, LinkEvent};
 use super::peer::Peer;
 use super::ranges::RangeSet;
 use super::receive;

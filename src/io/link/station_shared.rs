@@ -9,7 +9,7 @@ use std::time::Duration;
 use tokio::sync::{Notify, mpsc};
 use tokio::time::Instant;
 
-use super::events::Events;
+use super::link_events::Events;
 use super::peer::Peer;
 use super::ranges::RangeSet;
 use super::received_numbers::{Progress, ReceivedNumbers};

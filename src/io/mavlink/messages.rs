@@ -33,7 +33,7 @@ const CAPABILITIES: u8 = 0b1011;
 
 /// A vehicle's state as MAVLink wants it.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub struct Vehicle {
+pub struct VehicleMessages {
     /// Since the program's start.
     pub time_boot_ms: u64,
     /// Position and motion.
@@ -44,7 +44,7 @@ pub struct Vehicle {
     pub reference_m: f64,
 }
 
-impl Vehicle {
+impl VehicleMessages {
     /// Velocity of the reported point, north and east, m/s: (ẋ, ẏ) = (v cosψ − aω sinψ, v sinψ + aω cosψ).
     fn velocity(&self) -> (f64, f64) {
         let (sin, cos) = self.state.heading_rad.sin_cos();
@@ -136,8 +136,8 @@ fn degrees_e7(degrees: f64) -> i32 {
 mod tests {
     use super::*;
 
-    fn vehicle() -> Vehicle {
-        Vehicle {
+    fn vehicle() -> VehicleMessages {
+        VehicleMessages {
             time_boot_ms: 1_500,
             state: TargetState {
                 north_m: 1.0,

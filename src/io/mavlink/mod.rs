@@ -10,13 +10,14 @@ pub mod packet;
 use std::net::{SocketAddr, ToSocketAddrs as _, UdpSocket};
 use std::path::{Path, PathBuf};
 
-use crate::config::Config;
+use crate::config::MavlinkConfig;
 use crate::io::link::keys::{KeyError, read_private};
 use windhover_base::geo::Geodetic;
-use windhover_base::msg::{EstimatorOutput, Measurement, Output, TargetEstimate, TrackStatus};
+use windhover_base::msg::{EstimatorOutput, Output, SensorReading, TargetEstimate, TrackStatus};
+use windhover_base::settings::{GroundConfig, TargetConfig};
 use windhover_base::time::{MonoTime, Span, UtcTime};
 
-use messages::Vehicle;
+use messages::VehicleMessages;
 use packet::{Refused, Sender, SigningKey};
 
 /// MAV_COMP_ID_AUTOPILOT1: ground stations draw vehicles for this component only.
@@ -84,11 +85,14 @@ pub struct MavlinkSender {
 }
 
 impl MavlinkSender {
-    /// As configured.
-    pub fn open(config: &Config) -> Result<Self, MavlinkError> {
+    /// As configured, for these targets over this ground.
+    pub fn open(
+        mavlink: &MavlinkConfig,
+        targets: &[TargetConfig],
+        ground: &GroundConfig,
+    ) -> Result<Self, MavlinkError> {
         let socket = UdpSocket::bind("0.0.0.0:0").map_err(MavlinkError::Socket)?;
         socket.set_nonblocking(true).map_err(MavlinkError::Socket)?;
-        let mavlink = &config.mavlink;
         let key = match &mavlink.signing_key {
             Some(path) => {
                 let path = Path::new(path);
@@ -104,12 +108,12 @@ impl MavlinkSender {
             addresses: Vec::new(),
             resolved: None,
             system_id: mavlink.system_id,
-            references_m: config.target.iter().map(|t| t.reference_m).collect(),
+            references_m: targets.iter().map(|t| t.reference_m).collect(),
             key,
-            elevation_msl_m: config.ground.elevation_msl_m,
+            elevation_msl_m: ground.elevation_msl_m,
             datum: None,
             geoid_m: None,
-            latest: vec![None; config.target.len()],
+            latest: vec![None; targets.len()],
             utc_from_host_ns: None,
             started: None,
             heartbeat: None,
@@ -129,7 +133,7 @@ impl MavlinkSender {
                 }
             }
             Output::Datum(_, datum) => self.datum = Some(*datum),
-            Output::Measured(Measurement::Gnss(fix)) => {
+            Output::Reading(SensorReading::Gnss(fix)) => {
                 self.geoid_m = fix.value.geoid_m.or(self.geoid_m);
                 if let Some(utc) = fix.value.utc {
                     self.utc_from_host_ns = Some(utc.unix_ns() - fix.t_valid.ns());
@@ -177,7 +181,8 @@ impl MavlinkSender {
                 continue;
             };
             let time_boot_ms = messages::since_start_ms(started, t_valid);
-            let vehicle = Vehicle { time_boot_ms, state, alt_msl_m, reference_m: self.references_m[index] };
+            let vehicle =
+                VehicleMessages { time_boot_ms, state, alt_msl_m, reference_m: self.references_m[index] };
             if status == TrackStatus::Lost || !vehicle.is_finite() {
                 continue;
             }

@@ -1,14 +1,14 @@
 //! What is kept: events and outputs as protobuf messages on named topics.
 
-mod events;
-mod messages;
+mod event_codec;
+mod output_messages;
 mod outputs;
 mod schema;
 pub mod topic;
 pub mod warm_message;
 
-pub use events::{EventDecoder, KeptMessage, is_event, of_event, topic_of_event};
-pub use messages::{detections, health, ownship, target_state};
+pub use event_codec::{EventDecoder, KeptMessage, is_event, of_event, topic_of_event};
+pub use output_messages::{detections, health, ownship, target_state};
 pub use outputs::{DaemonFigures, OutputEncoder, opening};
 pub use schema::Schema;
 

@@ -5,14 +5,14 @@ use std::collections::BTreeMap;
 use nalgebra::{UnitQuaternion, Vector3};
 use prost::Message;
 
-use super::messages::{
+use super::output_messages::{
     annotations, detections, fix_number, health, log_message, ownship, stamp, target_state, transform,
 };
 use super::{Record, Schema, topic};
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
 use windhover_base::geo::rot_z;
 use windhover_base::msg::{
-    AttitudeSample, EstimatorOutput, FusionResult, GnssEpoch, Measurement, Output, Stamped, TargetEstimate,
+    AttitudeSample, EstimatorOutput, FusionResult, GnssEpoch, Output, SensorReading, Stamped, TargetEstimate,
 };
 use windhover_base::settings::{CameraConfig, TargetConfig};
 use windhover_base::time::MonoTime;
@@ -79,8 +79,8 @@ impl OutputEncoder {
                 };
                 out.push(record(topic::DATUM.into(), Schema::Datum, log, *t, &message));
             }
-            Output::Measured(Measurement::Gnss(epoch)) => fix(epoch, log, out),
-            Output::Measured(Measurement::Attitude(sample)) => out.push(attitude(sample, log)),
+            Output::Reading(SensorReading::Gnss(epoch)) => fix(epoch, log, out),
+            Output::Reading(SensorReading::Attitude(sample)) => out.push(attitude(sample, log)),
             Output::Detections { frame, t_valid, markers, features } => {
                 let whole = detections(*frame, *t_valid, markers, features);
                 out.push(record(topic::CAMERA_DETECTIONS.into(), Schema::Detections, log, *t_valid, &whole));

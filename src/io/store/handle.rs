@@ -17,7 +17,7 @@ use super::segment::Head;
 use super::status::{Recording, StoreNotice, StoreStatus};
 use super::store_shared::StoreShared;
 use super::volume::Volume;
-use crate::config::{Config, StoreConfig};
+use crate::config::StoreConfig;
 use crate::io::clock::HostClock;
 use crate::io::records::{self, Record};
 use windhover_base::msg::{Event, EventBody, WarmState};
@@ -50,8 +50,12 @@ pub struct StoreHandle {
 impl Store {
     /// Starts recording into a new flight, and tells the operator through the receiver. `config_toml`
     /// goes into every segment.
-    pub fn start(config: &Config, config_toml: String, clock: HostClock) -> (Self, Receiver<StoreNotice>) {
-        Self::start_on(Volume::new(&config.store.path), &config.store, config_toml, clock)
+    pub fn start(
+        store: &StoreConfig,
+        config_toml: String,
+        clock: HostClock,
+    ) -> (Self, Receiver<StoreNotice>) {
+        Self::start_on(Volume::new(&store.path), store, config_toml, clock)
     }
 
     /// The same on a volume given.

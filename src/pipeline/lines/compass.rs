@@ -1,7 +1,7 @@
 //! The compass line: bytes to samples at their time of validity.
 
-use super::{Line, on_the_wire};
-use windhover_base::msg::{Measurement, Stamped};
+use super::{SourceLine, on_the_wire};
+use windhover_base::msg::{SensorReading, Stamped};
 use windhover_base::settings::CompassConfig;
 use windhover_base::time::{MonoTime, Span, SteadyClock};
 use windhover_decode::{CompassDecoder, DecodeCounts, HeardAttitude};
@@ -27,15 +27,15 @@ impl CompassLine {
     }
 }
 
-impl Line for CompassLine {
-    fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<Measurement>) {
+impl SourceLine for CompassLine {
+    fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<SensorReading>) {
         self.decoder.push(bytes, t_recv, &mut self.heard);
         for heard in self.heard.drain(..) {
             let length = heard.bytes + heard.bytes_after;
             let began = heard.t_recv - on_the_wire(length, self.baud);
             let t_valid = self.clock.smooth(began) - self.latency;
             let sample = Stamped { t_valid, t_recv: heard.t_recv, seq, value: heard.sample };
-            out.push(Measurement::Attitude(sample));
+            out.push(SensorReading::Attitude(sample));
         }
     }
 

@@ -1,7 +1,7 @@
 //! The GPS line: bytes to epochs at their time of validity.
 
-use super::{Line, on_the_wire};
-use windhover_base::msg::{Measurement, Stamped, WarmArrival};
+use super::{SourceLine, on_the_wire};
+use windhover_base::msg::{SensorReading, Stamped, WarmArrival};
 use windhover_base::settings::GpsConfig;
 use windhover_base::time::{GnssClock, MonoTime, Span};
 use windhover_decode::{DecodeCounts, GnssDecoder, HeardEpoch};
@@ -32,7 +32,7 @@ impl GpsLine {
         }
     }
 
-    fn stamp(&mut self, seq: u64, out: &mut Vec<Measurement>) {
+    fn stamp(&mut self, seq: u64, out: &mut Vec<SensorReading>) {
         for heard in self.heard.drain(..) {
             let began = heard.t_first_byte - on_the_wire(heard.bytes_before_end, self.baud);
             if let (true, Some(time_of_day_ns)) = (heard.opens_burst, heard.epoch.time_of_day_ns) {
@@ -47,7 +47,7 @@ impl GpsLine {
             self.clock_sigma = fitted.map(|(_, sigma)| sigma);
             let t_valid = fitted.map_or(began - self.latency, |(t, _)| t);
             let epoch = Stamped { t_valid, t_recv: heard.t_last_byte, seq, value: heard.epoch };
-            out.push(Measurement::Gnss(epoch));
+            out.push(SensorReading::Gnss(epoch));
         }
     }
 
@@ -74,18 +74,18 @@ impl GpsLine {
     }
 }
 
-impl Line for GpsLine {
-    fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<Measurement>) {
+impl SourceLine for GpsLine {
+    fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<SensorReading>) {
         self.decoder.push(bytes, t_recv, &mut self.heard);
         self.stamp(seq, out);
     }
 
-    fn tick(&mut self, now: MonoTime, seq: u64, out: &mut Vec<Measurement>) {
+    fn tick(&mut self, now: MonoTime, seq: u64, out: &mut Vec<SensorReading>) {
         self.decoder.tick(now, &mut self.heard);
         self.stamp(seq, out);
     }
 
-    fn finish(&mut self, out: &mut Vec<Measurement>) {
+    fn finish(&mut self, out: &mut Vec<SensorReading>) {
         self.decoder.flush(&mut self.heard);
         self.stamp(u64::MAX, out);
     }

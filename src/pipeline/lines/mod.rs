@@ -1,4 +1,4 @@
-//! Sources that deliver bytes: bytes in, stamped measurements out. One file a line, one row in [`Lines::of`].
+//! Sources that deliver bytes: bytes in, stamped measurements out. One file a line, one row in [`SourceLines::of`].
 
 mod compass;
 mod gps;
@@ -6,39 +6,39 @@ mod gps;
 pub(super) use compass::CompassLine;
 pub(super) use gps::GpsLine;
 
-use windhover_base::msg::{Measurement, Source};
-use windhover_base::settings::{CompassConfig, GpsConfig};
+use windhover_base::msg::{SensorReading, Source};
+use windhover_base::settings::Rig;
 use windhover_base::time::{MonoTime, Span};
 use windhover_decode::DecodeCounts;
 
 /// A decoder, and the clock that puts what it decodes in time.
-pub(super) trait Line {
+pub(super) trait SourceLine {
     /// Takes the bytes that one read returned at `t_recv`.
-    fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<Measurement>);
+    fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<SensorReading>);
 
     /// Time has come to `now`: what waited for more bytes waits no longer.
-    fn tick(&mut self, _now: MonoTime, _seq: u64, _out: &mut Vec<Measurement>) {}
+    fn tick(&mut self, _now: MonoTime, _seq: u64, _out: &mut Vec<SensorReading>) {}
 
     /// No more bytes follow.
-    fn finish(&mut self, _out: &mut Vec<Measurement>) {}
+    fn finish(&mut self, _out: &mut Vec<SensorReading>) {}
 
     /// Counts of what was decoded and refused so far.
     fn counts(&self) -> &DecodeCounts;
 }
 
 /// The lines of a pipeline.
-pub(super) struct Lines {
+pub(super) struct SourceLines {
     pub(super) gps: GpsLine,
     pub(super) compass: CompassLine,
 }
 
-impl Lines {
-    pub(super) fn new(gps: &GpsConfig, compass: &CompassConfig) -> Self {
-        Self { gps: GpsLine::new(gps), compass: CompassLine::new(compass) }
+impl SourceLines {
+    pub(super) fn new(rig: &Rig) -> Self {
+        Self { gps: GpsLine::new(&rig.gps), compass: CompassLine::new(&rig.compass) }
     }
 
-    /// The line of a source; `None` where it does not deliver bytes.
-    pub(super) fn of(&mut self, source: Source) -> Option<&mut dyn Line> {
+    /// The line of a source; `None` where it does not deliver bytes, or is not configured.
+    pub(super) fn of(&mut self, source: Source) -> Option<&mut dyn SourceLine> {
         match source {
             Source::Gps => Some(&mut self.gps),
             Source::Compass => Some(&mut self.compass),

@@ -43,7 +43,7 @@ pub struct TargetHealth {
 pub struct Health {
     /// When.
     pub t: MonoTime,
-    /// Sources, in the order of [`Source::ALL`].
+    /// The sources there are, in the order of [`Source::ALL`].
     pub sources: Vec<SourceHealth>,
     /// Kind of the last fix.
     pub fix: FixKind,

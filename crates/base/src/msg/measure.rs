@@ -77,9 +77,9 @@ pub struct AttitudeSample {
     pub tilt: Option<Tilt>,
 }
 
-/// A measurement that a line's bytes were decoded to.
+/// What a source's bytes were decoded to.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub enum Measurement {
+pub enum SensorReading {
     /// Of a GPS receiver.
     Gnss(Stamped<GnssEpoch>),
     /// Of a compass.

@@ -10,7 +10,7 @@ mod notice;
 mod output;
 mod predict;
 mod source;
-mod warm;
+mod warm_state;
 
 pub use estimate::{
     Disposition, EstimatorOutput, FusionResult, FusionSource, Ownship, TargetEstimate, TargetState,
@@ -22,10 +22,10 @@ pub use health::{Health, SourceHealth, TargetHealth};
 pub use image::{GrayImage, ImageView, RgbImage};
 pub use measure::{
     AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, MarkerDetection, MarkerId,
-    Measurement, Stamped,
+    SensorReading, Stamped,
 };
 pub use notice::{Notice, NoticeKind};
 pub use output::{Output, TimedOutput};
 pub use predict::{FramePrediction, MarkerPrediction};
 pub use source::{Delivery, PerSource, Source};
-pub use warm::{WARM_STATES, WarmArrival, WarmFilter, WarmSite, WarmState};
+pub use warm_state::{WARM_STATES, WarmArrival, WarmFilter, WarmSite, WarmState};

@@ -1,6 +1,6 @@
 //! What the pipeline says: estimates, what became of measurements, notices, health.
 
-use super::{EstimatorOutput, FeatureTrack, Health, MarkerDetection, Measurement, Notice, TargetEstimate};
+use super::{EstimatorOutput, FeatureTrack, Health, MarkerDetection, Notice, SensorReading, TargetEstimate};
 use crate::geo::Geodetic;
 use crate::time::MonoTime;
 
@@ -9,8 +9,8 @@ use crate::time::MonoTime;
 pub enum Output {
     /// The origin of the NED frame was settled, at this host time.
     Datum(MonoTime, Geodetic),
-    /// A measurement, mapped to host time.
-    Measured(Measurement),
+    /// A sensor's reading, mapped to host time.
+    Reading(SensorReading),
     /// What was seen in a frame.
     Detections {
         /// Number of the frame.

@@ -33,7 +33,7 @@ pub(super) struct Session {
     wanted: Mutex<Wanted>,
     wanted_more: Notify,
     live_waits: AtomicBool,
-    table: Mutex<Table>,
+    table: Mutex<ChannelTable>,
     control: mpsc::Sender<pb::ToStation>,
     live: AtomicU64,
     thinned: AtomicU64,
@@ -47,7 +47,7 @@ pub(super) struct Session {
 
 /// Channel numbers of this connection.
 #[derive(Default)]
-struct Table {
+struct ChannelTable {
     numbers: BTreeMap<(String, &'static str), (u32, bool)>,
     known: Vec<u64>,
 }
@@ -116,7 +116,7 @@ async fn run(
         wanted: Mutex::default(),
         wanted_more: Notify::new(),
         live_waits: AtomicBool::new(false),
-        table: Mutex::new(Table { known: hello.known_schemas, ..Table::default() }),
+        table: Mutex::new(ChannelTable { known: hello.known_schemas, ..ChannelTable::default() }),
         control,
         live: AtomicU64::new(0),
         thinned: AtomicU64::new(0),
