@@ -23,6 +23,8 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
+use crate::app::run::prepare;
+
 /// Watches a ground vehicle from a small helicopter: where it is, where it points, how it moves.
 #[derive(Parser, Debug)]
 #[command(
@@ -66,6 +68,8 @@ enum Command {
 
 /// Runs the command line of this process.
 pub fn main() -> ExitCode {
+    // The daemon takes its signals over first of all: to understand the command line takes milliseconds.
+    let prepared = std::env::args_os().nth(1).is_some_and(|first| first == "run").then(prepare);
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(error) => {
@@ -81,7 +85,7 @@ pub fn main() -> ExitCode {
         Command::Import(args) => import::run(&args),
         Command::Export(args) => export::run(&args),
         Command::Generate(args) => generate::run(&args),
-        Command::Run(args) => run::run(&args),
+        Command::Run(args) => run::run(&args, prepared.unwrap_or_else(prepare)),
         Command::CheckConfig(args) => check_config::run(&args),
         Command::Decode(args) => decode::run(&args),
         Command::Ground(args) => ground::run(&args),

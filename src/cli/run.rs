@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::{CliError, CliResult};
-use crate::app::run::{self, RunError};
+use crate::app::run::{self, Prepared, RunError};
 
 /// Run the daemon: read the sensors, estimate, record, send, until SIGTERM. SIGHUP reads the
 /// configuration again.
@@ -17,8 +17,8 @@ pub(super) struct Args {
     config: PathBuf,
 }
 
-pub(super) fn run(args: &Args) -> CliResult {
-    let prepared = run::prepare().map_err(|error| CliError::failed(RunError::Start(error)))?;
+pub(super) fn run(args: &Args, prepared: std::io::Result<Prepared>) -> CliResult {
+    let prepared = prepared.map_err(|error| CliError::failed(RunError::Start(error)))?;
     run::run(prepared, &args.config).map_err(|error| match error {
         RunError::Config(error) => CliError::config(error),
         error => CliError::failed(error),
