@@ -11,7 +11,7 @@ use crate::io::store::{Recording, Store, StoreNotice, StoreStatus};
 use windhover_base::time::Span;
 
 use super::context::TaskContext;
-use super::events::Event;
+use super::events::{self, OperatorEvent};
 use super::flight_store::{FlightStore, StoreOrders};
 use super::health::CardFigures;
 use super::presence::PartState;
@@ -77,7 +77,7 @@ pub async fn run(task: StoreTask, mut opened: Option<OpenStore>) {
         if why == Closing::End {
             return;
         }
-        task.context.log.tell(Event::FlightClosed, "", "power is going: everything is on the card");
+        OperatorEvent::FlightClosed.emit("", "power is going: everything is on the card");
         task.show_state("closed");
         let mut power = task.orders.power_going.subscribe();
         let back = async { power.wait_for(|going| !going).await.is_ok() };
@@ -133,8 +133,12 @@ impl StoreTask {
 
     fn report(&self, notices: &mut Receiver<StoreNotice>) {
         for notice in notices.try_iter() {
-            let event = Event::Card { name: notice.name(), warning: notice.is_warning() };
-            self.context.log.tell(event, "card", notice.to_string());
+            match &notice {
+                StoreNotice::Started { flight } | StoreNotice::Resumed { flight } => events::flight(flight),
+                StoreNotice::Named { to, .. } => events::flight(to),
+                _ => {}
+            }
+            OperatorEvent::from(&notice).emit("card", &notice);
         }
     }
 

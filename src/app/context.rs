@@ -8,7 +8,6 @@ use crate::io::clock::HostClock;
 use windhover_base::time::MonoTime;
 
 use super::event_queue::EventQueue;
-use super::log::Log;
 use super::presence::Presence;
 
 /// What every task is given. Copies share the same parts.
@@ -20,8 +19,6 @@ pub struct TaskContext {
     pub began: MonoTime,
     /// Asks for the end.
     pub stop: CancellationToken,
-    /// The operator's log.
-    pub log: Log,
     /// Which parts are up.
     pub presence: Presence,
     /// Where events go.

@@ -11,7 +11,7 @@ use windhover_base::msg::{EventBody, Source};
 use windhover_base::settings::CompassFormat;
 
 use super::context::TaskContext;
-use super::events::Event;
+use super::events::{self, OperatorEvent};
 use super::presence::PartState;
 use super::supervise::Heart;
 
@@ -62,17 +62,17 @@ pub async fn camera(config: Arc<Config>, context: TaskContext, heart: Heart) {
 /// Watches the receiver's pulse until the end is asked for. A pulse line that is missing costs nothing
 /// but accuracy: it is no part that readiness waits for.
 pub async fn pulses(device: String, context: TaskContext, heart: Heart) {
-    let reports = |report| plain(report, "pps", &context, &heart);
+    let reports = |report| plain(report, "pps", &heart);
     let pulse = |t| context.events.put(t, EventBody::Pulse);
     context.stop.run_until_cancelled(pps::run(&device, context.clock, &reports, &pulse)).await;
 }
 
 /// What a device reports that delivers neither bytes nor frames.
-pub(super) fn plain(report: Report, name: &str, context: &TaskContext, heart: &Heart) {
+fn plain(report: Report, name: &str, heart: &Heart) {
     heart.beat();
     match report {
-        Report::Up(text) => context.log.tell(Event::DeviceUp, name, text),
-        Report::Down(fault) => context.log.tell(Event::DeviceDown, name, fault.to_string()),
+        Report::Up(text) => OperatorEvent::DeviceUp.emit(name, text),
+        Report::Down(fault) => events::device_down(name, &fault),
         _ => {}
     }
 }
@@ -94,7 +94,7 @@ impl DeviceReports {
             Report::Up(text) => {
                 self.context.presence.set(self.part, PartState::Open);
                 self.put(EventBody::SourceUp(self.source));
-                self.context.log.tell(Event::DeviceUp, name, text);
+                OperatorEvent::DeviceUp.emit(name, text);
             }
             Report::Bytes(t, bytes) => {
                 self.delivers();
@@ -109,7 +109,7 @@ impl DeviceReports {
                 if kind == NoteKind::FramesMissed {
                     self.put(EventBody::Dropped { source: self.source, count });
                 }
-                self.context.log.tell(Event::Device(kind), name, text);
+                OperatorEvent::from(kind).emit(name, text);
             }
         }
     }
@@ -129,12 +129,6 @@ impl DeviceReports {
         if matches!(before, PartState::Open | PartState::Delivers) {
             self.put(EventBody::SourceDown(self.source));
         }
-        let name = self.part.name();
-        // The same fault again and again is one line in half a minute, until the device comes up; another fault
-        // shows at once.
-        let key = format!("{name} {}", fault.kind.name());
-        self.context.log.tell_keyed(self.context.clock.now(), Event::DeviceDown, key, |line| {
-            line.says(fault.to_string()).with("about", name).with("fault", fault.kind.name())
-        });
+        events::device_down(self.part.name(), fault);
     }
 }

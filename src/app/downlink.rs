@@ -23,7 +23,7 @@ use windhover_base::msg::{Event, EventBody, FramePayload, Output};
 use windhover_base::time::UtcTime;
 
 use super::context::TaskContext;
-use super::events::Event as OperatorEvent;
+use super::events::OperatorEvent;
 use super::flight_store::FlightStore;
 use super::status::SharedStatus;
 use super::supervise::Heart;
@@ -182,7 +182,7 @@ type Opened = (PayloadLink, LinkHandle, mpsc::Receiver<LinkEvent>);
 
 impl LinkTask {
     fn fault(&self, why: &dyn std::fmt::Display) {
-        self.context.log.tell(OperatorEvent::LinkFault, "link", why.to_string());
+        OperatorEvent::LinkFault.emit("link", why);
     }
 
     fn show(&self, word: impl Into<String>) {
@@ -261,7 +261,7 @@ impl LinkTask {
             LinkEvent::KeysUnusable { why } => (LinkFault, "link", why.clone()),
             LinkEvent::Unresolved { address, why } => (LinkFault, "link", format!("{address}: {why}")),
         };
-        self.context.log.tell(what, about, words);
+        what.emit(about, words);
     }
 }
 

@@ -1,133 +1,212 @@
-//! The one table of operator events: fixed names, severities, throttles.
+//! The one table of operator events: fixed names, severities, throttles. Each row is a `tracing` callsite.
 //!
 //! People search logs and write alarms for these names: a name never changes its meaning and is
 //! never used again.
 
-use crate::config::LogLevel;
-use crate::io::device::NoteKind;
-use windhover_base::msg::{Notice, NoticeKind};
-use windhover_base::time::{MonoTime, Span};
+use std::fmt::Display;
+use std::path::Path;
 
-use super::log::Line;
+use tracing::field::Empty;
+use tracing::{Level, Metadata, Span};
 
-/// What an operator is told of.
-#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
-pub enum Event {
+use crate::io::device::{Fault, NoteKind};
+use crate::io::store::StoreNotice;
+use windhover_base::msg::{Notice, NoticeKind, Source};
+use windhover_base::time::{self, MonoTime, NS_PER_S, UtcTime};
+
+use super::latencies::OfFlight;
+
+/// The target of every operator event, and of nothing else.
+pub const TARGET: &str = "windhover";
+
+/// Makes the enum, its rows, and a callsite for each: `tracing` wants name, severity and the names of fields as
+/// constants.
+macro_rules! table {
+    ($( $(#[$doc:meta])* $variant:ident: $name:literal, $level:ident, every $every_s:literal s; )*) => {
+        /// An event for the operator.
+        #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+        pub enum OperatorEvent { $( $(#[$doc])* $variant, )* }
+
+        impl OperatorEvent {
+            /// Every row.
+            pub const ALL: &'static [Self] = &[$(Self::$variant),*];
+
+            const fn row(self) -> Row {
+                match self {
+                    $(Self::$variant => {
+                        Row { name: $name, level: Level::$level, every: time::Span::from_ns($every_s * NS_PER_S) }
+                    })*
+                }
+            }
+
+            fn send(self, t: Option<MonoTime>, about: &str, words: &dyn Display) {
+                let t_ns = t.map(MonoTime::ns);
+                let about = (!about.is_empty()).then_some(about);
+                match self {
+                    $(Self::$variant => {
+                        tracing::event!(name: $name, target: TARGET, Level::$level, { about, t_ns }, "{words}");
+                    })*
+                }
+            }
+        }
+    };
+}
+
+table! {
     /// The daemon has begun.
-    Started,
+    Started: "started", INFO, every 0 s;
     /// Everything asked for is up.
-    Ready,
+    Ready: "ready", INFO, every 0 s;
     /// Something asked for is not up yet.
-    NotReady,
+    NotReady: "not_ready", WARN, every 30 s;
     /// The end was asked for.
-    Stopping,
+    Stopping: "stopping", INFO, every 0 s;
     /// The end.
-    Stopped,
+    Stopped: "stopped", INFO, every 0 s;
     /// From exposure to estimate, over the whole flight; at its end.
-    Latencies,
+    Latencies: "latencies", INFO, every 0 s;
+    /// How everything does; once a second.
+    Health: "health", INFO, every 0 s;
     /// A device is open.
-    DeviceUp,
+    DeviceUp: "device_up", INFO, every 0 s;
     /// A device does not deliver; it is tried again.
-    DeviceDown,
-    /// A device delivers, with something to know about it.
-    Device(NoteKind),
-    /// The pipeline says something.
-    Pipeline(NoticeKind),
+    DeviceDown: "device_down", WARN, every 30 s;
+    /// What arrives is not what this line speed and format should give.
+    DeviceGarbled: "device_garbled", WARN, every 10 s;
+    /// The driver's stamps cannot be used; arrival times stand in.
+    CameraStampsUnusable: "camera_stamps_unusable", WARN, every 10 s;
+    /// The driver flagged a frame as damaged.
+    CameraFrameDamaged: "camera_frame_damaged", WARN, every 5 s;
+    /// The camera gives another format than asked for.
+    CameraFormatDiffers: "camera_format_differs", WARN, every 0 s;
+    /// Frames the driver counted and never delivered.
+    CameraFramesMissed: "camera_frames_missed", WARN, every 5 s;
+    /// A receiver was configured as asked.
+    ReceiverConfigured: "receiver_configured", INFO, every 0 s;
+    /// A receiver refused or ignored its configuration.
+    ReceiverNotConfigured: "receiver_not_configured", WARN, every 0 s;
+    /// A recorded source has played to its end.
+    RecordingPlayedOut: "recording_played_out", INFO, every 0 s;
+    /// The receiver has a position.
+    FixAcquired: "fix_acquired", INFO, every 0 s;
+    /// The receiver lost its position.
+    FixLost: "fix_lost", WARN, every 0 s;
+    /// Nothing came from a source for longer than its time-out.
+    SourceSilent: "source_silent", WARN, every 0 s;
+    /// A silent source delivers again.
+    SourceBack: "source_back", INFO, every 0 s;
+    /// Bytes of a source were refused (checksum, range, grammar).
+    BytesRefused: "bytes_refused", WARN, every 5 s;
+    /// A frame could not be read, or has the wrong size.
+    FrameUnusable: "frame_unusable", WARN, every 5 s;
+    /// Frames or bytes were lost before they could be recorded.
+    Dropped: "dropped", WARN, every 5 s;
+    /// The origin of the NED frame was settled.
+    DatumSet: "datum_set", INFO, every 0 s;
+    /// The terrain tile of the configuration cannot be used here: the ground is level instead.
+    TerrainMissing: "terrain_missing", WARN, every 0 s;
+    /// Declination was taken from the World Magnetic Model, or could not be.
+    Declination: "declination", INFO, every 0 s;
+    /// A target was found and settled.
+    TargetTracking: "target_tracking", INFO, every 0 s;
+    /// A target has not been seen for a moment.
+    TargetCoasting: "target_coasting", INFO, every 5 s;
+    /// A target is lost.
+    TargetLost: "target_lost", WARN, every 0 s;
+    /// The filter started again.
+    FilterReset: "filter_reset", WARN, every 0 s;
+    /// A stamp went back or leapt ahead.
+    ClockJump: "clock_jump", WARN, every 5 s;
     /// A flight was closed because power is going.
-    FlightClosed,
-    /// The store says something about the data card; names are the store's own.
-    Card {
-        /// Its fixed name.
-        name: &'static str,
-        /// Whether the operator should do something.
-        warning: bool,
-    },
+    FlightClosed: "flight_closed", WARN, every 0 s;
+    /// A flight began on the card.
+    RecordingStarted: "recording_started", INFO, every 0 s;
+    /// Nothing goes to the card any more.
+    RecordingStopped: "recording_stopped", WARN, every 5 s;
+    /// Recording goes on.
+    RecordingResumed: "recording_resumed", INFO, every 0 s;
+    /// The flight has its date.
+    FlightNamed: "flight_named", INFO, every 0 s;
+    /// Something was dropped because the card did not keep up.
+    RecordingDropout: "recording_dropout", WARN, every 5 s;
+    /// Less is free than wanted, and nothing may be deleted.
+    CardAlmostFull: "card_almost_full", WARN, every 5 s;
+    /// A segment that was cut or holed was sealed.
+    SegmentSealed: "segment_sealed", INFO, every 0 s;
+    /// A flight was deleted to make room or for its age.
+    FlightDeleted: "flight_deleted", INFO, every 0 s;
+    /// The index was unusable and is being made again.
+    IndexRebuilding: "index_rebuilding", WARN, every 5 s;
+    /// The index is complete.
+    IndexReady: "index_ready", INFO, every 0 s;
+    /// Something of the store beside recording failed.
+    StoreFailed: "store_failed", WARN, every 5 s;
     /// A ground station is connected.
-    LinkUp,
+    LinkUp: "link_up", INFO, every 0 s;
     /// A ground station went away.
-    LinkDown,
+    LinkDown: "link_down", WARN, every 0 s;
     /// The link does not work.
-    LinkFault,
+    LinkFault: "link_fault", WARN, every 30 s;
     /// The supply voltage is going.
-    PowerGoing,
+    PowerGoing: "power_going", ERROR, every 0 s;
     /// The supply voltage is back.
-    PowerBack,
+    PowerBack: "power_back", INFO, every 0 s;
     /// The computer is hot.
-    Hot,
+    Hot: "hot", WARN, every 60 s;
     /// There is a state of an earlier run; whether it is continued from.
-    WarmStart,
+    WarmStart: "warm_start", INFO, every 0 s;
     /// The configuration was read again.
-    Reloaded,
+    Reloaded: "reloaded", INFO, every 0 s;
     /// A changed value of the configuration takes a restart.
-    NeedsRestart,
+    NeedsRestart: "needs_restart", WARN, every 0 s;
     /// The configuration could not be read again; the old one stays.
-    ReloadRefused,
+    ReloadRefused: "reload_refused", ERROR, every 0 s;
     /// A task does not answer; the watchdog is not stroked.
-    TaskSilent,
+    TaskSilent: "task_silent", ERROR, every 5 s;
     /// A task answers again.
-    TaskBack,
+    TaskBack: "task_back", INFO, every 0 s;
     /// A task panicked.
-    TaskFailed,
+    TaskFailed: "task_failed", ERROR, every 0 s;
+    /// The log's file cannot be written.
+    LogFile: "log_file", WARN, every 30 s;
+    /// A sink of the log does not keep up: lines are missing there.
+    LogLinesLost: "log_lines_lost", WARN, every 30 s;
 }
 
 /// One row of the table.
 struct Row {
     name: &'static str,
-    level: LogLevel,
+    level: Level,
     /// At most one line this often about the same thing; what came between is counted.
-    every: Span,
+    every: time::Span,
 }
 
-const fn row(name: &'static str, level: LogLevel, every_s: i64) -> Row {
-    Row { name, level, every: Span::from_ns(every_s * windhover_base::time::NS_PER_S) }
+/// Emits a row with fields of its own.
+macro_rules! emit {
+    ($variant:ident, { $($fields:tt)* }, $($words:tt)+) => {
+        tracing::event!(
+            name: OperatorEvent::$variant.name(),
+            target: TARGET,
+            OperatorEvent::$variant.level(),
+            { $($fields)* },
+            $($words)+
+        )
+    };
 }
 
-use LogLevel::{Error, Info, Warn};
-
-impl Event {
-    const fn row(self) -> Row {
-        match self {
-            Self::Started => row("started", Info, 0),
-            Self::Ready => row("ready", Info, 0),
-            Self::NotReady => row("not_ready", Warn, 30),
-            Self::Stopping => row("stopping", Info, 0),
-            Self::Stopped => row("stopped", Info, 0),
-            Self::Latencies => row("latencies", Info, 0),
-            Self::DeviceUp => row("device_up", Info, 0),
-            Self::DeviceDown => row("device_down", Warn, 30),
-            Self::Device(note) => device_row(note),
-            Self::Pipeline(notice) => pipeline_row(notice),
-            Self::FlightClosed => row("flight_closed", Warn, 0),
-            Self::Card { name, warning: true } => row(name, Warn, 5),
-            Self::Card { name, warning: false } => row(name, Info, 0),
-            Self::LinkUp => row("link_up", Info, 0),
-            Self::LinkDown => row("link_down", Warn, 0),
-            Self::LinkFault => row("link_fault", Warn, 30),
-            Self::PowerGoing => row("power_going", Error, 0),
-            Self::PowerBack => row("power_back", Info, 0),
-            Self::Hot => row("hot", Warn, 60),
-            Self::WarmStart => row("warm_start", Info, 0),
-            Self::Reloaded => row("reloaded", Info, 0),
-            Self::NeedsRestart => row("needs_restart", Warn, 0),
-            Self::ReloadRefused => row("reload_refused", Error, 0),
-            Self::TaskSilent => row("task_silent", Error, 5),
-            Self::TaskBack => row("task_back", Info, 0),
-            Self::TaskFailed => row("task_failed", Error, 0),
-        }
-    }
-
+impl OperatorEvent {
     /// Its fixed name.
     pub const fn name(self) -> &'static str {
         self.row().name
     }
 
-    /// How grave it is.
-    pub const fn level(self) -> LogLevel {
+    /// Its severity.
+    pub const fn level(self) -> Level {
         self.row().level
     }
 
     /// At most one line this often about the same thing.
-    pub const fn throttle(self) -> Span {
+    pub const fn throttle(self) -> time::Span {
         self.row().every
     }
 
@@ -138,70 +217,129 @@ impl Event {
             _ => None,
         }
     }
-}
 
-const fn device_row(note: NoteKind) -> Row {
-    match note {
-        NoteKind::Garbled => row("device_garbled", Warn, 10),
-        NoteKind::StampsUnusable => row("camera_stamps_unusable", Warn, 10),
-        NoteKind::FrameDamaged => row("camera_frame_damaged", Warn, 5),
-        NoteKind::FormatDiffers => row("camera_format_differs", Warn, 0),
-        NoteKind::FramesMissed => row("camera_frames_missed", Warn, 5),
-        NoteKind::Configured => row("receiver_configured", Info, 0),
-        NoteKind::NotConfigured => row("receiver_not_configured", Warn, 0),
-        NoteKind::PlayedOut => row("recording_played_out", Info, 0),
+    /// Which row a `tracing` event comes from; `None` where a library emitted it.
+    pub fn of(metadata: &Metadata<'_>) -> Option<Self> {
+        let row = |name| Self::ALL.iter().copied().find(|event| event.name() == name);
+        (metadata.target() == TARGET).then(|| row(metadata.name()))?
+    }
+
+    /// Emits it now; `about` names what it is about (a source, a task, a peer), and is empty where that is the
+    /// daemon. The same event about the same thing is throttled.
+    pub fn emit(self, about: &str, words: impl Display) {
+        self.send(None, about, &words);
     }
 }
 
-const fn pipeline_row(notice: NoticeKind) -> Row {
-    let (level, every_s) = match notice {
-        NoticeKind::FixAcquired
-        | NoticeKind::SourceBack
-        | NoticeKind::DatumSet
-        | NoticeKind::Declination
-        | NoticeKind::TargetTracking => (Info, 0),
-        NoticeKind::TargetCoasting => (Info, 5),
-        NoticeKind::FixLost
-        | NoticeKind::SourceSilent
-        | NoticeKind::TerrainMissing
-        | NoticeKind::FilterReset
-        | NoticeKind::TargetLost => (Warn, 0),
-        NoticeKind::BytesRefused
-        | NoticeKind::FrameUnusable
-        | NoticeKind::Dropped
-        | NoticeKind::ClockJump => (Warn, 5),
-    };
-    row(notice.name(), level, every_s)
-}
-
-/// The pipeline's notice as a line; replay and daemon show it alike.
-pub fn line_of_notice(notice: &Notice) -> Line {
-    let event = Event::Pipeline(notice.kind);
-    let line = Line::new(notice.t, event.level(), event.name()).says(notice.detail.clone());
-    match notice.source {
-        Some(source) => line.with("about", source.name()),
-        None => line,
-    }
-}
-
-/// Holds back lines that come too often about the same thing.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Throttle {
-    last: Option<MonoTime>,
-    held: u64,
-}
-
-impl Throttle {
-    /// Whether a line may pass at `t`: how many were held back since the last that did; `None` where
-    /// this one is held back too.
-    pub fn pass(&mut self, t: MonoTime, every: Span) -> Option<u64> {
-        if every > Span::ZERO && self.last.is_some_and(|last| t - last < every) {
-            self.held += 1;
-            return None;
+impl From<NoteKind> for OperatorEvent {
+    fn from(note: NoteKind) -> Self {
+        match note {
+            NoteKind::Garbled => Self::DeviceGarbled,
+            NoteKind::StampsUnusable => Self::CameraStampsUnusable,
+            NoteKind::FrameDamaged => Self::CameraFrameDamaged,
+            NoteKind::FormatDiffers => Self::CameraFormatDiffers,
+            NoteKind::FramesMissed => Self::CameraFramesMissed,
+            NoteKind::Configured => Self::ReceiverConfigured,
+            NoteKind::NotConfigured => Self::ReceiverNotConfigured,
+            NoteKind::PlayedOut => Self::RecordingPlayedOut,
         }
-        self.last = Some(t);
-        Some(std::mem::take(&mut self.held))
     }
+}
+
+impl From<NoticeKind> for OperatorEvent {
+    fn from(notice: NoticeKind) -> Self {
+        match notice {
+            NoticeKind::FixAcquired => Self::FixAcquired,
+            NoticeKind::FixLost => Self::FixLost,
+            NoticeKind::SourceSilent => Self::SourceSilent,
+            NoticeKind::SourceBack => Self::SourceBack,
+            NoticeKind::BytesRefused => Self::BytesRefused,
+            NoticeKind::FrameUnusable => Self::FrameUnusable,
+            NoticeKind::Dropped => Self::Dropped,
+            NoticeKind::DatumSet => Self::DatumSet,
+            NoticeKind::TerrainMissing => Self::TerrainMissing,
+            NoticeKind::Declination => Self::Declination,
+            NoticeKind::TargetTracking => Self::TargetTracking,
+            NoticeKind::TargetCoasting => Self::TargetCoasting,
+            NoticeKind::TargetLost => Self::TargetLost,
+            NoticeKind::FilterReset => Self::FilterReset,
+            NoticeKind::ClockJump => Self::ClockJump,
+        }
+    }
+}
+
+impl From<&StoreNotice> for OperatorEvent {
+    fn from(notice: &StoreNotice) -> Self {
+        match notice {
+            StoreNotice::Started { .. } => Self::RecordingStarted,
+            StoreNotice::Stopped { .. } => Self::RecordingStopped,
+            StoreNotice::Resumed { .. } => Self::RecordingResumed,
+            StoreNotice::Named { .. } => Self::FlightNamed,
+            StoreNotice::Dropout { .. } => Self::RecordingDropout,
+            StoreNotice::AlmostFull { .. } => Self::CardAlmostFull,
+            StoreNotice::Sealed { .. } => Self::SegmentSealed,
+            StoreNotice::Deleted { .. } => Self::FlightDeleted,
+            StoreNotice::IndexRebuilding { .. } => Self::IndexRebuilding,
+            StoreNotice::IndexReady { .. } => Self::IndexReady,
+            StoreNotice::Failed { .. } => Self::StoreFailed,
+        }
+    }
+}
+
+/// Emits the pipeline's notice, at its own time; replay and daemon show it alike.
+pub fn notice(notice: &Notice) {
+    let about = notice.source.map(Source::name).or(notice.target.as_deref()).unwrap_or("");
+    OperatorEvent::from(notice.kind).send(Some(notice.t), about, &notice.detail);
+}
+
+/// Emits that the daemon has begun.
+pub fn started(config: &Path) {
+    let version = env!("CARGO_PKG_VERSION");
+    emit!(Started, { version, config = config.display().to_string() }, "");
+}
+
+/// Emits that a device does not deliver. The same fault of it is throttled; another one shows at once.
+pub fn device_down(about: &str, fault: &Fault) {
+    emit!(DeviceDown, { about, fault = fault.kind.name() }, "{fault}");
+}
+
+/// Emits the latencies of the whole flight.
+pub fn latencies(of: &OfFlight) {
+    emit!(
+        Latencies,
+        { frames = of.frames, p50_ms = of.p50.ms(), p99_ms = of.p99.ms(), max_ms = of.longest.ms() },
+        ""
+    );
+}
+
+/// Emits how many lines a sink of the log is short of.
+pub fn log_lines_lost(sink: &str, lines: u64) {
+    emit!(LogLinesLost, { about = sink, lines }, "the sink does not keep up");
+}
+
+/// The span around everything that a run of the daemon does; the flight becomes known later.
+pub fn run_span(began: MonoTime) -> Span {
+    let run = UtcTime::from_unix_ns(began.ns()).compact();
+    // Of the gravest severity, to be there whatever is shown.
+    tracing::error_span!(target: TARGET, "run", run, flight = Empty)
+}
+
+/// The flight that the card records from now on, for the span around the caller.
+pub fn flight(name: &str) {
+    Span::current().record("flight", name);
+}
+
+/// Decimals with which a field's figure is shown; those of a sigma are its figure's.
+pub fn decimals(field: &str) -> Option<usize> {
+    Some(match field.strip_suffix("_sigma").unwrap_or(field) {
+        "card_free_mb" | "cpu_pct" | "mem_mb" => 0,
+        "latency_p50_ms" | "latency_p99_ms" | "card_sync_p99_ms" | "temp_c" => 1,
+        "heading_deg" | "yaw_rate_dps" => 1,
+        "supply_v" | "north_m" | "east_m" | "speed_mps" | "p50_ms" | "p99_ms" | "max_ms" => 2,
+        rate if rate.ends_with("_hz") => 1,
+        age if age.ends_with("_age_s") => 2,
+        _ => return None,
+    })
 }
 
 #[cfg(test)]
@@ -210,59 +348,11 @@ mod tests {
 
     #[test]
     fn names_are_unique_and_searchable() {
-        let notes = [
-            NoteKind::Garbled,
-            NoteKind::StampsUnusable,
-            NoteKind::FrameDamaged,
-            NoteKind::FormatDiffers,
-            NoteKind::FramesMissed,
-            NoteKind::Configured,
-            NoteKind::NotConfigured,
-            NoteKind::PlayedOut,
-        ];
-        let plain = [
-            Event::Started,
-            Event::Ready,
-            Event::NotReady,
-            Event::Stopping,
-            Event::Stopped,
-            Event::Latencies,
-            Event::DeviceUp,
-            Event::DeviceDown,
-            Event::FlightClosed,
-            Event::LinkUp,
-            Event::LinkDown,
-            Event::LinkFault,
-            Event::PowerGoing,
-            Event::PowerBack,
-            Event::Hot,
-            Event::Reloaded,
-            Event::NeedsRestart,
-            Event::ReloadRefused,
-            Event::TaskSilent,
-            Event::TaskBack,
-            Event::TaskFailed,
-            Event::Pipeline(NoticeKind::Dropped),
-            Event::Pipeline(NoticeKind::FixLost),
-        ];
-        let events: Vec<Event> = plain.into_iter().chain(notes.into_iter().map(Event::Device)).collect();
-        let mut names: Vec<&str> = events.iter().map(|event| event.name()).collect();
+        let mut names: Vec<&str> = OperatorEvent::ALL.iter().map(|event| event.name()).collect();
         assert!(names.iter().all(|name| name.chars().all(|c| c.is_ascii_lowercase() || c == '_')));
         names.sort_unstable();
         let count = names.len();
         names.dedup();
         assert_eq!(names.len(), count);
-    }
-
-    #[test]
-    fn what_is_held_back_is_counted() {
-        let at = |ms: f64| MonoTime::from_ns(0) + Span::from_ms(ms);
-        let mut throttle = Throttle::default();
-        let every = Span::from_s(5.0);
-        assert_eq!(throttle.pass(at(0.0), every), Some(0));
-        assert_eq!(throttle.pass(at(100.0), every), None);
-        assert_eq!(throttle.pass(at(4_900.0), every), None);
-        assert_eq!(throttle.pass(at(5_000.0), every), Some(2));
-        assert_eq!(throttle.pass(at(5_000.0), Span::ZERO), Some(0));
     }
 }

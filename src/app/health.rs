@@ -1,11 +1,14 @@
 //! The health line: everything an operator wants to see, once a second, on one line.
 
-use crate::config::{Config, LogLevel};
+use tracing::Level;
+
+use crate::config::Config;
 use crate::io::records::DaemonFigures;
 use windhover_base::msg::{FixKind, Health, Source, SourceHealth, TargetHealth, TrackStatus};
 use windhover_base::time::Span;
 
-use super::log::{Line, Value};
+use super::callsite::RuntimeCallsite;
+use super::events::{OperatorEvent, TARGET};
 
 /// Figures that only a running daemon has.
 #[derive(Clone, PartialEq, Debug, Default)]
@@ -43,30 +46,27 @@ pub struct CardFigures {
     pub dropped: u64,
 }
 
-/// A figure by its name, and the decimals it is told with.
-type Number = (&'static str, Option<f64>, usize);
-
 impl Figures {
     /// Latency, card, computer, in this order; nothing where it is not known.
-    fn numbers(&self) -> [Number; 9] {
+    fn numbers(&self) -> [(&'static str, Option<f64>); 9] {
         let ms = |span: Option<Span>| span.map(|span| span.ms());
         let dropped = (self.card.dropped > 0).then_some(self.card.dropped as f64);
         [
-            ("latency_p50_ms", ms(self.latency_p50), 1),
-            ("latency_p99_ms", ms(self.latency_p99), 1),
-            ("card_free_mb", self.card.free_mb, 0),
-            ("card_sync_p99_ms", ms(self.card.sync_p99), 1),
-            ("card_dropped", dropped, 0),
-            ("temp_c", self.temperature_c, 1),
-            ("supply_v", self.voltage_v, 2),
-            ("cpu_pct", self.cpu_percent, 0),
-            ("mem_mb", self.memory_mb, 0),
+            ("latency_p50_ms", ms(self.latency_p50)),
+            ("latency_p99_ms", ms(self.latency_p99)),
+            ("card_free_mb", self.card.free_mb),
+            ("card_sync_p99_ms", ms(self.card.sync_p99)),
+            ("card_dropped", dropped),
+            ("temp_c", self.temperature_c),
+            ("supply_v", self.voltage_v),
+            ("cpu_pct", self.cpu_percent),
+            ("mem_mb", self.memory_mb),
         ]
     }
 
     /// As the flight's health messages have them: figures and words by name.
     pub fn by_name(&self) -> DaemonFigures {
-        let known = self.numbers().into_iter().filter_map(|(name, value, _)| Some((name.to_owned(), value?)));
+        let known = self.numbers().into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?)));
         let words = [("card", &self.card.state), ("link", &self.link)];
         let said = words.into_iter().filter(|(_, word)| !word.is_empty());
         DaemonFigures {
@@ -76,96 +76,150 @@ impl Figures {
     }
 }
 
-/// The health line; `figures` where a daemon runs, none in replay.
-pub fn line(health: &Health, config: &Config, figures: Option<&Figures>) -> Line {
-    let mut line = Line::new(health.t, level(health, figures), "health");
-    for of_source in &health.sources {
-        line = source(line, of_source);
-        if of_source.source == Source::Gps {
-            line = fix(line, health);
+/// A value of the health line.
+enum Value {
+    Time(i64),
+    Text(String),
+    Count(u64),
+    Figure(f64),
+}
+
+impl Value {
+    fn as_tracing(&self) -> &dyn tracing::Value {
+        match self {
+            Self::Time(ns) => ns,
+            Self::Text(text) => text,
+            Self::Count(count) => count,
+            Self::Figure(figure) => figure,
         }
     }
-    for (target, name) in health.targets.iter().zip(config.target.iter().map(|t| t.name.as_str())) {
-        line = of_target(line, name, target);
+}
+
+/// Fields in their order, each with its value where it has one.
+#[derive(Default)]
+struct Fields(Vec<(String, Option<Value>)>);
+
+impl Fields {
+    fn text(&mut self, name: &str, text: Option<&str>) {
+        self.0.push((name.to_owned(), text.map(|text| Value::Text(text.to_owned()))));
     }
-    line = line.count("dropped", health.sources.iter().map(|s| s.dropped).sum());
-    match figures {
-        Some(figures) => of_daemon(line, figures),
-        None => line,
+
+    fn count(&mut self, name: &str, count: Option<u64>) {
+        self.0.push((name.to_owned(), count.map(Value::Count)));
+    }
+
+    fn figure(&mut self, name: &str, figure: Option<f64>) {
+        self.0.push((name.to_owned(), figure.map(Value::Figure)));
+    }
+
+    /// A figure and its one-sigma, which is left out where it is not finite.
+    fn estimate(&mut self, name: &str, figure: Option<f64>, sigma: Option<f64>) {
+        self.figure(name, figure);
+        self.figure(&format!("{name}_sigma"), sigma.filter(|sigma| sigma.is_finite()));
+    }
+
+    /// Rate, and the age where there is one.
+    fn source(&mut self, health: &SourceHealth) {
+        let name = health.source.name();
+        self.figure(&format!("{name}_hz"), Some(health.rate_hz));
+        self.figure(&format!("{name}_age_s"), health.age.map(|age| age.s()));
+    }
+
+    fn target(&mut self, name: &str, target: Option<&TargetHealth>) {
+        self.text(name, target.map(|target| target.last.status.name()));
+        self.count(&format!("{name}_seen"), target.map(|target| u64::from(target.frames_seen)));
+        let last = target.map(|target| &target.last).filter(|last| last.status != TrackStatus::Lost);
+        let state = last.and_then(|last| last.state);
+        let sigma = |index: usize| Some(state?.covariance?[(index, index)].max(0.0).sqrt());
+        let degrees = |radians: Option<f64>| radians.map(f64::to_degrees);
+        let heading_deg = degrees(state.map(|s| s.heading_rad)).map(|heading| heading.rem_euclid(360.0));
+        self.estimate("north_m", state.map(|s| s.north_m), sigma(0));
+        self.estimate("east_m", state.map(|s| s.east_m), sigma(1));
+        self.estimate("heading_deg", heading_deg, degrees(sigma(2)));
+        self.estimate("speed_mps", state.map(|s| s.speed_mps), sigma(3));
+        self.estimate("yaw_rate_dps", degrees(state.map(|s| s.yaw_rate_radps)), degrees(sigma(4)));
+    }
+
+    fn daemon(&mut self, figures: &Figures) {
+        let word = |word: &'static str, text| (word, Some(text).filter(|text: &&String| !text.is_empty()));
+        let numbers = figures.numbers();
+        let (card, link) = (word("card", &figures.card.state), word("link", &figures.link));
+        self.numbers(&numbers[..2]);
+        self.text(card.0, card.1.map(String::as_str));
+        self.numbers(&numbers[2..5]);
+        self.text(link.0, link.1.map(String::as_str));
+        self.numbers(&numbers[5..]);
+    }
+
+    fn numbers(&mut self, numbers: &[(&str, Option<f64>)]) {
+        for (name, value) in numbers {
+            self.figure(name, *value);
+        }
     }
 }
 
-/// Normal flight is information; a silent source or a failing card is a warning.
-fn level(health: &Health, figures: Option<&Figures>) -> LogLevel {
-    let troubled = health.sources.iter().any(|source| source.rate_hz <= 0.0);
-    if troubled || figures.is_some_and(|f| f.warn) { LogLevel::Warn } else { LogLevel::Info }
+/// The health line, as an event whose fields hold the names of the targets.
+pub struct HealthLine {
+    targets: Vec<String>,
+    info: &'static RuntimeCallsite,
+    warn: &'static RuntimeCallsite,
 }
 
-fn fix(line: Line, health: &Health) -> Line {
+impl HealthLine {
+    /// Of these targets; made once.
+    pub fn new(config: &Config) -> Self {
+        Self::of(config.target.iter().map(|target| target.name.clone()).collect())
+    }
+
+    fn of(targets: Vec<String>) -> Self {
+        let all = fields(&Health::default(), &targets, Some(&Figures::default())).0;
+        let names: Vec<String> = all.into_iter().map(|(name, _)| name).collect();
+        let callsite = |level| RuntimeCallsite::new(OperatorEvent::Health.name(), TARGET, level, &names);
+        Self { targets, info: callsite(Level::INFO), warn: callsite(Level::WARN) }
+    }
+
+    /// Emits it, at its own time; `figures` where a daemon runs, none in replay. Normal flight is information; a
+    /// silent source or a failing card is a warning.
+    pub fn emit(&self, health: &Health, figures: Option<&Figures>) {
+        let troubled = health.sources.iter().any(|source| source.rate_hz <= 0.0);
+        let callsite = if troubled || figures.is_some_and(|f| f.warn) { self.warn } else { self.info };
+        let fields = fields(health, &self.targets, figures).0;
+        let values: Vec<_> = fields.iter().map(|(_, value)| value.as_ref().map(Value::as_tracing)).collect();
+        callsite.emit(&values);
+    }
+}
+
+/// The fields and their values; the fields are the same whatever the health is.
+fn fields(health: &Health, targets: &[String], figures: Option<&Figures>) -> Fields {
     let fix = match health.fix {
         FixKind::None => "none",
         FixKind::TwoD => "2d",
         FixKind::ThreeD => "3d",
     };
-    let line = line.with("fix", fix);
-    match health.sats {
-        Some(sats) => line.count("sats", u64::from(sats)),
-        None => line,
+    let mut fields = Fields::default();
+    fields.0.push(("t_ns".into(), Some(Value::Time(health.t.ns()))));
+    for &source in Source::ALL {
+        fields.source(&health.source(source));
+        if source == Source::Gps {
+            fields.text("fix", Some(fix));
+            fields.count("sats", health.sats.map(u64::from));
+        }
     }
-}
-
-/// Rate, and the age where there is one: `gps=5.0Hz/0.12s`.
-fn source(line: Line, health: &SourceHealth) -> Line {
-    let name = health.source.name();
-    let line = line.figure(format!("{name}_hz"), health.rate_hz, 1);
-    match health.age {
-        Some(age) => line.figure(format!("{name}_age_s"), age.s(), 2),
-        None => line,
+    for (number, name) in targets.iter().enumerate() {
+        fields.target(name, health.targets.get(number));
     }
-}
-
-fn of_target(line: Line, name: &str, target: &TargetHealth) -> Line {
-    let line = line
-        .with(name, target.last.status.name())
-        .count(format!("{name}_seen"), u64::from(target.frames_seen));
-    let Some(state) = target.last.state.filter(|_| target.last.status != TrackStatus::Lost) else {
-        return line;
-    };
-    let sigma = |index: usize| state.covariance.map_or(f64::NAN, |p| p[(index, index)].max(0.0).sqrt());
-    let estimate = |value: f64, sigma: f64, decimals| match sigma.is_finite() {
-        true => Value::Estimate(value, sigma, decimals),
-        false => Value::Figure(value, decimals),
-    };
-    let heading_deg = state.heading_rad.to_degrees().rem_euclid(360.0);
-    line.with("north_m", estimate(state.north_m, sigma(0), 2))
-        .with("east_m", estimate(state.east_m, sigma(1), 2))
-        .with("heading_deg", estimate(heading_deg, sigma(2).to_degrees(), 1))
-        .with("speed_mps", estimate(state.speed_mps, sigma(3), 2))
-        .with("yaw_rate_dps", estimate(state.yaw_rate_radps.to_degrees(), sigma(4).to_degrees(), 1))
-}
-
-fn of_daemon(mut line: Line, figures: &Figures) -> Line {
-    let told = |line: Line, numbers: &[Number]| {
-        numbers.iter().fold(line, |line, (name, value, decimals)| match value {
-            Some(value) => line.figure(*name, *value, *decimals),
-            None => line,
-        })
-    };
-    let numbers = figures.numbers();
-    line = told(line, &numbers[..2]);
-    if !figures.card.state.is_empty() {
-        line = line.with("card", figures.card.state.as_str());
+    fields.count("dropped", Some(health.sources.iter().map(|s| s.dropped).sum()));
+    if let Some(figures) = figures {
+        fields.daemon(figures);
     }
-    line = told(line, &numbers[2..5]);
-    if !figures.link.is_empty() {
-        line = line.with("link", figures.link.as_str());
-    }
-    told(line, &numbers[5..])
+    fields
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::app::log::tests::lines_of;
+    use windhover_base::msg::{TargetEstimate, TargetState};
 
     #[test]
     fn the_flight_gets_what_the_line_tells() {
@@ -175,28 +229,60 @@ mod tests {
         let numbers: Vec<(&str, f64)> = told.figures.iter().map(|(name, value)| (&**name, *value)).collect();
         assert_eq!(numbers, [("card_free_mb", 812.0), ("latency_p99_ms", 31.0)]);
         assert_eq!(told.words.iter().map(|(a, b)| (&**a, &**b)).collect::<Vec<_>>(), [("card", "ok")]);
-        let text = of_daemon(
-            Line::new(windhover_base::time::MonoTime::default(), LogLevel::Info, "health"),
-            &figures,
-        )
-        .text();
+        let line = HealthLine::new(&config());
+        let text = lines_of(|| line.emit(&Health::default(), Some(&figures)));
         assert!(text.contains("latency_p99_ms=31.0 card=ok card_free_mb=812"), "{text}");
+    }
+
+    fn config() -> Config {
+        Config::parse(include_str!("../../config/windhover.toml")).expect("valid")
     }
 
     #[test]
     fn a_silent_source_is_a_warning() {
-        let config =
-            crate::config::Config::parse(include_str!("../../config/windhover.toml")).expect("valid");
+        let line = HealthLine::new(&config());
         let age = Some(Span::from_ms(120.0));
         let up = |&source: &Source| SourceHealth { rate_hz: 5.0, age, ..SourceHealth::nothing_from(source) };
         let mut health = Health { sources: Source::ALL.iter().map(up).collect(), ..Health::default() };
-        let text = line(&health, &config, None);
-        assert_eq!(text.level, LogLevel::Info);
-        assert!(text.text().contains("gps_hz=5.0 gps_age_s=0.12 fix=none"), "{}", text.text());
+        let text = lines_of(|| line.emit(&health, None));
+        assert!(text.contains("level=info event=health gps_hz=5.0 gps_age_s=0.12 fix=none"), "{text}");
         health.sources[1].rate_hz = 0.0;
         let figures = Figures { link: "off".into(), temperature_c: Some(41.3), ..Figures::default() };
-        let text = line(&health, &config, Some(&figures));
-        assert_eq!(text.level, LogLevel::Warn);
-        assert!(text.text().contains("link=off temp_c=41.3"), "{}", text.text());
+        let text = lines_of(|| line.emit(&health, Some(&figures)));
+        assert!(text.contains("level=warn") && text.contains("link=off temp_c=41.3"), "{text}");
+    }
+
+    #[test]
+    fn every_target_has_its_figures_with_their_sigmas() {
+        let line = HealthLine::of(vec!["ugv".into(), "rover".into()]);
+        let state = TargetState {
+            north_m: 12.345,
+            east_m: 0.0,
+            heading_rad: -0.1,
+            speed_mps: 2.0,
+            yaw_rate_radps: 0.0,
+            lat_deg: 0.0,
+            lon_deg: 0.0,
+            covariance: Some(nalgebra::SMatrix::from_diagonal_element(0.0025)),
+        };
+        let target = |number| {
+            let last = TargetEstimate {
+                t_valid: Default::default(),
+                frame: 0,
+                target: number,
+                status: TrackStatus::Tracking,
+                state: Some(state),
+            };
+            TargetHealth { last, frames_seen: 15 }
+        };
+        let health = Health { targets: vec![target(0), target(1)], ..Health::default() };
+        let text = lines_of(|| line.emit(&health, None));
+        assert!(
+            text.contains(
+                "ugv=tracking ugv_seen=15 north_m=12.35±0.05 east_m=0.00±0.05 heading_deg=354.3±2.9"
+            ),
+            "{text}"
+        );
+        assert!(text.contains("rover=tracking rover_seen=15 north_m=12.35±0.05"), "{text}");
     }
 }

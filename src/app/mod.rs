@@ -1,5 +1,6 @@
 //! Wiring: configuration files, the task graph, supervision, the operator log, reports.
 
+mod callsite;
 pub mod card;
 pub mod config_file;
 pub mod context;

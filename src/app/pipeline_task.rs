@@ -10,9 +10,9 @@ use windhover_base::msg::{EstimatorOutput, Event, EventBody, Health, Output, Tar
 use windhover_base::time::{MonoTime, Span};
 
 use super::context::TaskContext;
-use super::events::{self, Event as OperatorEvent};
+use super::events::{self, OperatorEvent};
 use super::flight_store::{FlightStore, StoreOrders};
-use super::health;
+use super::health::HealthLine;
 use super::latencies::Latencies;
 use super::sink::{Outlets, Sink};
 use super::status::SharedStatus;
@@ -54,6 +54,7 @@ pub fn run(parts: Parts) {
         outlets,
         pipeline: Pipeline::with_terrain((&*config).into(), terrain),
         latencies: Latencies::default(),
+        health_line: HealthLine::new(&config),
         outputs: Vec::new(),
     };
     task.continue_from_earlier(&heart);
@@ -92,6 +93,7 @@ struct PipelineTask<'a> {
     outlets: Outlets<Box<dyn Sink>>,
     pipeline: Pipeline,
     latencies: Latencies,
+    health_line: HealthLine,
     outputs: Vec<TimedOutput>,
 }
 
@@ -102,16 +104,16 @@ impl PipelineTask<'_> {
         if !self.config.store.enabled {
             return;
         }
-        let tell = |words: String| self.context.log.tell(OperatorEvent::WarmStart, "", words);
+        let report = |words: String| OperatorEvent::WarmStart.emit("", words);
         match warm_start::wait_for(&self.flight_store, &self.origin, self.context, heart) {
             Earlier::Known(state, age) => {
-                tell(format!("continues from what was known {:.1} s ago", age.s()));
+                report(format!("continues from what was known {:.1} s ago", age.s()));
                 let body = EventBody::Warm(state);
                 let event = self.context.events.number(self.context.began, body);
                 self.handle(&event);
             }
-            Earlier::Unusable(stale) => tell(format!("what an earlier run knew is not used: {stale}")),
-            Earlier::NotTold(patience) => tell(format!(
+            Earlier::Unusable(stale) => report(format!("what an earlier run knew is not used: {stale}")),
+            Earlier::NotTold(patience) => report(format!(
                 "begins anew: the card did not tell within {:.0} s what an earlier run knew",
                 patience.s()
             )),
@@ -138,12 +140,7 @@ impl PipelineTask<'_> {
         self.pipeline.finish(&mut self.outputs);
         self.pass_on();
         if let Some(all) = self.latencies.of_flight() {
-            self.context.log.tell_with(OperatorEvent::Latencies, "", "", |line| {
-                line.count("frames", all.frames)
-                    .figure("p50_ms", all.p50.ms(), 2)
-                    .figure("p99_ms", all.p99.ms(), 2)
-                    .figure("max_ms", all.longest.ms(), 2)
-            });
+            events::latencies(&all);
         }
     }
 
@@ -152,14 +149,7 @@ impl PipelineTask<'_> {
         let outputs = std::mem::take(&mut self.outputs);
         for timed in &outputs {
             match &timed.output {
-                Output::Notice(notice) => {
-                    let about = notice.source.map_or("", windhover_base::msg::Source::name);
-                    let line = events::line_of_notice(notice);
-                    let event = OperatorEvent::Pipeline(notice.kind);
-                    // A target's notices tell its name in their words only.
-                    let key = if about.is_empty() { notice.detail.clone() } else { about.to_owned() };
-                    self.context.log.tell_keyed(notice.t, event, key, |_| line);
-                }
+                Output::Notice(notice) => events::notice(notice),
                 Output::Health(health) => self.health(health),
                 Output::Estimator(EstimatorOutput::Estimate(estimate)) => self.estimate(estimate),
                 _ => {}
@@ -185,7 +175,7 @@ impl PipelineTask<'_> {
             shown.figures.clone()
         });
         self.outlets.figures(figures.by_name());
-        self.context.log.write(health::line(health, self.config, Some(&figures)));
+        self.health_line.emit(health, Some(&figures));
         if let (Some(state), Some(store)) = (self.pipeline.warm_state(), self.flight_store.get()) {
             warm_start::save(&store, &self.origin, health.t, &state);
         }

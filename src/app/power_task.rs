@@ -6,7 +6,7 @@ use std::time::Duration;
 use tokio::sync::watch;
 
 use super::context::TaskContext;
-use super::events::Event;
+use super::events::{self, OperatorEvent};
 use super::supervise::Heart;
 use crate::config::PowerConfig;
 use crate::io::device::{Report, blocking};
@@ -57,9 +57,8 @@ pub fn parts(config: &PowerConfig) -> (PowerTask, PowerView) {
 pub async fn run(mut task: PowerTask, context: TaskContext, heart: Heart) {
     loop {
         let settings = task.settings.borrow_and_update().clone();
-        let watching = async {
-            tokio::join!(read(&settings, &task.supply, &heart), watch_line(&settings, &task.line, &context))
-        };
+        let watching =
+            async { tokio::join!(read(&settings, &task.supply, &heart), watch_line(&settings, &task.line)) };
         // What is dropped ends first: a line is given to one reader.
         tokio::select! {
             () = context.stop.cancelled() => return,
@@ -85,12 +84,12 @@ async fn read(settings: &PowerConfig, supply: &watch::Sender<Supply>, heart: &He
 }
 
 /// Watches the line for ever, where one is configured.
-async fn watch_line(settings: &PowerConfig, level: &watch::Sender<bool>, context: &TaskContext) {
+async fn watch_line(settings: &PowerConfig, level: &watch::Sender<bool>) {
     level.send_replace(false);
     let Some(line) = &settings.going_line else { return std::future::pending().await };
     let reports = |report| match report {
-        Report::Up(text) => context.log.tell(Event::DeviceUp, "power_line", text),
-        Report::Down(fault) => context.log.tell(Event::DeviceDown, "power_line", fault.to_string()),
+        Report::Up(text) => OperatorEvent::DeviceUp.emit("power_line", text),
+        Report::Down(fault) => events::device_down("power_line", &fault),
         _ => {}
     };
     let active = |active| {

@@ -4,10 +4,11 @@ use std::path::Path;
 use std::time::Duration;
 
 use tokio::runtime::Runtime;
+use tracing::Instrument as _;
 
 use super::config_file::{ConfigFileError, Loaded};
 use super::context::TaskContext;
-use super::events::Event;
+use super::events::{self, OperatorEvent};
 use super::log::{self, Log};
 use super::reload::Reloading;
 use super::signals::{Asked, Signals};
@@ -89,21 +90,16 @@ async fn daemon(path: &Path, signals: &mut Signals) -> Result<(), RunError> {
     let mut reloading = Reloading::new(path);
     let Some(loaded) = first_load(&mut reloading, signals).await? else { return Ok(()) };
     let clock = HostClock::start();
-    let (log, log_thread) = log::start(&loaded.config.log, clock);
-    report_panics(&log);
-    log.tell_with(Event::Started, "", "", |line| {
-        line.with("version", env!("CARGO_PKG_VERSION")).with("config", path.display().to_string())
-    });
-    let result = fly(loaded, reloading, signals, clock, &log).await;
-    log.tell(
-        Event::Stopped,
-        "",
-        match &result {
-            Ok(()) => "everything is written".to_owned(),
-            Err(error) => error.to_string(),
-        },
-    );
-    drop(log_thread);
+    let (log, log_end) = log::start(&loaded.config.log, clock);
+    report_panics();
+    events::started(path);
+    let result = fly(loaded, reloading, signals, clock, &log).instrument(events::run_span(clock.now())).await;
+    log.settle();
+    match &result {
+        Ok(()) => OperatorEvent::Stopped.emit("", "everything is written"),
+        Err(error) => OperatorEvent::Stopped.emit("", error),
+    }
+    drop(log_end);
     result
 }
 
@@ -129,11 +125,10 @@ async fn first_load(
 }
 
 /// A panic is reported with its place before it unwinds, unless it is caught.
-fn report_panics(log: &Log) {
-    let log = log.clone();
-    std::panic::set_hook(Box::new(move |panic| {
+fn report_panics() {
+    std::panic::set_hook(Box::new(|panic| {
         if !panics_are_caught() {
-            log.tell(Event::TaskFailed, &running_task(), panic.to_string());
+            OperatorEvent::TaskFailed.emit(&running_task(), panic);
         }
     }));
 }
@@ -147,8 +142,8 @@ async fn fly(
     log: &Log,
 ) -> Result<(), RunError> {
     let config = loaded.config.clone();
-    let Graph { context, status, orders, power, mut tasks } = topology::start(loaded, clock, log)?;
-    let mut watch = Watch::new(config, context.clone(), status, orders, power);
+    let Graph { context, status, orders, power, mut tasks } = topology::start(loaded, clock)?;
+    let mut watch = Watch::new(config, context.clone(), log.clone(), (status, orders, power));
     let mut round = tokio::time::interval(ROUND);
     round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     let (why, result) = loop {
@@ -161,7 +156,7 @@ async fn fly(
                 }
             },
             task = tasks.ended() => {
-                log.tell(Event::TaskFailed, task, "ended by itself");
+                OperatorEvent::TaskFailed.emit(task, "ended by itself");
                 break ("a task failed", Err(RunError::TaskFailed(task)));
             }
             news = watch.power_news() => watch.power(news),
@@ -176,7 +171,7 @@ async fn fly(
 /// Ends the tasks: devices first, then what waits is handled, then the card is flushed; whether it was.
 async fn end(tasks: &mut Supervisor, context: &TaskContext, why: &str) -> bool {
     ServiceManager.stopping(&format!("stopping: {why}"));
-    context.log.tell(Event::Stopping, "", why);
+    OperatorEvent::Stopping.emit("", why);
     context.stop.cancel();
     context.events.wake();
     let mut late = tasks.join(ENDING).await;
@@ -184,7 +179,7 @@ async fn end(tasks: &mut Supervisor, context: &TaskContext, why: &str) -> bool {
         late = tasks.join(WRITING).await;
     }
     for task in &late {
-        context.log.tell(Event::TaskSilent, task, "did not end in time");
+        OperatorEvent::TaskSilent.emit(task, "did not end in time");
     }
     !late.contains(&topology::STORE.name)
 }

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use tokio::sync::oneshot;
 use tokio::task::JoinSet;
+use tracing::Instrument as _;
 
 use crate::io::clock::HostClock;
 use windhover_base::time::{MonoTime, Span};
@@ -129,9 +130,10 @@ impl Supervisor {
         let beating = heart.clone();
         // Dropped when the body returns and when it panics.
         let (running, ended) = oneshot::channel::<()>();
+        let span = tracing::Span::current();
         std::thread::Builder::new().name(rule.name.to_owned()).spawn(move || {
             let _running = running;
-            body(beating);
+            span.in_scope(|| body(beating));
         })?;
         self.keep(rule, heart, async move {
             let _ = ended.await;
@@ -140,7 +142,7 @@ impl Supervisor {
     }
 
     fn keep(&mut self, rule: TaskRule, heart: Heart, task: impl Future<Output = ()> + Send + 'static) {
-        let id = self.running.spawn(task).id();
+        let id = self.running.spawn(task.in_current_span()).id();
         self.tasks.push(Task { rule, heart, id });
     }
 

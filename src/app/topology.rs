@@ -27,7 +27,7 @@
 //! | pipeline | computes for milliseconds a frame. Ends the process where it fails: a filter in an unknown state is not repaired |
 //! | store-encode | computes JPEG |
 //! | store-write, store-keep, index | `fdatasync` and directory calls block as long as the card does |
-//! | log | a terminal, a pipe or a disk can stall |
+//! | log, one for each sink | a terminal, a pipe, a journal or a disk can stall |
 //! | recording | reads image files where the camera is a recording; it stands in for the driver |
 //! | runtime's threads for blocking work, 32 at most | open and close devices (a UART drains, a camera ends its stream); read configuration, terrain, keys and sysfs; thumbnails; back-fill from the card; start and stop the store |
 //!
@@ -42,7 +42,7 @@
 //! | store | see `io::store` | what does not fit is dropped and counted; the pipeline never waits |
 //! | link | see `io::link` | the oldest estimate goes first; what was missed is sent later |
 //! | power to health, power to store, store to link | the newest value | a newer value replaces it |
-//! | log | see `app::log` | the line is dropped and counted |
+//! | log, each sink | 512 lines | the line is dropped and counted |
 //!
 //! Every task beats its heart at least once a second while it works; the watchdog is stroked only while
 //! all do. A panic in any task ends the process, and the service manager starts it again. The end is a
@@ -62,7 +62,6 @@ use super::devices;
 use super::downlink::{self, Downlink, LinkTask};
 use super::event_queue::EventQueue;
 use super::flight_store::{FlightStore, StoreOrders};
-use super::log::Log;
 use super::outlets;
 use super::pipeline_task::{self, Parts};
 use super::power_task::{self, PowerView};
@@ -102,13 +101,12 @@ pub struct Graph {
 }
 
 /// Starts every task.
-pub fn start(loaded: Loaded, clock: HostClock, log: &Log) -> std::io::Result<Graph> {
+pub fn start(loaded: Loaded, clock: HostClock) -> std::io::Result<Graph> {
     let (config, terrain) = (Arc::new(loaded.config), loaded.terrain);
     let context = TaskContext {
         clock,
         began: clock.now(),
         stop: CancellationToken::new(),
-        log: log.clone(),
         presence: Presence::default(),
         events: Arc::new(EventQueue::new(config.daemon.frame_queue)),
     };

@@ -4,8 +4,9 @@ use std::collections::BTreeSet;
 
 use super::config_file::ConfigFileError;
 use super::context::TaskContext;
-use super::events::Event;
+use super::events::OperatorEvent;
 use super::flight_store::StoreOrders;
+use super::log::Log;
 use super::power_task::{PowerView, Supply};
 use super::presence::Presence;
 use super::reload;
@@ -25,6 +26,7 @@ pub(super) struct Watch {
     status: SharedStatus,
     orders: StoreOrders,
     power: PowerView,
+    log: Log,
     ready: bool,
     missing: String,
     silent: BTreeSet<&'static str>,
@@ -51,12 +53,12 @@ impl Watch {
     pub(super) fn new(
         config: Config,
         context: TaskContext,
-        status: SharedStatus,
-        orders: StoreOrders,
-        power: PowerView,
+        log: Log,
+        (status, orders, power): (SharedStatus, StoreOrders, PowerView),
     ) -> Self {
         Self {
             context,
+            log,
             status,
             orders,
             power,
@@ -81,18 +83,17 @@ impl Watch {
     }
 
     fn all_answer(&mut self, tasks: &Supervisor) -> bool {
-        let log = &self.context.log;
         let limit = Span::from_s(self.config.daemon.answer_within_s);
         let silences = tasks.silent(limit);
         for (name, silence) in &silences {
             self.silent.insert(name);
-            log.tell(Event::TaskSilent, name, format!("has not answered for {:.1} s", silence.s()));
+            OperatorEvent::TaskSilent.emit(name, format!("has not answered for {:.1} s", silence.s()));
         }
         let back: Vec<&str> =
             self.silent.iter().copied().filter(|name| silences.iter().all(|(s, _)| s != name)).collect();
         for name in back {
             self.silent.remove(name);
-            log.tell(Event::TaskBack, name, "answers again");
+            OperatorEvent::TaskBack.emit(name, "answers again");
         }
         silences.is_empty()
     }
@@ -104,11 +105,11 @@ impl Watch {
         if missing.is_empty() && estimating {
             if !std::mem::replace(&mut self.ready, true) {
                 let after = context.clock.now() - context.began;
-                context.log.tell(Event::Ready, "", format!("after {:.1} s", after.s()));
+                OperatorEvent::Ready.emit("", format!("after {:.1} s", after.s()));
                 ServiceManager.ready("ready");
             }
         } else if !self.ready && missing != self.missing && context.clock.now() - context.began > SETTLING {
-            context.log.tell(Event::NotReady, "", format!("waiting: {missing}"));
+            OperatorEvent::NotReady.emit("", format!("waiting: {missing}"));
         } else {
             return;
         }
@@ -150,9 +151,9 @@ impl Watch {
         };
         match state {
             PowerState::Going => {
-                self.context.log.tell(Event::PowerGoing, "", format!("{what}: closing the segment"));
+                OperatorEvent::PowerGoing.emit("", format!("{what}: closing the segment"));
             }
-            PowerState::Good => self.context.log.tell(Event::PowerBack, "", what),
+            PowerState::Good => OperatorEvent::PowerBack.emit("", what),
         }
     }
 
@@ -177,8 +178,9 @@ impl Watch {
         });
         if hot && let Some(celsius) = reading.temperature_c {
             let limit = self.config.power.hot_c;
-            self.context.log.tell(Event::Hot, "", format!("{celsius:.1} °C; limit {limit:.0}"));
+            OperatorEvent::Hot.emit("", format!("{celsius:.1} °C; limit {limit:.0}"));
         }
+        self.log.report_losses();
         self.show_status();
     }
 
@@ -202,26 +204,25 @@ impl Watch {
     /// A configuration is being read again.
     pub(super) fn reloading(&self) {
         ServiceManager.reloading();
-        self.context.log.reopen();
+        self.log.reopen();
     }
 
     /// The configuration was read again: what can change changes, the rest is reported.
     pub(super) fn reload(&mut self, read: Result<Config, ConfigFileError>) {
-        let log = &self.context.log;
         match read {
-            Err(error) => log.tell(Event::ReloadRefused, "", format!("{error}; the old one stays")),
+            Err(error) => OperatorEvent::ReloadRefused.emit("", format!("{error}; the old one stays")),
             Ok(read) => {
                 let told = reload::differences(&self.config, &read);
                 let changes = match told.now.as_slice() {
                     [] => "nothing that can change in flight has changed".to_owned(),
                     changes => changes.join(", "),
                 };
-                log.tell(Event::Reloaded, "", changes);
+                OperatorEvent::Reloaded.emit("", changes);
                 if !told.restart.is_empty() {
-                    log.tell(Event::NeedsRestart, "", told.restart.join(", "));
+                    OperatorEvent::NeedsRestart.emit("", told.restart.join(", "));
                 }
                 self.config = reload::merged(&self.config, &read);
-                log.set_level(self.config.log.level);
+                self.log.set_level(self.config.log.level);
                 self.power_watch = power_watch(&self.config.power);
                 self.power.settings.send_replace(self.config.power.clone());
             }

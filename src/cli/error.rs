@@ -3,6 +3,8 @@
 use std::fmt::Display;
 use std::process::ExitCode;
 
+use crate::app::log::last_words;
+
 /// Done.
 pub const DONE: u8 = 0;
 /// Tried and failed.
@@ -50,7 +52,7 @@ pub(super) fn exit_code(result: CliResult) -> ExitCode {
     match result {
         Ok(()) => ExitCode::from(DONE),
         Err(error) => {
-            eprintln!("windhover: {}", error.message);
+            last_words(&format!("windhover: {}", error.message));
             ExitCode::from(error.code)
         }
     }

@@ -6,6 +6,8 @@ use std::path::PathBuf;
 
 use super::{CliError, CliResult};
 use crate::app::ground::{self, GroundSettings};
+use crate::app::log;
+use crate::io::clock::HostClock;
 use crate::io::link::StationSettings;
 use crate::io::link::tls::KeyFiles;
 
@@ -105,6 +107,7 @@ pub(super) fn run(args: &Args) -> CliResult {
         zenoh: args.zenoh.clone(),
         terminal: std::io::stdout().is_terminal(),
     };
+    let _log = log::start_plain(HostClock::start());
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     runtime.block_on(async {
         let stop = tokio::sync::watch::Sender::new(false);

@@ -1,13 +1,15 @@
 //! `windhover replay CAPTURE [--config FILE] [--out FLIGHT] [--realtime]`
 
+use std::io::Write;
 use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{CliError, CliResult};
+use crate::app::health::HealthLine;
 use crate::app::replay::{self, ReplayError, ReplayStep};
-use crate::app::{config_file, events, health};
-use crate::config::Config;
+use crate::app::{config_file, events, log};
+use crate::io::clock::HostClock;
 use windhover_base::msg::Output;
 
 /// Run a recorded capture or flight through the pipeline that flies: the same bytes and frames give
@@ -46,6 +48,10 @@ pub(super) fn run(args: &Args) -> CliResult {
         return Err(CliError::usage("--out names the capture itself; a replay never writes over its source"));
     }
     let bar = progress_bar();
+    let health_line = args.log.then(|| {
+        log::start_direct(AboveBar(bar.clone()), HostClock::start());
+        HealthLine::new(&config)
+    });
     let summary =
         replay::replay(&args.capture, &config, args.out.as_deref(), args.realtime, &mut |step| match step {
             ReplayStep::Progress(done, total) => {
@@ -54,10 +60,8 @@ pub(super) fn run(args: &Args) -> CliResult {
             }
             ReplayStep::Warning(words) => bar.suspend(|| eprintln!("windhover: {words}")),
             ReplayStep::Output(output) => {
-                if args.log
-                    && let Some(line) = log_line(output, &config)
-                {
-                    bar.suspend(|| eprintln!("{line}"));
+                if let Some(health) = &health_line {
+                    log_output(output, health);
                 }
             }
         })?;
@@ -76,11 +80,24 @@ pub(super) fn run(args: &Args) -> CliResult {
 }
 
 /// The line an operator would tail, if the output makes one.
-fn log_line(output: &Output, config: &Config) -> Option<String> {
+fn log_output(output: &Output, health_line: &HealthLine) {
     match output {
-        Output::Notice(notice) => Some(events::line_of_notice(notice).text()),
-        Output::Health(now) => Some(health::line(now, config, None).text()),
-        _ => None,
+        Output::Notice(notice) => events::notice(notice),
+        Output::Health(now) => health_line.emit(now, None),
+        _ => {}
+    }
+}
+
+/// Standard error, above the bar.
+struct AboveBar(ProgressBar);
+
+impl Write for AboveBar {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.suspend(|| std::io::stderr().write(bytes))
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
     }
 }
 

@@ -213,7 +213,8 @@ impl Monitor {
             }
             _ => return,
         };
-        out.push(notice(t, kind, None, detail));
+        let target = Some(name.clone());
+        out.push(Output::Notice(Notice { t, kind, source: None, target, detail }));
     }
 
     /// What became of a measurement.
@@ -224,7 +225,7 @@ impl Monitor {
 
 /// A notice as an output.
 pub(super) fn notice(t: MonoTime, kind: NoticeKind, source: Option<Source>, detail: String) -> Output {
-    Output::Notice(Notice { t, kind, source, detail })
+    Output::Notice(Notice { t, kind, source, target: None, detail })
 }
 
 #[cfg(test)]

@@ -282,22 +282,33 @@ impl Daemon {
         Self::start_under(config, log, None)
     }
 
-    /// The same under a service manager that listens on a socket.
+    /// Under a service manager that listens on a socket.
     pub fn start_under(config: &Path, log: &Path, manager: Option<&Path>) -> Self {
         let file = File::options().create(true).append(true).open(log).expect("a log");
+        Self::start_with(config, Stdio::from(file), log, manager)
+    }
+
+    /// With another standard error than the log that is waited for.
+    pub fn start_with(config: &Path, stderr: Stdio, log: &Path, manager: Option<&Path>) -> Self {
         let child = Command::new(env!("CARGO_BIN_EXE_windhover"))
             .args(["run", "--config"])
             .arg(config)
             .envs(manager.map(|socket| ("NOTIFY_SOCKET", socket)))
             .stdin(Stdio::null())
-            .stderr(file)
+            .stderr(stderr)
             .spawn()
             .expect("started");
+        Self::of(child, log)
+    }
+
+    /// A process that runs, and its log.
+    pub fn of(child: Child, log: &Path) -> Self {
         Self { child, log: log.to_owned(), clock: HostClock::start() }
     }
 
+    /// Its log so far; empty before the first line.
     pub fn log(&self) -> String {
-        std::fs::read_to_string(&self.log).expect("a log")
+        std::fs::read_to_string(&self.log).unwrap_or_default()
     }
 
     /// The first line after `skip` lines that holds all of `words`, and how many lines came before

@@ -3,6 +3,7 @@
 
 mod devices;
 mod harness;
+mod log;
 mod signals;
 mod warm;
 

@@ -47,7 +47,7 @@ const NARROW_SHIFT: f64 = 0.1;
 
 /// Error that neighbouring cells leave on all edges of one direction alike, their shift being fitted: pixels, at a
 /// blur of one pixel and one pixel a cell (it grows with the square of the blur and falls with the cube of the cell),
-/// and a share of the shift. Measured on generated tags.
+/// and a share of the shift. From generated tags: `proof_of_what_neighbouring_cells_leave`.
 const NEIGHBOURS: f64 = 1.2;
 const SHIFT_ERROR: f64 = 0.3;
 
@@ -62,7 +62,7 @@ const LEAST_STEP_PX: f64 = 0.005;
 
 /// Share of the edges between a tag's cells that are seen where the fit is right. Where fewer are and windows reach
 /// from cell to cell, edges were taken for their neighbours: blur is wider than a cell then, and corners are wrong
-/// by so much of one, measured on generated tags.
+/// by so much of one (the same proof).
 const ENOUGH_SEEN: f64 = 0.93;
 const MISTAKEN: f64 = 0.25;
 
@@ -96,12 +96,8 @@ impl Refiner {
         let cell = f64::from(edge) / family.width as f64;
         let mut model = Model::of_corners(corners)?;
         self.edges.place(family, id, cell);
-        let half = 0.5 * f64::from(edge);
-        let shift = NARROW_SHIFT * cell;
-        let (bow, barrel) = (LENS_CURVATURE * half.powi(2) / 2.0, LENS_BARREL * half.powi(3));
-        let twist = LENS_TWIST * half.powi(2);
-        let (covariance, windows) =
-            self.fit(image, &mut model, family.width, [bow, bow, barrel, twist, twist, shift, shift])?;
+        let held = held(0.5 * f64::from(edge), cell);
+        let (covariance, windows) = self.fit(image, &mut model, family.width, held)?;
         let (pitches, blurs) = (model.pitches(family.width), windows.blurs_squared());
         let seen = self.count() as f64 / self.edges.count() as f64;
         let mistaken = if seen < ENOUGH_SEEN && cell < WIDEST_CELL { MISTAKEN } else { 0.0 };
@@ -280,6 +276,14 @@ impl Refiner {
     }
 }
 
+/// Sigmas by which the parameters after the homography's are held near nought, for a tag of so long a half side and cells
+/// so wide, pixels.
+fn held(half: f64, cell: f64) -> [f64; HELD] {
+    let (bow, barrel) = (LENS_CURVATURE * half.powi(2) / 2.0, LENS_BARREL * half.powi(3));
+    let (twist, shift) = (LENS_TWIST * half.powi(2), NARROW_SHIFT * cell);
+    [bow, bow, barrel, twist, twist, shift, shift]
+}
+
 /// One step of the fit.
 struct Solved {
     step: Row,
@@ -288,3 +292,6 @@ struct Solved {
     holds: [f64; HELD],
     flattening: f64,
 }
+
+#[cfg(test)]
+mod tests;

@@ -20,7 +20,7 @@ pub(super) struct Refined {
 }
 
 /// What stays of an edge's error when noise is averaged away: sampling, neighbouring cells, print. Pixels.
-const FLOOR_PX: f64 = 0.02;
+pub(super) const FLOOR_PX: f64 = 0.02;
 
 /// Homography in ξ, η (row by row, last entry 1), the bow, the barrel, the twist and the shifts of edges.
 #[derive(Clone, Copy, Debug)]

@@ -14,6 +14,7 @@ pub mod foxglove;
 #[cfg(feature = "zenoh")]
 mod history;
 pub mod mirror;
+mod terminal;
 pub mod view;
 pub mod web;
 
@@ -25,12 +26,14 @@ use std::time::Duration;
 use tokio::io::AsyncWriteExt as _;
 use tokio::sync::{broadcast, mpsc, watch};
 
+use crate::app::events::OperatorEvent;
 use crate::io::clock::HostClock;
 use crate::io::link::{
     Arrival, FromPayload, LinkError, LinkEvent, StationHandle, StationLink, StationSettings,
 };
 use foxglove::Scope;
 use mirror::{Mirror, MirrorError};
+use terminal::Terminal;
 use view::View;
 use web::Web;
 
@@ -143,13 +146,15 @@ fn random_token() -> Option<String> {
 
 /// Runs a station until `stop` says so.
 pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Result<(), GroundError> {
+    let shown = Terminal::start(settings.terminal);
+    let terminal = shown.terminal();
     let mirror = Mirror::at(&settings.out)?;
     let root = settings.out.clone();
     let recall =
         Arc::new(move |payload: &str, flight: &str, run: u32| mirror::recall(&root, payload, flight, run));
     let (link, handle, records, events) = StationLink::open(&settings.link, recall)?;
     if settings.link.listen.is_some() {
-        println!("payloads may call {}", link.local_addr()?);
+        terminal.line(format_args!("payloads may call {}", link.local_addr()?));
     }
     let view = Arc::new(Mutex::new(View::default()));
     let live = broadcast::Sender::new(PAGE_QUEUE);
@@ -157,7 +162,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     let tokens = Tokens::of(&settings)?;
     if let Some(address) = settings.web {
         let listener = listen(address).await?;
-        println!("page at http://{}/{}", listener.local_addr()?, tokens.asked(address));
+        terminal.line(format_args!("page at http://{}/{}", listener.local_addr()?, tokens.asked(address)));
         let (view, live, tiles) = (Arc::clone(&view), live.clone(), settings.tiles.clone());
         let token = tokens.at(address);
         tasks.spawn(async move { web::serve(listener, Web { view, live, tiles, token }).await });
@@ -165,13 +170,13 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     let scope = settings.foxglove.map(|_| Scope::default());
     if let (Some(address), Some(scope)) = (settings.foxglove, scope.clone()) {
         let listener = listen(address).await?;
-        println!("Foxglove at ws://{}/{}", listener.local_addr()?, tokens.asked(address));
+        terminal.line(format_args!("Foxglove at ws://{}/{}", listener.local_addr()?, tokens.asked(address)));
         let token = tokens.at(address);
         tasks.spawn(foxglove::serve(listener, foxglove::Server { scope, token }));
     }
     if let Some(address) = settings.nmea {
         let listener = listen(address).await?;
-        println!("NMEA at tcp://{}", listener.local_addr()?);
+        terminal.line(format_args!("NMEA at tcp://{}", listener.local_addr()?));
         tasks.spawn(serve_nmea(listener, Arc::clone(&view)));
     }
     let (to_disk, from_link) = std::sync::mpsc::sync_channel(DISK_QUEUE);
@@ -184,7 +189,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
         }
     })?;
     let linked = tokio::spawn(link.run(stop));
-    tasks.spawn(report(handle, Arc::clone(&view), live.clone(), settings.terminal));
+    tasks.spawn(report(handle, Arc::clone(&view), live.clone(), terminal.clone()));
     tasks.spawn(tell(events, Arc::clone(&view), live.clone()));
     let ended = watch::Sender::new(false);
     #[cfg(feature = "zenoh")]
@@ -321,11 +326,11 @@ async fn report(
     handle: StationHandle,
     view: Arc<Mutex<View>>,
     live: broadcast::Sender<Arc<str>>,
-    terminal: bool,
+    terminal: Terminal,
 ) -> std::io::Result<()> {
     let mut tick = tokio::time::interval(Duration::from_secs(1));
     tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
-    let (mut last, mut printed) = (tokio::time::Instant::now(), 0);
+    let mut last = tokio::time::Instant::now();
     loop {
         tick.tick().await;
         let status = handle.status();
@@ -336,15 +341,11 @@ async fn report(
             (message, status.iter().map(|s| view.line(s)).collect::<Vec<_>>())
         };
         let _ = live.send(message);
-        let up = if terminal && printed > 0 { format!("\x1b[{printed}A") } else { String::new() };
-        let clear = if terminal { "\x1b[K" } else { "" };
-        printed = lines.len();
-        let text: String = lines.iter().map(|line| format!("{line}{clear}\n")).collect();
-        print!("{up}{text}");
+        terminal.status(&lines);
     }
 }
 
-/// What the operator may want to know, on standard error and on the pages.
+/// What the operator may want to know, in the log and on the pages.
 async fn tell(
     mut events: mpsc::Receiver<LinkEvent>,
     view: Arc<Mutex<View>>,
@@ -352,20 +353,23 @@ async fn tell(
 ) -> std::io::Result<()> {
     let clock = HostClock::start();
     while let Some(event) = events.recv().await {
-        let (peer, level, text) = match &event {
-            LinkEvent::Up { peer, address } => (Some(peer), 2, format!("connected from {address}")),
-            LinkEvent::Down { peer, why } => (Some(peer), 3, format!("disconnected: {why}")),
+        use crate::io::proto::foxglove::log::Level;
+        use OperatorEvent::{LinkDown, LinkFault, LinkUp, Reloaded};
+        let (of, peer, text) = match &event {
+            LinkEvent::Up { peer, address } => (LinkUp, peer.as_str(), format!("connected from {address}")),
+            LinkEvent::Down { peer, why } => (LinkDown, peer.as_str(), format!("disconnected: {why}")),
             LinkEvent::Refused { address, why, unreported } => {
                 let more = if *unreported > 0 { format!(" ({unreported} more)") } else { String::new() };
-                (None, 4, format!("{address}: {why}{more}"))
+                (LinkFault, "", format!("{address}: {why}{more}"))
             }
-            LinkEvent::KeysReloaded => (None, 2, "keys read again".into()),
-            LinkEvent::KeysUnusable { why } => (None, 4, format!("keys changed and not usable: {why}")),
-            LinkEvent::Unresolved { address, why } => (None, 3, format!("{address}: {why}")),
+            LinkEvent::KeysReloaded => (Reloaded, "", "keys read again".into()),
+            LinkEvent::KeysUnusable { why } => (LinkFault, "", format!("keys changed and not usable: {why}")),
+            LinkEvent::Unresolved { address, why } => (LinkFault, "", format!("{address}: {why}")),
         };
-        eprintln!("{}{text}", peer.map_or_else(String::new, |peer| format!("{peer}: ")));
-        if let Some(peer) = peer {
-            let _ = live.send(lock(&view).remark(peer, clock.now(), level, &text));
+        of.emit(peer, &text);
+        if !peer.is_empty() {
+            let level = if of == LinkUp { Level::Info } else { Level::Warning };
+            let _ = live.send(lock(&view).remark(peer, clock.now(), level as u32, &text));
         }
     }
     Ok(())

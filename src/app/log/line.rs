@@ -1,105 +1,132 @@
-//! One line of the operator's log, and how it looks as text, as JSON and in the journal.
+//! One line of the operator's log, made of a `tracing` event, and how it looks as logfmt and as JSON.
 
-use std::fmt::Write as _;
+use std::fmt::{Debug, Write as _};
 
+use tracing::field::{Field, Visit};
+use tracing::{Event, Metadata, Subscriber};
+use tracing_log::NormalizeEvent as _;
+use tracing_subscriber::layer::Context;
+use tracing_subscriber::registry::LookupSpan;
+
+use super::span::SpanFields;
+use super::throttle;
+use crate::app::events::{self, OperatorEvent, TARGET};
 use crate::config::LogLevel;
+use crate::io::clock::HostClock;
 use windhover_base::time::{MonoTime, UtcTime};
+
+/// The event's name of what libraries emit.
+const LIBRARY: &str = "library";
 
 /// A value of a field.
 #[derive(Clone, PartialEq, Debug)]
-pub enum Value {
+pub(super) enum Value {
     /// Words.
     Text(String),
     /// A whole number.
     Count(i64),
-    /// A figure, shown with so many decimals.
-    Figure(f64, usize),
-    /// A figure with its one-sigma, shown as `12.34±0.05`; two fields in JSON and the journal.
-    Estimate(f64, f64, usize),
+    /// A figure.
+    Figure(f64),
 }
 
-impl From<&str> for Value {
-    fn from(text: &str) -> Self {
-        Self::Text(text.to_owned())
-    }
-}
-
-impl From<String> for Value {
-    fn from(text: String) -> Self {
-        Self::Text(text)
-    }
-}
+/// A field by its name.
+pub(super) type NamedValue = (&'static str, Value);
 
 /// One line: when, how grave, the event's fixed name, words for people, and fields.
 #[derive(Clone, PartialEq, Debug)]
-pub struct Line {
+pub(super) struct Line {
     /// When, host time; shown as UTC.
-    pub t: MonoTime,
-    /// How grave.
-    pub level: LogLevel,
+    pub(super) t: MonoTime,
+    /// Its severity.
+    pub(super) level: LogLevel,
     /// Fixed name of the event.
-    pub event: &'static str,
+    pub(super) event: &'static str,
     /// Words for people; may be empty.
-    pub message: String,
+    pub(super) message: String,
     /// Fields in the order they are shown.
-    pub fields: Vec<(String, Value)>,
+    pub(super) fields: Vec<NamedValue>,
+    /// Fields of the spans around it (run, flight): in JSON and the journal.
+    pub(super) context: Vec<NamedValue>,
 }
 
 impl Line {
+    /// What an event says, in its context.
+    pub(super) fn of<S>(event: &Event<'_>, context: &Context<'_, S>, clock: HostClock) -> Self
+    where
+        S: Subscriber + for<'span> LookupSpan<'span>,
+    {
+        let mut said = Fields::default();
+        event.record(&mut said);
+        let mut line = Self::new(clock.now(), LogLevel::Info, LIBRARY);
+        line.message = said.message;
+        if let Some(row) = OperatorEvent::of(event.metadata()) {
+            let passed = throttle::passed();
+            line.event = row.name();
+            line.level = level(event.metadata(), true);
+            line.t = said.t.or_else(|| passed.map(|passed| passed.t)).unwrap_or(line.t);
+            line.fields = said.values;
+            if let Some(held) = passed.map(|passed| passed.held).filter(|held| *held > 0) {
+                line.fields.push(("more_like_it", count(held)));
+            }
+        } else {
+            // What comes through the `log` crate carries its own target.
+            let normal = event.normalized_metadata();
+            let metadata = normal.as_ref().unwrap_or_else(|| event.metadata());
+            line.level = level(metadata, metadata.target().starts_with(TARGET));
+            line.fields.push(("about", Value::Text(metadata.target().to_owned())));
+            line.fields.extend(said.values);
+        }
+        for span in context.event_scope(event).into_iter().flat_map(|scope| scope.from_root()) {
+            if let Some(fields) = span.extensions().get::<SpanFields>() {
+                line.context.extend(fields.0.iter().cloned());
+            }
+        }
+        line
+    }
+
     /// A line without words and fields.
-    pub const fn new(t: MonoTime, level: LogLevel, event: &'static str) -> Self {
-        Self { t, level, event, message: String::new(), fields: Vec::new() }
-    }
-
-    /// With words for people.
-    #[must_use]
-    pub fn says(mut self, message: impl Into<String>) -> Self {
-        self.message = message.into();
-        self
-    }
-
-    /// With one more field.
-    #[must_use]
-    pub fn with(mut self, name: impl Into<String>, value: impl Into<Value>) -> Self {
-        self.fields.push((name.into(), value.into()));
-        self
-    }
-
-    /// With one more figure.
-    #[must_use]
-    pub fn figure(self, name: impl Into<String>, value: f64, decimals: usize) -> Self {
-        self.with(name, Value::Figure(value, decimals))
-    }
-
-    /// With one more whole number.
-    #[must_use]
-    pub fn count(self, name: impl Into<String>, value: u64) -> Self {
-        self.with(name, Value::Count(i64::try_from(value).unwrap_or(i64::MAX)))
+    pub(super) const fn new(t: MonoTime, level: LogLevel, event: &'static str) -> Self {
+        Self { t, level, event, message: String::new(), fields: Vec::new(), context: Vec::new() }
     }
 
     /// logfmt with time and severity: `time=… level=info event=… msg="…" key=value …`.
-    pub fn text(&self) -> String {
+    pub(super) fn text(&self) -> String {
         format!("time={} level={} event={}", self.utc(), self.level.name(), self.logfmt())
     }
 
-    /// The event's name, words and fields in logfmt; time and severity are left to the journal.
-    pub fn logfmt(&self) -> String {
+    /// The event's name, words and fields in logfmt; time and severity are left to the journal. A figure and its
+    /// one-sigma are one word: `12.34±0.05`.
+    pub(super) fn logfmt(&self) -> String {
         let mut out = self.event.to_owned();
         if !self.message.is_empty() {
             out.push_str(" msg=");
             put_word(&mut out, &self.message);
         }
+        let mut before = "";
         for (name, value) in &self.fields {
-            out.push(' ');
-            out.push_str(name);
-            out.push('=');
-            put_word(&mut out, &shown(value));
+            let sigma = name.strip_suffix("_sigma").is_some_and(|figure| figure == before);
+            if sigma {
+                out.push('±');
+            } else {
+                out.push(' ');
+                out.push_str(name);
+                out.push('=');
+            }
+            put_word(&mut out, &shown(name, value));
+            before = name;
         }
         out
     }
 
+    /// For people at a terminal: what it is about, and the words.
+    pub(super) fn plain(&self) -> String {
+        let about = self.fields.iter().find(|(name, _)| *name == "about");
+        let about = about.map(|(name, value)| shown(name, value) + ": ").unwrap_or_default();
+        about + &self.message
+    }
+
     /// One JSON object.
-    pub fn json(&self) -> String {
+    pub(super) fn json(&self) -> String {
         let mut object = serde_json::Map::new();
         object.insert("time".into(), self.utc().to_string().into());
         object.insert("level".into(), self.level.name().into());
@@ -107,62 +134,100 @@ impl Line {
         if !self.message.is_empty() {
             object.insert("msg".into(), self.message.clone().into());
         }
-        for (name, value) in self.plain_fields() {
-            object.insert(name, value);
+        for (name, value) in self.context.iter().chain(&self.fields) {
+            object.insert((*name).to_owned(), plain_value(name, value));
         }
         serde_json::Value::Object(object).to_string()
-    }
-
-    /// A datagram of the journal's native protocol: `MESSAGE`, `PRIORITY`, `SYSLOG_IDENTIFIER`,
-    /// `WINDHOVER_EVENT`, and each field as `WINDHOVER_NAME`.
-    /// Source: systemd, "Native Journal Protocol".
-    pub fn journal(&self) -> Vec<u8> {
-        let mut out = Vec::with_capacity(512);
-        put_journal_field(&mut out, "MESSAGE", &self.logfmt());
-        put_journal_field(&mut out, "PRIORITY", priority(self.level));
-        put_journal_field(&mut out, "SYSLOG_IDENTIFIER", "windhover");
-        put_journal_field(&mut out, "WINDHOVER_EVENT", self.event);
-        for (name, value) in self.plain_fields() {
-            let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
-            put_journal_field(&mut out, &journal_name(&name), &text);
-        }
-        out
     }
 
     fn utc(&self) -> UtcTime {
         UtcTime::from_unix_ns(self.t.ns())
     }
+}
 
-    /// Fields as plain values: an estimate becomes two.
-    fn plain_fields(&self) -> Vec<(String, serde_json::Value)> {
-        let mut out = Vec::with_capacity(self.fields.len());
-        for (name, value) in &self.fields {
-            match value {
-                Value::Text(text) => out.push((name.clone(), text.clone().into())),
-                Value::Count(count) => out.push((name.clone(), (*count).into())),
-                Value::Figure(figure, decimals) => out.push((name.clone(), rounded(*figure, *decimals))),
-                Value::Estimate(figure, sigma, decimals) => {
-                    out.push((name.clone(), rounded(*figure, *decimals)));
-                    out.push((format!("{name}_sigma"), rounded(*sigma, *decimals)));
-                }
-            }
-        }
-        out
+/// Libraries talk more than operators want to read: their information is our debugging.
+fn level(metadata: &Metadata<'_>, ours: bool) -> LogLevel {
+    use tracing::Level;
+    match *metadata.level() {
+        Level::ERROR if ours => LogLevel::Error,
+        Level::ERROR | Level::WARN => LogLevel::Warn,
+        Level::INFO if ours => LogLevel::Info,
+        Level::INFO => LogLevel::Debug,
+        Level::DEBUG if ours => LogLevel::Debug,
+        Level::DEBUG | Level::TRACE => LogLevel::Trace,
     }
 }
 
-fn shown(value: &Value) -> String {
+/// The fields of an event or a span as they come.
+#[derive(Default)]
+pub(super) struct Fields {
+    /// The words.
+    pub(super) message: String,
+    /// A time of its own.
+    pub(super) t: Option<MonoTime>,
+    /// Everything else.
+    pub(super) values: Vec<NamedValue>,
+}
+
+impl Fields {
+    fn put(&mut self, field: &Field, value: Value) {
+        match (field.name(), value) {
+            ("message", Value::Text(words)) => self.message = words,
+            ("t_ns", Value::Count(ns)) => self.t = Some(MonoTime::from_ns(ns)),
+            // Where in its source a message of the `log` crate comes from.
+            (name, _) if name.starts_with("log.") => {}
+            (name, value) => self.values.push((name, value)),
+        }
+    }
+}
+
+fn count(value: u64) -> Value {
+    Value::Count(i64::try_from(value).unwrap_or(i64::MAX))
+}
+
+impl Visit for Fields {
+    fn record_f64(&mut self, field: &Field, value: f64) {
+        self.put(field, Value::Figure(value));
+    }
+
+    fn record_i64(&mut self, field: &Field, value: i64) {
+        self.put(field, Value::Count(value));
+    }
+
+    fn record_u64(&mut self, field: &Field, value: u64) {
+        self.put(field, count(value));
+    }
+
+    fn record_str(&mut self, field: &Field, value: &str) {
+        self.put(field, Value::Text(value.to_owned()));
+    }
+
+    fn record_debug(&mut self, field: &Field, value: &dyn Debug) {
+        self.put(field, Value::Text(format!("{value:?}")));
+    }
+}
+
+/// A value as text, a figure with its field's decimals.
+pub(super) fn shown(name: &str, value: &Value) -> String {
     match value {
         Value::Text(text) => text.clone(),
         Value::Count(count) => count.to_string(),
-        Value::Figure(figure, decimals) => format!("{figure:.decimals$}"),
-        Value::Estimate(figure, sigma, decimals) => format!("{figure:.decimals$}±{sigma:.decimals$}"),
+        Value::Figure(figure) => match events::decimals(name) {
+            Some(decimals) => format!("{figure:.decimals$}"),
+            None => figure.to_string(),
+        },
     }
 }
 
-/// A number as JSON with so many decimals; null where it is not finite.
-fn rounded(figure: f64, decimals: usize) -> serde_json::Value {
-    format!("{figure:.decimals$}").parse::<f64>().ok().map_or(serde_json::Value::Null, Into::into)
+/// A value in JSON; null where a figure is not finite.
+fn plain_value(name: &str, value: &Value) -> serde_json::Value {
+    match value {
+        Value::Text(text) => text.clone().into(),
+        Value::Count(count) => (*count).into(),
+        Value::Figure(_) => {
+            shown(name, value).parse::<f64>().ok().map_or(serde_json::Value::Null, Into::into)
+        }
+    }
 }
 
 /// A logfmt word: bare where it can be, else quoted with `"` and `\` escaped and line ends as `\n`.
@@ -189,45 +254,23 @@ fn put_word(out: &mut String, text: &str) {
     out.push('"');
 }
 
-/// syslog's priorities, as the journal takes them.
-const fn priority(level: LogLevel) -> &'static str {
-    match level {
-        LogLevel::Error => "3",
-        LogLevel::Warn => "4",
-        LogLevel::Info => "6",
-        LogLevel::Debug | LogLevel::Trace => "7",
-    }
-}
-
-/// Upper case, and nothing but letters, digits and underscores.
-fn journal_name(name: &str) -> String {
-    let clean = name.chars().map(|c| if c.is_ascii_alphanumeric() { c.to_ascii_uppercase() } else { '_' });
-    "WINDHOVER_".chars().chain(clean).collect()
-}
-
-fn put_journal_field(out: &mut Vec<u8>, name: &str, value: &str) {
-    out.extend_from_slice(name.as_bytes());
-    if value.contains('\n') {
-        out.push(b'\n');
-        out.extend_from_slice(&(value.len() as u64).to_le_bytes());
-    } else {
-        out.push(b'=');
-    }
-    out.extend_from_slice(value.as_bytes());
-    out.push(b'\n');
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     fn line() -> Line {
-        Line::new(MonoTime::from_ns(1_795_014_245_501_000_000), LogLevel::Info, "device_up")
-            .says("ready \"now\"\nor later")
-            .with("source", "gps")
-            .with("north_m", Value::Estimate(12.345, 0.054, 2))
-            .figure("temp_c", 41.26, 1)
-            .count("drops", 3)
+        Line {
+            message: "ready \"now\"\nor later".into(),
+            fields: vec![
+                ("source", Value::Text("gps".into())),
+                ("north_m", Value::Figure(12.345)),
+                ("north_m_sigma", Value::Figure(0.054)),
+                ("temp_c", Value::Figure(41.26)),
+                ("drops", Value::Count(3)),
+            ],
+            context: vec![("run", Value::Count(7))],
+            ..Line::new(MonoTime::from_ns(1_795_014_245_501_000_000), LogLevel::Info, "device_up")
+        }
     }
 
     #[test]
@@ -237,27 +280,12 @@ mod tests {
     }
 
     #[test]
-    fn json_has_numbers() {
+    fn json_has_numbers_and_the_context() {
         let object: serde_json::Value = serde_json::from_str(&line().json()).expect("JSON");
         assert_eq!(object["event"], "device_up");
         assert_eq!(object["north_m_sigma"], 0.05);
         assert_eq!(object["drops"], 3);
+        assert_eq!(object["run"], 7);
         assert_eq!(object["msg"], "ready \"now\"\nor later");
-    }
-
-    #[test]
-    fn journal_fields_are_framed() {
-        let datagram = String::from_utf8(line().journal()).expect("UTF-8");
-        for part in [
-            "PRIORITY=6\n",
-            "WINDHOVER_EVENT=device_up\n",
-            "WINDHOVER_TEMP_C=41.3\n",
-            "WINDHOVER_SOURCE=gps\n",
-        ] {
-            assert!(datagram.contains(part), "{datagram}");
-        }
-        let mut framed = Vec::new();
-        put_journal_field(&mut framed, "MESSAGE", "a\nb");
-        assert_eq!(framed, b"MESSAGE\n\x03\0\0\0\0\0\0\0a\nb\n");
     }
 }

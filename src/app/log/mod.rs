@@ -1,149 +1,333 @@
-//! The operator's log: one bounded queue, one thread that writes, and a level that can change.
+//! The operator's log: the program's one `tracing` subscriber.
+//!
+//! ```text
+//! app::events, app::health, libraries ─► throttle ─► level ─┬─► queue ─► standard error or journal
+//!                                                           └─► queue ─► file
+//! ```
+//!
+//! Each sink is a layer with a queue and a thread of its own. A sink that is stuck loses its own lines, counted, and
+//! holds up neither the others nor the end of the program.
 
-mod bridge;
+mod file;
+mod journal;
 mod line;
+mod queue;
 mod sink;
+mod span;
+mod stream;
+mod throttle;
 
-pub use line::{Line, Value};
+pub use queue::{Queue, QueueEnd, queue};
+pub use stream::{Stream, last_words};
 
-use std::collections::HashMap;
-use std::sync::atomic::{AtomicU8, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
-use std::thread::JoinHandle;
+use std::io::Write;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
 
-use super::events::{Event, Throttle};
-use crate::config::{LogConfig, LogLevel};
+use tracing::Subscriber;
+use tracing::level_filters::LevelFilter;
+use tracing_log::AsLog as _;
+use tracing_subscriber::filter::{Targets, filter_fn};
+use tracing_subscriber::layer::{Layer as _, SubscriberExt as _};
+use tracing_subscriber::{Registry, reload};
+
+use self::file::RotatingFile;
+use self::journal::Journal;
+use self::sink::{Format, JournalWriter, Sink, Way};
+use self::span::KeepSpanFields;
+use self::throttle::Throttle;
+use super::events::{self, TARGET};
+use crate::config::{LogConfig, LogFormat, LogLevel};
 use crate::io::clock::HostClock;
-use sink::Sinks;
-use windhover_base::time::MonoTime;
+use windhover_base::time::Span;
 
-/// Lines that wait to be written; when one more comes it is dropped and counted, so that a terminal
-/// or disk that stalls holds nobody up.
-const WAITING: usize = 512;
+/// Longest that the sinks get, twice, at the end to write what waits; one that takes longer is left behind. Together
+/// less than what tasks and card leave of the unit's `TimeoutStopSec`.
+const ENDING: Span = Span::from_ns(400_000_000);
 
-enum Job {
-    Write(Box<Line>),
-    Reopen,
-    End,
-}
+/// What is shown, to be changed.
+type Level = reload::Handle<Targets, Registry>;
 
-/// A handle on the log. Copies write to the same one.
+/// A handle on the log. Copies are the same.
 #[derive(Clone)]
 pub struct Log {
-    queue: SyncSender<Job>,
-    level: Arc<AtomicU8>,
-    lost: Arc<std::sync::atomic::AtomicU64>,
-    throttles: Arc<Mutex<HashMap<(Event, String), Throttle>>>,
+    level: Level,
+    reopen: Arc<AtomicBool>,
+    queues: Vec<Queue>,
     clock: HostClock,
 }
 
-/// Ends the log when dropped: everything said is written first.
-pub struct LogThread {
-    queue: SyncSender<Job>,
-    thread: Option<JoinHandle<()>>,
+/// Ends the log when dropped: what is not stuck is written first.
+pub struct LogEnd {
+    log: Log,
+    /// Dropped after the wait.
+    _ends: Vec<QueueEnd>,
 }
 
-/// Starts the log.
-pub fn start(config: &LogConfig, clock: HostClock) -> (Log, LogThread) {
-    let (queue, jobs) = sync_channel(WAITING);
-    let sinks = Sinks::new(config);
-    let thread = std::thread::Builder::new().name("log".into()).spawn(move || write(&jobs, sinks)).ok();
-    let log = Log {
-        queue: queue.clone(),
-        level: Arc::new(AtomicU8::new(config.level as u8)),
-        lost: Arc::default(),
-        throttles: Arc::default(),
-        clock,
+/// Starts the daemon's log: throttled, to standard error or the journal, and to a file where one is configured.
+pub fn start(config: &LogConfig, clock: HostClock) -> (Log, LogEnd) {
+    let reopen = Arc::new(AtomicBool::new(false));
+    let (screen, end) = screen(config.format);
+    let format = if config.format == LogFormat::Json { Format::Json } else { Format::Text };
+    let (mut queues, mut ends) = (vec![screen], vec![end]);
+    if let Some(path) = &config.file {
+        let limit_bytes = (config.file_mb * 1e6) as u64;
+        let file = RotatingFile::new(Path::new(path), limit_bytes, config.files_kept, reopen.clone());
+        let (queue, end) = queue("file", file);
+        queues.push((format, queue));
+        ends.push(end);
+    }
+    let sink =
+        |(format, queue): &(Format, Queue)| Sink { format: *format, way: Way::Queue(queue.clone()), clock };
+    let level = install(queues.iter().map(sink).collect(), config.level, Some(Throttle::new(clock)));
+    let queues = queues.into_iter().map(|(_, queue)| queue).collect();
+    let log = Log { level, reopen, queues, clock };
+    (log.clone(), LogEnd { log, _ends: ends })
+}
+
+/// Starts the log of a command for people: words alone, on standard error.
+pub fn start_plain(clock: HostClock) -> LogEnd {
+    let (queue, end) = queue("stderr", Stream::Error);
+    let sink = Sink { format: Format::Plain, way: Way::Queue(queue.clone()), clock };
+    let level = install(vec![sink], LogLevel::Info, None);
+    LogEnd { log: Log { level, reopen: Arc::default(), queues: vec![queue], clock }, _ends: vec![end] }
+}
+
+/// Starts the log of a command that prints lines as it goes, and waits for who reads them.
+pub fn start_direct(writer: impl Write + Send + 'static, clock: HostClock) {
+    let sink = Sink { format: Format::Text, way: Way::Direct(Mutex::new(Box::new(writer))), clock };
+    install(vec![sink], LogLevel::Info, None);
+}
+
+/// The sink that standard error stands for.
+fn screen(format: LogFormat) -> ((Format, Queue), QueueEnd) {
+    let wanted = match format {
+        LogFormat::Journal => true,
+        LogFormat::Auto => journal::is_stderr(),
+        LogFormat::Text | LogFormat::Json => false,
     };
-    bridge::install(log.clone());
-    (log, LogThread { queue, thread })
+    if let Some(journal) = wanted.then(|| Journal::open().ok()).flatten() {
+        let (queue, end) = queue("journal", JournalWriter(journal));
+        return ((Format::Journal, queue), end);
+    }
+    let (queue, end) = queue("stderr", Stream::Error);
+    ((if format == LogFormat::Json { Format::Json } else { Format::Text }, queue), end)
 }
 
-fn write(jobs: &Receiver<Job>, mut sinks: Sinks) {
-    while let Ok(job) = jobs.recv() {
-        match job {
-            Job::Write(line) => sinks.write(&line),
-            Job::Reopen => sinks.reopen(),
-            Job::End => return,
-        }
+/// Makes the layers the subscriber of this process; later calls change nothing.
+fn install(sinks: Vec<Sink>, level: LogLevel, throttle: Option<Throttle>) -> Level {
+    let (layers, handle) = layers(sinks, level, throttle);
+    let _ = tracing::subscriber::set_global_default(layers);
+    // Libraries that speak through the `log` crate.
+    let _ = tracing_log::LogTracer::init();
+    tracing_log::log::set_max_level(shown(level).1.as_log());
+    handle
+}
+
+/// The throttle before the level: a row that ends another does so where it is not shown, too.
+fn layers(
+    sinks: Vec<Sink>,
+    level: LogLevel,
+    throttle: Option<Throttle>,
+) -> (impl Subscriber + Send + Sync, Level) {
+    let (filter, handle) = reload::Layer::new(targets(level));
+    let ours = || filter_fn(|metadata| metadata.target() == TARGET);
+    let layers = tracing_subscriber::registry()
+        .with(sinks.with_filter(filter))
+        .with(throttle.map(|throttle| throttle.with_filter(ours())))
+        .with(KeepSpanFields.with_filter(ours()));
+    (layers, handle)
+}
+
+/// What is shown at a level: of ours that severity and graver, of libraries one step less, and nothing of theirs where
+/// only errors are asked for.
+const fn shown(level: LogLevel) -> (LevelFilter, LevelFilter) {
+    match level {
+        LogLevel::Error => (LevelFilter::ERROR, LevelFilter::OFF),
+        LogLevel::Warn => (LevelFilter::WARN, LevelFilter::WARN),
+        LogLevel::Info => (LevelFilter::INFO, LevelFilter::WARN),
+        LogLevel::Debug => (LevelFilter::DEBUG, LevelFilter::INFO),
+        LogLevel::Trace => (LevelFilter::TRACE, LevelFilter::TRACE),
     }
 }
 
-impl Drop for LogThread {
-    fn drop(&mut self) {
-        let _ = self.queue.send(Job::End);
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
-    }
+fn targets(level: LogLevel) -> Targets {
+    let (ours, libraries) = shown(level);
+    Targets::new().with_default(libraries).with_target(TARGET, ours)
 }
 
 impl Log {
-    /// Whether lines of this severity are shown.
-    pub fn shows(&self, level: LogLevel) -> bool {
-        level as u8 <= self.level.load(Ordering::Relaxed)
-    }
-
     /// From now on shows lines of this severity and graver.
     pub fn set_level(&self, level: LogLevel) {
-        self.level.store(level as u8, Ordering::Relaxed);
+        // The subscriber lives as long as the process.
+        let _ = self.level.reload(targets(level));
+        tracing_log::log::set_max_level(shown(level).1.as_log());
     }
 
-    /// Opens the log file anew.
+    /// Opens the log file anew with its next line.
     pub fn reopen(&self) {
-        let _ = self.queue.try_send(Job::Reopen);
+        self.reopen.store(true, Ordering::Release);
     }
 
-    /// Lines lost because they came faster than they could be written.
-    pub fn lost(&self) -> u64 {
-        self.lost.load(Ordering::Relaxed)
-    }
-
-    /// Writes a line as it is.
-    pub fn write(&self, line: Line) {
-        if self.shows(line.level) && self.queue.try_send(Job::Write(Box::new(line))).is_err() {
-            self.lost.fetch_add(1, Ordering::Relaxed);
+    /// Emits how many lines each sink lost since this was last called, where any were.
+    pub fn report_losses(&self) {
+        for queue in &self.queues {
+            match queue.newly_lost() {
+                0 => {}
+                lines => events::log_lines_lost(queue.name(), lines),
+            }
         }
     }
 
-    /// Tells of an operator event now, unless its throttle holds it back; `about` is what it is about
-    /// (a source, a task), throttled apart.
-    pub fn tell(&self, event: Event, about: &str, message: impl Into<String>) {
-        self.tell_with(event, about, message, |line| line);
+    /// Waits a moment for what waits to be written, and emits what sinks that are stuck are short of.
+    pub fn settle(&self) {
+        let limit = self.clock.now() + ENDING;
+        let waiting: Vec<u64> = self.queues.iter().map(|queue| queue.drain(self.clock, limit)).collect();
+        for (queue, waiting) in self.queues.iter().zip(waiting) {
+            match waiting + queue.newly_lost() {
+                0 => {}
+                lines => events::log_lines_lost(queue.name(), lines),
+            }
+        }
+    }
+}
+
+impl Drop for LogEnd {
+    fn drop(&mut self) {
+        let limit = self.log.clock.now() + ENDING;
+        for queue in &self.log.queues {
+            queue.drain(self.log.clock, limit);
+        }
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use windhover_base::msg::{Notice, NoticeKind};
+    use windhover_base::time::MonoTime;
+
+    /// A writer whose text can be read.
+    #[derive(Clone, Default)]
+    struct Text(Arc<Mutex<Vec<u8>>>);
+
+    impl Text {
+        fn take(&self) -> String {
+            let bytes = std::mem::take(&mut *self.0.lock().expect("not poisoned"));
+            String::from_utf8(bytes).expect("UTF-8")
+        }
     }
 
-    /// As [`Self::tell`], with more fields.
-    pub fn tell_with(
-        &self,
-        event: Event,
-        about: &str,
-        message: impl Into<String>,
-        fields: impl FnOnce(Line) -> Line,
-    ) {
-        let about = about.to_owned();
-        self.tell_keyed(self.clock.now(), event, about.clone(), |line| {
-            let line = line.says(message);
-            fields(if about.is_empty() { line } else { line.with("about", about) })
+    impl Write for Text {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            self.0.lock().expect("not poisoned").write(bytes)
+        }
+
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    fn sink(format: Format, text: &Text, clock: HostClock) -> Sink {
+        Sink { format, way: Way::Direct(Mutex::new(Box::new(text.clone()))), clock }
+    }
+
+    /// The lines of logfmt that `emit` makes, without a throttle.
+    pub(in crate::app) fn lines_of(emit: impl FnOnce()) -> String {
+        let (text, clock) = (Text::default(), HostClock::start());
+        let (layers, _) = layers(vec![sink(Format::Text, &text, clock)], LogLevel::Info, None);
+        tracing::subscriber::with_default(layers, emit);
+        text.take()
+    }
+
+    #[test]
+    fn every_sink_gets_the_same_line_and_what_was_held_back_is_counted() {
+        let (first, second, clock) = (Text::default(), Text::default(), HostClock::start());
+        let sinks = vec![sink(Format::Text, &first, clock), sink(Format::Text, &second, clock)];
+        let (layers, _) = layers(sinks, LogLevel::Info, Some(Throttle::new(clock)));
+        tracing::subscriber::with_default(layers, || {
+            for s in [0, 1, 6] {
+                events::notice(&Notice {
+                    t: MonoTime::from_ns(1_795_014_245_501_000_000) + Span::from_s(f64::from(s)),
+                    kind: NoticeKind::FrameUnusable,
+                    source: Some(windhover_base::msg::Source::Camera),
+                    target: None,
+                    detail: "too short".into(),
+                });
+            }
+            events::OperatorEvent::Ready.emit("", "after 1.0 s");
+        });
+        let text = first.take();
+        let lines: Vec<&str> = text.lines().collect();
+        let line =
+            "time=2026-11-18T15:04:05.501Z level=warn event=frame_unusable msg=\"too short\" about=camera";
+        assert_eq!(lines[0], line);
+        assert!(lines[1].starts_with("time=2026-11-18T15:04:11.501Z"), "{text}");
+        assert!(lines[1].ends_with("about=camera more_like_it=1"), "{text}");
+        assert!(
+            lines[2].ends_with("level=info event=ready msg=\"after 1.0 s\"") && lines.len() == 3,
+            "{text}"
+        );
+        assert_eq!(second.take(), text, "the time is the same, too");
+    }
+
+    #[test]
+    fn the_level_changes_and_a_hidden_event_still_ends_another() {
+        let (text, clock) = (Text::default(), HostClock::start());
+        let sinks = vec![sink(Format::Text, &text, clock)];
+        let (layers, level) = layers(sinks, LogLevel::Warn, Some(Throttle::new(clock)));
+        tracing::subscriber::with_default(layers, || {
+            use crate::io::device::{Fault, FaultKind};
+            let fault = Fault::new(FaultKind::Missing, "/dev/gps", "not there");
+            events::device_down("gps", &fault);
+            events::device_down("gps", &fault);
+            events::OperatorEvent::DeviceUp.emit("gps", "open");
+            events::device_down("gps", &fault);
+            let down = "level=warn event=device_down msg=\"/dev/gps: not there\" about=gps fault=missing";
+            let lines = text.take();
+            assert_eq!(lines.lines().filter(|line| line.ends_with(down)).count(), 2, "{lines}");
+            assert_eq!(lines.lines().count(), 2, "{lines}");
+            level.reload(targets(LogLevel::Info)).expect("the subscriber lives");
+            events::OperatorEvent::DeviceUp.emit("gps", "open");
+            assert!(text.take().ends_with("level=info event=device_up msg=open about=gps\n"));
         });
     }
 
-    /// Tells of an operator event at a time of its own; lines of the same event and `key`, which begins with what
-    /// they are about, are throttled together.
-    pub fn tell_keyed(&self, t: MonoTime, event: Event, key: String, fields: impl FnOnce(Line) -> Line) {
-        let held = {
-            let mut throttles = self.throttles.lock().unwrap_or_else(PoisonError::into_inner);
-            if let Some(over) = event.ends() {
-                throttles.retain(|(held, about), _| *held != over || !about.starts_with(&key));
-            }
-            let throttle = throttles.entry((event, key)).or_default();
-            throttle.pass(t, event.throttle())
-        };
-        let Some(held) = held else { return };
-        let mut line = fields(Line::new(t, event.level(), event.name()));
-        if held > 0 {
-            line = line.count("more_like_it", held);
-        }
-        self.write(line);
+    #[test]
+    fn libraries_speak_through_the_same_subscriber_and_one_step_lower() {
+        let _ = tracing_log::LogTracer::init();
+        let text = lines_of(|| {
+            tracing::error!(target: "quinn::endpoint", port = 5, "no socket");
+            tracing_log::log::warn!(target: "sled::pagecache", "page of {} bytes", 7);
+            tracing::info!(target: "quinn", "not for operators");
+        });
+        let lines: Vec<&str> = text.lines().map(|line| line.split_once(' ').expect("a time").1).collect();
+        assert_eq!(
+            lines,
+            [
+                "level=warn event=library msg=\"no socket\" about=quinn::endpoint port=5",
+                "level=warn event=library msg=\"page of 7 bytes\" about=sled::pagecache",
+            ]
+        );
+    }
+
+    #[test]
+    fn spans_carry_run_and_flight_to_who_asks_for_fields() {
+        let (text, json, clock) = (Text::default(), Text::default(), HostClock::start());
+        let sinks = vec![sink(Format::Text, &text, clock), sink(Format::Json, &json, clock)];
+        let (layers, _) = layers(sinks, LogLevel::Error, None);
+        tracing::subscriber::with_default(layers, || {
+            let run = events::run_span(MonoTime::from_ns(1_795_014_245_501_000_000));
+            run.in_scope(|| {
+                events::flight("boot-7");
+                events::flight("20261118T150407Z");
+                events::OperatorEvent::TaskFailed.emit("gps", "ended by itself");
+            });
+        });
+        assert!(text.take().ends_with("level=error event=task_failed msg=\"ended by itself\" about=gps\n"));
+        let object: serde_json::Value = serde_json::from_str(&json.take()).expect("one object");
+        assert_eq!(object["run"], "20261118T150405Z");
+        assert_eq!(object["flight"], "20261118T150407Z");
     }
 }

@@ -1,187 +1,89 @@
-//! Where lines go: standard error, the journal, a file that is put aside when it is large.
+//! A sink: the layer that renders events as lines and hands them to a queue of its own, or to a writer.
 
-use std::fs::{File, OpenOptions};
-use std::io::{self, Write};
-use std::os::fd::AsFd;
-use std::os::unix::net::UnixDatagram;
-use std::path::{Path, PathBuf};
+use std::io::Write;
+use std::sync::{Mutex, PoisonError};
 
+use tracing::{Event, Subscriber};
+use tracing_subscriber::layer::{Context, Layer};
+use tracing_subscriber::registry::LookupSpan;
+
+use super::journal::{self, Journal};
 use super::line::Line;
-use crate::config::{LogConfig, LogFormat};
+use super::queue::Queue;
+use super::stream::Stream;
+use crate::io::clock::HostClock;
 
-/// The journal's socket for its native protocol.
-const JOURNAL: &str = "/run/systemd/journal/socket";
-/// The socket standard error is connected to where the service manager put it into the journal.
-const JOURNAL_STREAM: &[u8] = b"/run/systemd/journal/stdout";
-
-/// How lines leave the process.
-pub(super) struct Sinks {
-    screen: Screen,
-    file: Option<RotatingFile>,
-}
-
-enum Screen {
+/// How a line looks.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Format {
+    /// logfmt.
     Text,
+    /// One JSON object a line.
     Json,
-    Journal(UnixDatagram),
+    /// A datagram for the journal.
+    Journal,
+    /// Words for people at a terminal.
+    Plain,
 }
 
-impl Sinks {
-    pub(super) fn new(config: &LogConfig) -> Self {
-        let journal = || UnixDatagram::unbound().map_or(Screen::Text, Screen::Journal);
-        let screen = match config.format {
-            LogFormat::Text => Screen::Text,
-            LogFormat::Json => Screen::Json,
-            LogFormat::Journal => journal(),
-            LogFormat::Auto if stderr_is_journal() => journal(),
-            LogFormat::Auto => Screen::Text,
+impl Format {
+    fn render(self, line: &Line) -> Vec<u8> {
+        let text = match self {
+            Self::Text => line.text(),
+            Self::Json => line.json(),
+            Self::Plain => line.plain(),
+            Self::Journal => return journal::datagram(line),
         };
-        let file = config
-            .file
-            .as_ref()
-            .map(|path| RotatingFile::new(Path::new(path), (config.file_mb * 1e6) as u64, config.files_kept));
-        Self { screen, file }
-    }
-
-    /// Writes a line everywhere it goes. A sink that refuses is given up for this line: the log must
-    /// not stop the daemon.
-    pub(super) fn write(&mut self, line: &Line) {
-        match &self.screen {
-            Screen::Journal(socket) if socket.send_to(&line.journal(), JOURNAL).is_ok() => {}
-            Screen::Text | Screen::Journal(_) => print(&line.text()),
-            Screen::Json => print(&line.json()),
-        }
-        if let Some(file) = &mut self.file {
-            let text = if matches!(self.screen, Screen::Json) { line.json() } else { line.text() };
-            file.write(&text);
-        }
-    }
-
-    /// Opens the file anew: something else may have moved it.
-    pub(super) fn reopen(&mut self) {
-        if let Some(file) = &mut self.file {
-            file.current = None;
-        }
+        (text + "\n").into_bytes()
     }
 }
 
-fn print(text: &str) {
-    let mut out = io::stderr().lock();
-    let _ = writeln!(out, "{text}");
+/// Where lines go.
+pub(super) enum Way {
+    /// Nobody waits for it; lines may be lost there.
+    Queue(Queue),
+    /// The command waits for it, as for all that it prints.
+    Direct(Mutex<Box<dyn Write + Send>>),
 }
 
-/// Whether standard error is connected to the journal.
-fn stderr_is_journal() -> bool {
-    let stderr = io::stderr();
-    let peer = rustix::net::getpeername(stderr.as_fd()).ok().flatten();
-    let unix = peer.and_then(|address| rustix::net::SocketAddrUnix::try_from(address).ok());
-    unix.is_some_and(|address| address.path_bytes() == Some(JOURNAL_STREAM))
+/// The layer.
+pub(super) struct Sink {
+    pub(super) format: Format,
+    pub(super) way: Way,
+    pub(super) clock: HostClock,
 }
 
-/// A log file with those put aside as `NAME.1` (the newest), `NAME.2`, ….
-struct RotatingFile {
-    path: PathBuf,
-    limit_bytes: u64,
-    kept: u32,
-    current: Option<(File, u64)>,
-    complained: bool,
-}
-
-impl RotatingFile {
-    fn new(path: &Path, limit_bytes: u64, kept: u32) -> Self {
-        Self { path: path.to_owned(), limit_bytes, kept, current: None, complained: false }
-    }
-
-    fn write(&mut self, text: &str) {
-        match self.try_write(text) {
-            Ok(()) => self.complained = false,
-            Err(error) => {
-                self.current = None;
-                if !std::mem::replace(&mut self.complained, true) {
-                    print(&format!(
-                        "level=warn event=log_file msg=\"cannot write {}: {error}\"",
-                        self.path.display()
-                    ));
-                }
+impl<S> Layer<S> for Sink
+where
+    S: Subscriber + for<'span> LookupSpan<'span>,
+{
+    fn on_event(&self, event: &Event<'_>, context: Context<'_, S>) {
+        let line = self.format.render(&Line::of(event, &context, self.clock));
+        match &self.way {
+            Way::Queue(queue) => queue.put(&line),
+            Way::Direct(writer) => {
+                let mut writer = writer.lock().unwrap_or_else(PoisonError::into_inner);
+                // What cannot be printed is lost, as with everything that a command prints.
+                let _ = writer.write_all(&line);
             }
         }
     }
+}
 
-    fn try_write(&mut self, text: &str) -> io::Result<()> {
-        if self.current.as_ref().is_some_and(|(_, size)| *size >= self.limit_bytes) {
-            self.current = None;
-            self.put_aside()?;
+/// Writes datagrams to the journal; what it does not take goes to standard error, without its fields.
+pub(super) struct JournalWriter(pub(super) Journal);
+
+impl Write for JournalWriter {
+    fn write(&mut self, datagram: &[u8]) -> std::io::Result<usize> {
+        if self.0.send(datagram).is_err() {
+            let message = datagram.strip_prefix(b"MESSAGE=").unwrap_or(datagram);
+            let end = message.iter().position(|byte| *byte == b'\n').map_or(message.len(), |at| at + 1);
+            Stream::Error.write_all(&message[..end])?;
         }
-        let (file, size) = match &mut self.current {
-            Some(current) => current,
-            None => {
-                if let Some(folder) = self.path.parent() {
-                    std::fs::create_dir_all(folder)?;
-                }
-                let file = OpenOptions::new().create(true).append(true).open(&self.path)?;
-                let size = file.metadata()?.len();
-                self.current.insert((file, size))
-            }
-        };
-        file.write_all(format!("{text}\n").as_bytes())?;
-        *size += text.len() as u64 + 1;
+        Ok(datagram.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
         Ok(())
-    }
-
-    fn put_aside(&self) -> io::Result<()> {
-        let numbered = |n: u32| {
-            let mut name = self.path.clone().into_os_string();
-            name.push(format!(".{n}"));
-            PathBuf::from(name)
-        };
-        if self.kept == 0 {
-            return std::fs::remove_file(&self.path);
-        }
-        for n in (1..self.kept).rev() {
-            if numbered(n).exists() {
-                std::fs::rename(numbered(n), numbered(n + 1))?;
-            }
-        }
-        std::fs::rename(&self.path, numbered(1))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn files_are_put_aside_and_only_so_many_kept() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("log/windhover.log");
-        let mut file = RotatingFile::new(&path, 50, 2);
-        for n in 0..20 {
-            file.write(&format!("line {n:02} of a log"));
-        }
-        let mut names: Vec<String> = std::fs::read_dir(path.parent().expect("a parent"))
-            .expect("listed")
-            .map(|entry| entry.expect("an entry").file_name().into_string().expect("a name"))
-            .collect();
-        names.sort();
-        assert_eq!(names, ["windhover.log", "windhover.log.1", "windhover.log.2"]);
-        let newest = std::fs::read_to_string(&path).expect("read");
-        assert!(newest.ends_with("line 19 of a log\n"), "{newest}");
-        let before = std::fs::read_to_string(folder.path().join("log/windhover.log.1")).expect("read");
-        assert!(before.len() <= 50 + 17 && before.ends_with("log\n"), "{before}");
-    }
-
-    #[test]
-    fn a_moved_file_is_begun_anew() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("w.log");
-        let config = LogConfig { file: Some(path.to_string_lossy().into_owned()), ..LogConfig::default() };
-        let mut sinks = Sinks::new(&config);
-        let line =
-            Line::new(windhover_base::time::MonoTime::from_ns(0), crate::config::LogLevel::Info, "started");
-        sinks.write(&line);
-        std::fs::rename(&path, folder.path().join("moved")).expect("moved");
-        sinks.reopen();
-        sinks.write(&line);
-        assert_eq!(std::fs::read_to_string(&path).expect("begun anew").lines().count(), 1);
     }
 }

@@ -70,6 +70,8 @@ pub struct Notice {
     pub kind: NoticeKind,
     /// Which source, where it is about one.
     pub source: Option<Source>,
+    /// Name of the target, where it is about one.
+    pub target: Option<String>,
     /// In words: what, where, how many.
     pub detail: String,
 }

@@ -1,0 +1,60 @@
+//! A `tracing` callsite whose fields are known only at run time.
+
+use std::sync::OnceLock;
+
+use tracing::callsite::{Callsite, Identifier};
+use tracing::dispatcher::get_default;
+use tracing::field::{Field, FieldSet, Value};
+use tracing::metadata::Kind;
+use tracing::subscriber::Interest;
+use tracing::{Event, Level, Metadata};
+
+/// Fields that one event can have. `tracing` takes a fixed number; what an event does not use stays empty.
+const MOST_FIELDS: usize = 1_024;
+
+/// Where an event comes from. Never freed, as `tracing` wants it: made once by who emits it.
+pub struct RuntimeCallsite {
+    metadata: OnceLock<Metadata<'static>>,
+}
+
+impl RuntimeCallsite {
+    /// Events of this name, target and severity, with these fields.
+    pub fn new(name: &'static str, target: &'static str, level: Level, fields: &[String]) -> &'static Self {
+        let names: Vec<&'static str> =
+            fields.iter().take(MOST_FIELDS).map(|name| &*name.clone().leak()).collect();
+        let callsite: &'static Self = Box::leak(Box::new(Self { metadata: OnceLock::new() }));
+        let fields = FieldSet::new(names.leak(), Identifier(callsite));
+        let place = (Some(file!()), Some(line!()), Some(module_path!()));
+        callsite.metadata.get_or_init(|| {
+            Metadata::new(name, target, level, place.0, place.1, place.2, fields, Kind::EVENT)
+        });
+        tracing::callsite::register(callsite);
+        callsite
+    }
+
+    /// Emits an event: a value for each field in their order, `None` where it has none.
+    pub fn emit(&'static self, values: &[Option<&dyn Value>]) {
+        let metadata = Callsite::metadata(self);
+        get_default(|dispatch| {
+            if !dispatch.enabled(metadata) {
+                return;
+            }
+            let fields: Vec<Field> = metadata.fields().iter().collect();
+            let Some(unused) = fields.first() else { return };
+            let pair = |at: usize| {
+                fields.get(at).map_or((unused, None), |field| (field, values.get(at).copied().flatten()))
+            };
+            let pairs: [(&Field, Option<&dyn Value>); MOST_FIELDS] = std::array::from_fn(pair);
+            dispatch.event(&Event::new(metadata, &metadata.fields().value_set(&pairs)));
+        });
+    }
+}
+
+impl Callsite for RuntimeCallsite {
+    // Asked for each event: they are few.
+    fn set_interest(&self, _: Interest) {}
+
+    fn metadata(&self) -> &Metadata<'_> {
+        self.metadata.get().expect("set before anybody sees the callsite")
+    }
+}

@@ -1,0 +1,113 @@
+//! The station's terminal: lines that stay, and those of the payloads, which a terminal shows in place of the ones
+//! before. It has a queue of its own: one that is stopped, or a pipe that nobody reads, holds nothing up.
+
+use std::fmt::Display;
+use std::io::{self, Write};
+
+use crate::app::log::{Queue, QueueEnd, Stream, queue};
+use crate::io::clock::HostClock;
+use windhover_base::time::Span;
+
+/// Begins a message whose lines stand for those of the last that began so.
+const STATUS: u8 = b'\r';
+/// Longest that is waited at the end for what waits to be shown.
+const ENDING: Span = Span::from_ns(400_000_000);
+
+/// Standard output. Copies are the same.
+#[derive(Clone)]
+pub(super) struct Terminal(Queue);
+
+/// Ends the terminal when dropped: what waits is shown first, unless the terminal is stuck.
+pub(super) struct TerminalEnd {
+    terminal: Terminal,
+    /// Dropped after the wait.
+    _end: QueueEnd,
+}
+
+impl Terminal {
+    /// Begins; `rewrites` where lines are rewritten in place, as on a terminal.
+    pub(super) fn start(rewrites: bool) -> TerminalEnd {
+        let (queue, end) = queue("stdout", Screen { out: Stream::Out, rewrites, shown: 0 });
+        TerminalEnd { terminal: Self(queue), _end: end }
+    }
+
+    /// Shows a line that stays.
+    pub(super) fn line(&self, text: impl Display) {
+        self.0.put(format!("{text}\n").as_bytes());
+    }
+
+    /// Shows these lines, a line for each payload, in place of the last of their kind.
+    pub(super) fn status(&self, lines: &[String]) {
+        let mut message = vec![STATUS];
+        for line in lines {
+            message.extend_from_slice(line.as_bytes());
+            message.push(b'\n');
+        }
+        self.0.put(&message);
+    }
+}
+
+impl TerminalEnd {
+    /// The terminal, for those who show something.
+    pub(super) fn terminal(&self) -> &Terminal {
+        &self.terminal
+    }
+}
+
+impl Drop for TerminalEnd {
+    fn drop(&mut self) {
+        let clock = HostClock::start();
+        self.terminal.0.drain(clock, clock.now() + ENDING);
+    }
+}
+
+/// The far end of the queue: what was shown last is known here, whatever was dropped before.
+struct Screen<W> {
+    out: W,
+    rewrites: bool,
+    /// Lines of the status on the screen.
+    shown: usize,
+}
+
+impl<W: Write> Write for Screen<W> {
+    fn write(&mut self, message: &[u8]) -> io::Result<usize> {
+        match message.strip_prefix(&[STATUS]) {
+            None => self.out.write_all(message)?,
+            Some(status) if !self.rewrites => self.out.write_all(status)?,
+            Some(status) => {
+                let mut text = match self.shown {
+                    0 => String::new(),
+                    shown => format!("\x1b[{shown}A"),
+                };
+                text.push_str(&String::from_utf8_lossy(status).replace('\n', "\x1b[K\n"));
+                self.shown = status.iter().filter(|byte| **byte == b'\n').count();
+                self.out.write_all(text.as_bytes())?;
+            }
+        }
+        Ok(message.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.out.flush()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_terminal_shows_the_status_in_place_and_a_pipe_line_by_line() {
+        let shown = |rewrites| {
+            let mut screen = Screen { out: Vec::new(), rewrites, shown: 0 };
+            for message in ["page at http://\n", "\rbird up\nhawk up\n", "\rbird down\n", "\rbird up\n"] {
+                screen.write_all(message.as_bytes()).expect("shown");
+            }
+            String::from_utf8(screen.out).expect("UTF-8")
+        };
+        assert_eq!(shown(false), "page at http://\nbird up\nhawk up\nbird down\nbird up\n");
+        let rewritten =
+            "page at http://\nbird up\x1b[K\nhawk up\x1b[K\n\x1b[2Abird down\x1b[K\n\x1b[1Abird up\x1b[K\n";
+        assert_eq!(shown(true), rewritten);
+    }
+}
