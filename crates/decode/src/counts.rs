@@ -55,11 +55,21 @@ pub struct DecodeCounts {
     /// Sound readings of which the device itself said that something is not valid.
     pub flagged: u64,
     refused: BTreeMap<Refusal, u64>,
+    left_out: BTreeMap<&'static str, u64>,
 }
 
 impl DecodeCounts {
     pub(super) fn refuse(&mut self, why: Refusal) {
         *self.refused.entry(why).or_insert(0) += 1;
+    }
+
+    pub(super) fn leave_out(&mut self, field: &'static str) {
+        *self.left_out.entry(field).or_insert(0) += 1;
+    }
+
+    /// Fields left out of sentences that were used otherwise, by name, with how often.
+    pub fn left_out(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
+        self.left_out.iter().map(|(field, count)| (*field, *count))
     }
 
     /// Whether nothing at all was a sound sentence or packet: bytes of another device, another speed
@@ -92,6 +102,9 @@ impl fmt::Display for DecodeCounts {
         }
         if self.refused_total() > 0 {
             write!(f, ")")?;
+        }
+        for (field, count) in self.left_out() {
+            write!(f, ", {count} without {field}")?;
         }
         write!(f, ", {} flagged by the device, {} bytes outside sentences", self.flagged, self.noise_bytes)
     }

@@ -53,8 +53,8 @@ fn of_pgrmf(sentence: &Sentence<'_>) -> Result<Report, Refusal> {
     report.time_of_day_ns = time_of_day_ns(sentence.field(4))?;
     let lat_deg = angle_deg(sentence.field(6), sentence.field(7), "N", "S")?;
     let lon_deg = angle_deg(sentence.field(8), sentence.field(9), "E", "W")?;
-    let speed_kmh = sentence.number(12, 0.0, 10_000.0)?;
-    let course_deg = sentence.number(13, 0.0, 360.0)?;
+    let speed_kmh = report.optional("PGRMF speed", sentence.number(12, 0.0, 10_000.0));
+    let course_deg = report.optional("PGRMF course", sentence.number(13, 0.0, 360.0));
     let fix = match sentence.field(11) {
         "" | "0" => FixKind::None,
         "1" => FixKind::TwoD,

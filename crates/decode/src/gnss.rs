@@ -141,7 +141,10 @@ impl Assembler {
         let placed = match read {
             Ok(None) => return counts.ignored += 1,
             Err(why) => Err(why),
-            Ok(Some(report)) => self.place(report, sentence.address(), line.span, out),
+            Ok(Some(report)) => {
+                report.left_out.iter().for_each(|field| counts.leave_out(field));
+                self.place(report, sentence.address(), line.span, out)
+            }
         };
         match placed {
             Ok(()) => counts.used += 1,

@@ -177,6 +177,31 @@ fn a_receiver_without_time_or_fix_is_heard() {
 }
 
 #[test]
+fn a_receiver_of_rmc_and_gns_alone_has_altitude() {
+    let burst = |second: u32| {
+        line(&format!("GNGNS,1200{second:02}.00,3842.20000,N,00911.00000,W,RRRR,14,0.6,50.1,48.0,1.0,0000,V"))
+            + &line(&format!("GNRMC,1200{second:02}.00,A,3842.20000,N,00911.00000,W,0.1,,181126,,,R,V"))
+    };
+    let text: String = (0..5).map(burst).collect();
+    let (epochs, counts) = decode(GnssDecoder::new(), &text);
+    assert_eq!((epochs.len(), counts.refused_total()), (5, 0), "{counts}");
+    for heard in epochs {
+        let epoch = heard.epoch;
+        assert_eq!((epoch.fix, epoch.alt_msl_m, epoch.sats), (FixKind::ThreeD, Some(50.1), Some(14)));
+    }
+}
+
+#[test]
+fn what_is_left_out_is_counted_by_name() {
+    let odd = line("GPRMC,101101,A,3030.00000,N,08530.00000,W,010.0,090.0,010226,999.9000,E,D");
+    let (epochs, counts) = decode(GnssDecoder::patient(), &odd.repeat(3));
+    assert_eq!(counts.left_out().collect::<Vec<_>>(), [("RMC magnetic variation", 3)]);
+    assert!(counts.to_string().contains("3 without RMC magnetic variation"), "{counts}");
+    let epoch = epochs[0].epoch;
+    assert!(epoch.utc.is_some() && epoch.vel_ned_mps.is_some() && counts.refused_total() == 0);
+}
+
+#[test]
 fn a_void_sentence_voids_its_epoch() {
     let void = line("GPRMC,101101,V,3030.00000,N,08530.00000,W,010.0,090.0,010226,003.4,W,N");
     let text = gga("101101", "3030.00000", "10.0") + &void;

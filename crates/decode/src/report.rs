@@ -82,6 +82,8 @@ pub(super) struct Report {
     /// Satellites used, as GSA lists them; GSA comes once for each constellation.
     pub sats_listed: Option<u32>,
     pub hdop: Option<f64>,
+    /// Fields that were there and could not be: the sentence is used without them.
+    pub left_out: Vec<&'static str>,
 }
 
 impl Report {
@@ -103,7 +105,16 @@ impl Report {
             sats: None,
             sats_listed: None,
             hdop: None,
+            left_out: Vec::new(),
         }
+    }
+
+    /// Keeps what a field says, or notes that it says what cannot be.
+    pub(super) fn optional<T>(&mut self, name: &'static str, read: Result<Option<T>, Refusal>) -> Option<T> {
+        read.unwrap_or_else(|_| {
+            self.left_out.push(name);
+            None
+        })
     }
 }
 
@@ -127,19 +138,26 @@ pub(super) fn time_of_day_ns(text: &str) -> Result<Option<i64>, Refusal> {
     Ok(Some((hour * 3600 + minute * 60 + second) * NS_PER_S + fraction_ns))
 }
 
-/// Degrees from `dddmm.mmmm` and its hemisphere letter; `None` where both are empty.
+/// Degrees from `dddmm.mmmm` and its hemisphere letter; `None` where the number is empty. The last
+/// two digits before the point are minutes, however many digits stand before them: receivers differ
+/// in how many zeros they write.
 pub(super) fn angle_deg(
     text: &str,
     letter: &str,
     positive: &str,
     negative: &str,
 ) -> Result<Option<f64>, Refusal> {
-    let limit = if positive == "N" { 90.0 } else { 180.0 };
-    let Some(value) = number(text, 0.0, limit * 100.0)? else {
+    if text.is_empty() {
         return Ok(None);
-    };
-    let degrees = (value / 100.0).trunc();
-    let minutes = value - degrees * 100.0;
+    }
+    let whole = text.find('.').unwrap_or(text.len());
+    if !text.bytes().enumerate().all(|(index, byte)| byte.is_ascii_digit() || index == whole) {
+        return Err(Refusal::Malformed);
+    }
+    let (degrees, minutes) = text.split_at(whole.saturating_sub(2));
+    let limit = if positive == "N" { 90.0 } else { 180.0 };
+    let degrees = number(degrees, 0.0, limit)?.unwrap_or(0.0);
+    let minutes = number(minutes, 0.0, 60.0)?.ok_or(Refusal::Malformed)?;
     let angle = degrees + minutes / 60.0;
     if minutes >= 60.0 || angle > limit {
         return Err(Refusal::OutOfRange);
@@ -153,6 +171,8 @@ pub(super) fn angle_deg(
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     #[test]
@@ -174,6 +194,48 @@ mod tests {
         assert_eq!(angle_deg("4560.0", "N", "N", "S"), Err(Refusal::OutOfRange));
         assert_eq!(angle_deg("4530.0", "", "N", "S"), Err(Refusal::Malformed));
         assert_eq!(angle_deg("", "", "N", "S"), Ok(None));
+        for text in [".", "-4530.0", "45.30.0", "+1", "45 30"] {
+            assert_eq!(angle_deg(text, "N", "N", "S"), Err(Refusal::Malformed), "{text}");
+        }
+    }
+
+    #[test]
+    fn minutes_are_counted_from_the_decimal_point() {
+        let east = |text| angle_deg(text, "E", "E", "W").expect("sound").expect("given");
+        for (text, degrees, minutes) in [
+            ("100.102", 1.0, 0.102),
+            ("1026.6634", 10.0, 26.6634),
+            ("530.445", 5.0, 30.445),
+            ("26.5", 0.0, 26.5),
+            ("6.5", 0.0, 6.5),
+            (".5", 0.0, 0.5),
+            ("0000100.102", 1.0, 0.102),
+            ("17959", 179.0, 59.0),
+            ("18000.", 180.0, 0.0),
+        ] {
+            assert_eq!(east(text), degrees + minutes / 60.0, "{text}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn an_angle_reads_the_same_however_many_zeros_are_written(
+            degrees in 0u32..180,
+            minutes_e4 in 0u32..600_000,
+            zeros in 0usize..4,
+            west: bool,
+        ) {
+            let fraction = minutes_e4 % 10_000;
+            let plain = format!("{}.{fraction:04}", degrees * 100 + minutes_e4 / 10_000);
+            let padded = format!("{degrees:03}{:02}.{fraction:04}", minutes_e4 / 10_000);
+            let letter = if west { "W" } else { "E" };
+            let read = |text: &str| angle_deg(text, letter, "E", "W").expect("sound").expect("given");
+            let size = f64::from(degrees) + f64::from(minutes_e4) / 600_000.0;
+            let angle = if west { -size } else { size };
+            prop_assert!((read(&plain) - angle).abs() < 1e-12);
+            prop_assert_eq!(read(&padded), read(&plain));
+            prop_assert_eq!(read(&format!("{}{plain}", "0".repeat(zeros))), read(&plain));
+        }
     }
 
     #[test]

@@ -32,10 +32,12 @@ impl<'a> Sentence<'a> {
         let inner = line.strip_prefix('$').ok_or(Refusal::Malformed)?;
         let (body, sum) = inner.split_once('*').ok_or(Refusal::NoChecksum)?;
         let sum = sum.trim_end();
-        if sum.len() != 2 || !sum.bytes().all(|byte| byte.is_ascii_hexdigit()) {
+        // Some devices write a blank for the leading zero.
+        let digits = sum.strip_prefix(' ').unwrap_or(sum);
+        if sum.len() != 2 || !digits.bytes().all(|byte| byte.is_ascii_hexdigit()) {
             return Err(Refusal::BadChecksum);
         }
-        let sum = u8::from_str_radix(sum, 16).map_err(|_| Refusal::BadChecksum)?;
+        let sum = u8::from_str_radix(digits, 16).map_err(|_| Refusal::BadChecksum)?;
         if sum != checksum(body.as_bytes()) {
             return Err(Refusal::BadChecksum);
         }
@@ -92,6 +94,11 @@ mod tests {
     fn a_sentence_must_hold_its_checksum() {
         let good = Sentence::of_line(b"$PGRMM,WGS 84*06").expect("the checksum is right");
         assert_eq!((good.address(), good.field(1), good.fields()), ("PGRMM", "WGS 84", 1));
+        assert_eq!(Sentence::of_line(b"$PGRMM,WGS 84* 6").expect("a blank for the zero").address(), "PGRMM");
+        for damaged in [&b"$PGRMM,WGS 84* 7"[..], b"$PGRMM,WGS 84*6", b"$PGRMM,WGS 84*  ", b"$PGRMM,WGS 84*"]
+        {
+            assert_eq!(Sentence::of_line(damaged).err(), Some(Refusal::BadChecksum));
+        }
         assert_eq!(Sentence::of_line(b"$PGRMM,WGS 85*06").err(), Some(Refusal::BadChecksum));
         assert_eq!(Sentence::of_line(b"$PGRMM,WGS 84*06junk").err(), Some(Refusal::BadChecksum));
         assert_eq!(Sentence::of_line(b"$PGRMM,WGS 84").err(), Some(Refusal::NoChecksum));

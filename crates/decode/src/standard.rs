@@ -1,9 +1,26 @@
 //! Standard NMEA sentences, read by the `nmea` crate one by one and checked.
 //!
-//! The crate is used without its state: it merges sentences of different times. It also accepts
-//! what cannot be (latitude 99°, altitude "NaN") and refuses what is legitimate (a leap second, GLL
-//! before NMEA 2.3, GSA of a two-dimensional fix without VDOP, an RMC with the date 000000), so
-//! fields are checked before and such sentences are put into a form it reads.
+//! The time, the position and the status (validity, or the kind of fix) decide over a sentence: it is
+//! refused where one of them cannot be. Every other field is left out alone where it cannot be, and
+//! counted by its name.
+//!
+//! | sentence | decide | used where sound | checked only |
+//! |---|---|---|---|
+//! | RMC | time, status, position | speed, course, date, mode | variation |
+//! | GGA | time, position | quality, satellites, HDOP, altitude, geoid | |
+//! | GNS | time, position | modes, satellites, HDOP, altitude, geoid | |
+//! | GLL | time, status, position | mode | |
+//! | GSA | kind of fix | satellites, HDOP | PDOP, VDOP |
+//! | VTG | | course, speed (knots, else km/h), mode | magnetic course |
+//! | ZDA | time | day, month, year | |
+//!
+//! A mode or quality that is unknown counts as no measured fix, but an unknown quality of GGA leaves
+//! the decision to the other sentences of its epoch. Fields not named are not read.
+//!
+//! The crate is used without its state: it merges sentences of different times. It splits angles at
+//! fixed columns, accepts what cannot be (altitude "NaN") and refuses a whole sentence for one odd
+//! field, so positions are read here, and it gets the sentence with the fields it needs, checked and
+//! put into a form it reads.
 
 use chrono::Datelike;
 use nmea::ParseResult;
@@ -11,7 +28,7 @@ use nmea::sentences::{FixType, GgaData, GllData, GnsData, GsaData, RmcData, VtgD
 
 use super::counts::Refusal;
 use super::report::{Date, Kind, Report, angle_deg, time_of_day_ns};
-use super::sentence::{Sentence, framed};
+use super::sentence::{Sentence, framed, number};
 use windhover_base::msg::FixKind;
 
 /// Metres a second in a knot.
@@ -22,15 +39,18 @@ pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<Report>, Refusal> {
     let Some(kind) = sentence.formatter().and_then(kind_of) else {
         return Ok(None);
     };
-    check_numbers(kind, sentence)?;
+    if sentence.fields() < fields_min(kind) {
+        return Err(Refusal::Malformed);
+    }
     let mut report = Report::new(kind);
     if let Some(field) = time_field(kind) {
         report.time_of_day_ns = time_of_day_ns(sentence.field(field))?;
     }
-    let readable = framed(&readable_body(kind, sentence));
+    let position_deg = position_deg(kind, sentence)?;
+    let readable = framed(&readable_body(kind, sentence, &mut report));
     match nmea::parse_str(&readable) {
         Ok(ParseResult::RMC(data)) => of_rmc(&mut report, &data, sentence),
-        Ok(ParseResult::GGA(data)) => of_gga(&mut report, &data),
+        Ok(ParseResult::GGA(data)) => of_gga(&mut report, &data, sentence),
         Ok(ParseResult::GLL(data)) => of_gll(&mut report, &data, sentence),
         Ok(ParseResult::GNS(data)) => of_gns(&mut report, &data, sentence),
         Ok(ParseResult::GSA(data)) => of_gsa(&mut report, &data, sentence)?,
@@ -38,6 +58,9 @@ pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<Report>, Refusal> {
         Ok(ParseResult::ZDA(data)) => of_zda(&mut report, &data),
         _ if kind == Kind::Gsa => gsa_by_fields(&mut report, sentence)?,
         _ => return Err(Refusal::Malformed),
+    }
+    if report.valid != Some(false) {
+        report.position_deg = position_deg;
     }
     Ok(Some(report))
 }
@@ -73,57 +96,178 @@ const fn latitude_field(kind: Kind) -> Option<usize> {
     }
 }
 
-/// Fields that must be numbers, with the range they can have.
-const fn number_fields(kind: Kind) -> &'static [(usize, f64, f64)] {
+/// Fields a sentence has at least, up to the last that every version of it has.
+const fn fields_min(kind: Kind) -> usize {
     match kind {
-        // knots; degrees; degrees
-        Kind::Rmc => &[(7, 0.0, 2_000.0), (8, 0.0, 360.0), (10, 0.0, 180.0)],
-        // satellites; HDOP; metres; metres
-        Kind::Gga => &[(7, 0.0, 99.0), (8, 0.0, 9_999.0), (9, -20_000.0, 100_000.0), (11, -1_000.0, 1_000.0)],
-        Kind::Gns => &[(7, 0.0, 99.0), (8, 0.0, 9_999.0), (9, -20_000.0, 100_000.0), (10, -1_000.0, 1_000.0)],
-        Kind::Gsa => &[(15, 0.0, 9_999.0), (16, 0.0, 9_999.0), (17, 0.0, 9_999.0)],
-        // degrees; degrees; knots; km/h
-        Kind::Vtg => &[(1, 0.0, 360.0), (3, 0.0, 360.0), (5, 0.0, 2_000.0), (7, 0.0, 4_000.0)],
+        Kind::Rmc | Kind::Gga => 9,
+        Kind::Gns => 10,
+        Kind::Vtg => 8,
+        Kind::Gll => 6,
+        Kind::Zda => 4,
+        _ => 2,
+    }
+}
+
+/// Fields handed to the crate: what follows is not read, and empty fields stand for missing ones.
+const fn fields_read(kind: Kind) -> Option<usize> {
+    match kind {
+        Kind::Rmc => Some(12),
+        Kind::Gga | Kind::Gns => Some(13),
+        Kind::Gll => Some(7),
+        Kind::Vtg => Some(9),
+        Kind::Zda => Some(6),
+        _ => None,
+    }
+}
+
+/// A number that may be left out: its field, its name, the range it can have.
+type Optional = (usize, &'static str, f64, f64);
+
+const fn optional_numbers(kind: Kind) -> &'static [Optional] {
+    match kind {
+        Kind::Rmc => &[
+            (7, "RMC speed", 0.0, 2_000.0),
+            (8, "RMC course", 0.0, 360.0),
+            (10, "RMC magnetic variation", 0.0, 180.0),
+        ],
+        Kind::Gga => &[
+            (7, "GGA satellites", 0.0, 999.0),
+            (8, "GGA HDOP", 0.0, 9_999.0),
+            (9, "GGA altitude", -20_000.0, 100_000.0),
+            (11, "GGA geoid", -1_000.0, 1_000.0),
+        ],
+        Kind::Gns => &[
+            (7, "GNS satellites", 0.0, 999.0),
+            (8, "GNS HDOP", 0.0, 9_999.0),
+            (9, "GNS altitude", -20_000.0, 100_000.0),
+            (10, "GNS geoid", -1_000.0, 1_000.0),
+        ],
+        Kind::Gsa => {
+            &[(15, "GSA PDOP", 0.0, 9_999.0), (16, "GSA HDOP", 0.0, 9_999.0), (17, "GSA VDOP", 0.0, 9_999.0)]
+        }
+        Kind::Vtg => &[
+            (1, "VTG course", 0.0, 360.0),
+            (3, "VTG magnetic course", 0.0, 360.0),
+            (5, "VTG speed in knots", 0.0, 2_000.0),
+            (7, "VTG speed in km/h", 0.0, 4_000.0),
+        ],
+        Kind::Zda => {
+            &[(2, "ZDA day", 1.0, 31.0), (3, "ZDA month", 1.0, 12.0), (4, "ZDA year", 1_980.0, 9_999.0)]
+        }
         _ => &[],
     }
 }
 
-fn check_numbers(kind: Kind, sentence: &Sentence<'_>) -> Result<(), Refusal> {
-    for &(index, low, high) in number_fields(kind) {
-        sentence.number(index, low, high)?;
+/// Latitude and longitude as the sentence gives them, valid or not.
+fn position_deg(kind: Kind, sentence: &Sentence<'_>) -> Result<Option<(f64, f64)>, Refusal> {
+    let Some(lat) = latitude_field(kind) else {
+        return Ok(None);
+    };
+    let lat_deg = angle_deg(sentence.field(lat), sentence.field(lat + 1), "N", "S")?;
+    let lon_deg = angle_deg(sentence.field(lat + 2), sentence.field(lat + 3), "E", "W")?;
+    if lat_deg.is_some() != lon_deg.is_some() {
+        return Err(Refusal::Malformed);
     }
-    if let Some(lat) = latitude_field(kind) {
-        let lat_deg = angle_deg(sentence.field(lat), sentence.field(lat + 1), "N", "S")?;
-        let lon_deg = angle_deg(sentence.field(lat + 2), sentence.field(lat + 3), "E", "W")?;
-        if lat_deg.is_some() != lon_deg.is_some() {
-            return Err(Refusal::Malformed);
-        }
-    }
-    Ok(())
+    Ok(lat_deg.zip(lon_deg))
 }
 
-/// The body in a form the crate reads; the same as it came for all but the cases named above.
-fn readable_body(kind: Kind, sentence: &Sentence<'_>) -> String {
+/// The body in a form the crate reads, without the fields that cannot be; these go to `report`.
+fn readable_body(kind: Kind, sentence: &Sentence<'_>, report: &mut Report) -> String {
     let mut fields: Vec<String> = sentence.body.split(',').map(|field| field.trim().to_owned()).collect();
+    for &(index, name, low, high) in optional_numbers(kind) {
+        if let Some(field) = fields.get_mut(index) {
+            let value = report.optional(name, number(field, low, high));
+            // Adding zero takes the sign off a zero.
+            *field = value.map_or_else(String::new, |value| (value + 0.0).to_string());
+        }
+    }
+    if matches!(kind, Kind::Gga | Kind::Gns) && fields[7].contains('.') {
+        report.left_out.push(if kind == Kind::Gga { "GGA satellites" } else { "GNS satellites" });
+        fields[7].clear();
+    }
+    if let Some(last) = fields_read(kind) {
+        fields.resize(last + 1, String::new());
+    }
     if let Some(time) = time_field(kind).and_then(|index| fields.get_mut(index))
         && time.get(4..6) == Some("60")
     {
         time.replace_range(4..6, "59");
     }
-    if let Some(lat) = latitude_field(kind).filter(|&lat| sentence.field(lat).is_empty()) {
-        // A letter without its number, as some receivers send before the first fix.
+    if let Some(lat) = latitude_field(kind) {
         fields.iter_mut().skip(lat).take(4).for_each(String::clear);
     }
-    if kind == Kind::Rmc
-        && let Some(date) = fields.get_mut(9)
-        && Date::of_ddmmyy(date).is_none()
-    {
-        date.clear();
-    }
-    if kind == Kind::Gll && sentence.fields() == 6 {
-        fields.push(if sentence.field(6) == "A" { "A" } else { "N" }.to_owned());
+    match kind {
+        Kind::Rmc => readable_rmc(&mut fields, report),
+        Kind::Gga => readable_gga(&mut fields, report),
+        Kind::Gns => readable_gns(&mut fields),
+        Kind::Gll => fields[7] = "N".to_owned(),
+        Kind::Zda => readable_zda(&mut fields, report),
+        Kind::Vtg => [2, 4, 6, 8, 9].into_iter().for_each(|unit| fields[unit].clear()),
+        _ => {}
     }
     fields.join(",")
+}
+
+/// The date only where it is one (000000 is none yet), and no variation.
+fn readable_rmc(fields: &mut [String], report: &mut Report) {
+    let date = &mut fields[9];
+    if Date::of_ddmmyy(date).is_none() {
+        if !date.bytes().all(|byte| byte == b'0') {
+            report.left_out.push("RMC date");
+        }
+        date.clear();
+    }
+    if !fields[10].is_empty() && !matches!(fields[11].as_str(), "E" | "W") {
+        report.left_out.push("RMC magnetic variation");
+    }
+    fields[10..].iter_mut().for_each(String::clear);
+}
+
+/// A quality the crate knows, metres only, and nothing of the corrections.
+fn readable_gga(fields: &mut [String], report: &mut Report) {
+    match fields[6].as_str() {
+        "0" | "1" | "2" | "3" | "4" | "5" | "6" | "7" | "8" => {}
+        // A fix with corrections from satellites, as NovAtel numbers it.
+        "9" => fields[6] = "2".to_owned(),
+        other => {
+            if !other.is_empty() {
+                report.left_out.push("GGA quality");
+            }
+            fields[6] = "0".to_owned();
+        }
+    }
+    for (value, name) in [(9, "GGA altitude"), (11, "GGA geoid")] {
+        if !fields[value].is_empty() && !matches!(fields[value + 1].as_str(), "" | "M") {
+            report.left_out.push(name);
+            fields[value].clear();
+        }
+        fields[value + 1].clear();
+    }
+    fields[13].clear();
+}
+
+/// The modes are read by their letters; the crate knows two of them at most, and wants a count.
+fn readable_gns(fields: &mut [String]) {
+    fields[6] = "N".to_owned();
+    if fields[7].is_empty() {
+        fields[7] = "0".to_owned();
+    }
+    fields[11..].iter_mut().for_each(String::clear);
+}
+
+/// Only a date that exists, and no zone: some write its sign, and the time is UTC anyway.
+fn readable_zda(fields: &mut [String], report: &mut Report) {
+    let date = &fields[2..5];
+    let whole = |field: &String| field.parse::<u16>().unwrap_or(0);
+    let (day, month) = (u8::try_from(whole(&date[0])), u8::try_from(whole(&date[1])));
+    let real = |(day, month)| Date::new(i32::from(whole(&date[2])), month, day).is_some();
+    if !day.ok().zip(month.ok()).is_some_and(real) {
+        if date.iter().all(|field| !field.is_empty()) {
+            report.left_out.push("ZDA date");
+        }
+        fields[2..5].iter_mut().for_each(String::clear);
+    }
+    fields[5..].iter_mut().for_each(String::clear);
 }
 
 /// Modes in which a receiver has measured its position: autonomous, differential, precise, RTK.
@@ -137,22 +281,22 @@ fn of_rmc(report: &mut Report, data: &RmcData, sentence: &Sentence<'_>) {
     report.valid = Some(valid);
     report.date = data.fix_date.and_then(|date| Date::new(date.year(), date.month() as u8, date.day() as u8));
     if valid {
-        report.position_deg = data.lat.zip(data.lon);
         report.speed_mps = data.speed_over_ground.map(|knots| decimal(knots) * KNOT_MPS);
         report.course_deg = data.true_course.map(decimal);
     }
 }
 
-fn of_gga(report: &mut Report, data: &GgaData) {
+fn of_gga(report: &mut Report, data: &GgaData, sentence: &Sentence<'_>) {
+    let quality_known = matches!(sentence.field(6).as_bytes(), [b'0'..=b'9']);
     let measured = data.fix_type.is_some_and(|fix| {
         !matches!(fix, FixType::Invalid | FixType::Estimated | FixType::Manual | FixType::Simulation)
     });
-    // A fix of no satellites is one only if another sentence says so.
-    report.valid = (!measured || data.fix_satellites != Some(0)).then_some(measured);
+    // A fix of no satellites, or of a quality unknown, is one only if another sentence says so.
+    let decided = quality_known && (!measured || data.fix_satellites != Some(0));
+    report.valid = decided.then_some(measured);
     report.sats = data.fix_satellites;
     report.hdop = data.hdop.map(decimal);
-    if measured {
-        report.position_deg = data.latitude.zip(data.longitude);
+    if report.valid != Some(false) {
         report.alt_msl_m = data.altitude.map(decimal);
         report.geoid_m = data.geoid_separation.map(decimal);
     }
@@ -162,21 +306,17 @@ fn of_gns(report: &mut Report, data: &GnsData, sentence: &Sentence<'_>) {
     let mode = sentence.field(6);
     let measured = !mode.is_empty() && mode_is_measured(mode);
     report.valid = Some(measured);
-    report.sats = Some(u32::from(data.nsattelites));
+    let count_given = !sentence.field(7).is_empty() && !report.left_out.contains(&"GNS satellites");
+    report.sats = count_given.then_some(u32::from(data.nsattelites));
     report.hdop = data.hdop.map(decimal);
     if measured {
-        report.position_deg = data.lat.zip(data.lon);
         report.alt_msl_m = data.alt.map(decimal);
         report.geoid_m = data.geoid_separation.map(decimal);
     }
 }
 
 fn of_gll(report: &mut Report, data: &GllData, sentence: &Sentence<'_>) {
-    let valid = data.valid && mode_is_measured(sentence.field(7));
-    report.valid = Some(valid);
-    if valid {
-        report.position_deg = data.latitude.zip(data.longitude);
-    }
+    report.valid = Some(data.valid && mode_is_measured(sentence.field(7)));
 }
 
 fn of_gsa(report: &mut Report, data: &GsaData, sentence: &Sentence<'_>) -> Result<(), Refusal> {
@@ -190,7 +330,7 @@ fn of_gsa(report: &mut Report, data: &GsaData, sentence: &Sentence<'_>) -> Resul
 fn gsa_by_fields(report: &mut Report, sentence: &Sentence<'_>) -> Result<(), Refusal> {
     report.fix = Some(gsa_fix(sentence)?);
     report.sats_listed = Some((3..=14).filter(|&index| !sentence.field(index).is_empty()).count() as u32);
-    report.hdop = sentence.number(16, 0.0, 9_999.0)?;
+    report.hdop = sentence.number(16, 0.0, 9_999.0).unwrap_or(None);
     Ok(())
 }
 
@@ -205,7 +345,8 @@ fn gsa_fix(sentence: &Sentence<'_>) -> Result<FixKind, Refusal> {
 
 fn of_vtg(report: &mut Report, data: &VtgData, sentence: &Sentence<'_>) {
     if mode_is_measured(sentence.field(9)) {
-        report.speed_mps = data.speed_over_ground.map(|knots| decimal(knots) * KNOT_MPS);
+        let by_kmh = || sentence.number(7, 0.0, 4_000.0).unwrap_or(None).map(|kmh| kmh / 3.6);
+        report.speed_mps = data.speed_over_ground.map(|knots| decimal(knots) * KNOT_MPS).or_else(by_kmh);
         report.course_deg = data.true_course.map(decimal);
     }
 }
@@ -222,6 +363,8 @@ fn decimal(value: f32) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     fn said(body: &str) -> Result<Option<Report>, Refusal> {
@@ -262,10 +405,102 @@ mod tests {
     #[test]
     fn what_cannot_be_is_refused() {
         assert_eq!(said("GPGGA,101112,9912.0,N,08530.0,E,1,08,1.1,10.0,M,0.0,M,,"), Err(Refusal::OutOfRange));
-        assert_eq!(said("GPGGA,101112,3030.0,N,08530.0,E,1,08,1.1,NaN,M,0.0,M,,"), Err(Refusal::Malformed));
         assert_eq!(said("GPRMC,251112,A,3030.0,N,08530.0,W,0.1,,010226,,"), Err(Refusal::OutOfRange));
         assert_eq!(said("GPRMC,101112"), Err(Refusal::Malformed));
         assert_eq!(said("GPGSA,A,7"), Err(Refusal::Malformed));
+    }
+
+    #[test]
+    fn a_field_that_cannot_be_is_left_out_alone() {
+        let rmc = |motion: &str, variation: &str| {
+            format!("GPRMC,101112,A,3030.0,N,08530.0,W,{motion},010226,{variation},A")
+        };
+        let gga = |fields: &str| format!("GPGGA,101112,3030.0,N,08530.0,W,{fields},,");
+        for (body, left_out) in [
+            (rmc("5.0,90.0", "999.9000,E"), "RMC magnetic variation"),
+            (rmc("5.0,90.0", "0,N"), "RMC magnetic variation"),
+            (rmc("5.0,90.0", "3.4,"), "RMC magnetic variation"),
+            (rmc("5.0,-45", ","), "RMC course"),
+            (rmc("5.0,360.01", ","), "RMC course"),
+            (rmc("-5.0,90.0", ","), "RMC speed"),
+            (gga("1,08,10000,43.0,M,50.0,M"), "GGA HDOP"),
+            (gga("1,08,1.1,NaN,M,50.0,M"), "GGA altitude"),
+            (gga("1,08,1.1,43.0,f,50.0,M"), "GGA altitude"),
+            (gga("1,8.5,1.1,43.0,M,50.0,M"), "GGA satellites"),
+            (gga("x,08,1.1,43.0,M,50.0,M"), "GGA quality"),
+        ] {
+            let report = report(&body);
+            assert_eq!(report.left_out, [left_out], "{body}");
+            assert_eq!(report.position_deg, Some((30.5, -85.5)), "{body}");
+            assert_eq!(report.time_of_day_ns, Some(36_672_000_000_000), "{body}");
+            if body.starts_with("GPRMC") {
+                assert_eq!((report.valid, report.date), (Some(true), Date::new(2026, 2, 1)), "{body}");
+                assert_eq!(report.speed_mps.is_some(), left_out != "RMC speed", "{body}");
+                assert_eq!(report.course_deg.is_some(), left_out != "RMC course", "{body}");
+            } else {
+                let altitude = (left_out != "GGA altitude").then_some(43.0);
+                assert_eq!((report.alt_msl_m, report.geoid_m), (altitude, Some(50.0)), "{body}");
+                assert_eq!(report.valid, (left_out != "GGA quality").then_some(true), "{body}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_nobody_needs_is_not_read() {
+        assert_eq!(report("GPZDA,120000.00,18,11,2026,+00,00").date, Date::new(2026, 11, 18));
+        assert_eq!(report("GPZDA,120000.00,18,11,2026,-15,99").date, Date::new(2026, 11, 18));
+        let nowhere = report("GPZDA,120000.00,31,02,2026,00,00");
+        assert_eq!((nowhere.date, nowhere.left_out), (None, vec!["ZDA date"]));
+        let long = report(
+            "GPGGA,101112.000000,3030.000000000000,N,08530.000000000000,W,9,08,1.100000,43.000000,M,50.000000,M,12.0,0123",
+        );
+        assert_eq!((long.valid, long.position_deg), (Some(true), Some((30.5, -85.5))));
+        assert_eq!((long.alt_msl_m, long.hdop, long.left_out.len()), (Some(43.0), Some(1.1), 0));
+        let metric = report("GPVTG,90.0,T,,M,999999,N,36.0,K,A");
+        assert_eq!((metric.speed_mps, metric.left_out), (Some(10.0), vec!["VTG speed in knots"]));
+    }
+
+    #[test]
+    fn a_gns_has_a_mode_for_each_constellation() {
+        for modes in ["A", "AN", "NNR", "RRRR", "DDDDDD", "XXA"] {
+            let gns =
+                report(&format!("GNGNS,120000.00,3030.0,N,08530.0,W,{modes},14,0.6,50.1,48.0,1.0,0000,V"));
+            assert_eq!(gns.valid, Some(true), "{modes}");
+            assert_eq!(gns.position_deg, Some((30.5, -85.5)), "{modes}");
+            assert_eq!((gns.alt_msl_m, gns.geoid_m, gns.sats), (Some(50.1), Some(48.0), Some(14)), "{modes}");
+        }
+        for modes in ["", "N", "NNNN", "EEE", "MS"] {
+            let gns = report(&format!("GNGNS,120000.00,3030.0,N,08530.0,W,{modes},,,50.1,48.0"));
+            assert_eq!((gns.valid, gns.position_deg, gns.sats), (Some(false), None, None), "{modes}");
+        }
+    }
+
+    /// A sound sentence of each kind with a position, and the fields that decide over it.
+    const POSITIONED: [(&str, &[usize]); 4] = [
+        ("GPRMC,101112,A,3030.0,N,08530.0,W,5.0,90.0,010226,3.4,W,A,V", &[1, 2, 3, 4, 5, 6, 12]),
+        ("GPGGA,101112,3030.0,N,08530.0,W,1,08,1.1,43.0,M,50.0,M,1.0,0001", &[1, 2, 3, 4, 5]),
+        ("GNGNS,101112,3030.0,N,08530.0,W,AAN,14,0.6,50.1,48.0,1.0,0000,V", &[1, 2, 3, 4, 5, 6]),
+        ("GPGLL,3030.0,N,08530.0,W,101112,A,A", &[1, 2, 3, 4, 5, 6, 7]),
+    ];
+
+    proptest! {
+        #[test]
+        fn no_field_but_those_that_decide_takes_the_position(
+            which in 0usize..4,
+            at in 0usize..20,
+            junk in "[-+.0-9A-Za-z ]{0,24}",
+        ) {
+            let (body, deciding) = POSITIONED[which];
+            let mut fields: Vec<&str> = body.split(',').collect();
+            let at = 1 + at % (fields.len() - 1);
+            prop_assume!(!deciding.contains(&at));
+            fields[at] = &junk;
+            let report = report(&fields.join(","));
+            prop_assert!(report.valid != Some(false) || Kind::Gga == report.kind);
+            prop_assert_eq!(report.position_deg.is_some(), report.valid != Some(false));
+            prop_assert_eq!(report.time_of_day_ns, Some(36_672_000_000_000));
+            prop_assert!(report.left_out.len() <= 1);
+        }
     }
 
     #[test]

@@ -47,10 +47,11 @@ impl SourceLines {
     }
 }
 
-/// How many pieces were refused, and the reasons.
+/// How many pieces were refused, and the reasons, with the fields left out of the others.
 pub(super) fn refused(counts: &DecodeCounts) -> (u64, String) {
-    let reasons: Vec<String> = counts.refusals().map(|(why, n)| format!("{n} {}", why.words())).collect();
-    (counts.refused_total(), reasons.join(", "))
+    let reasons = counts.refusals().map(|(why, n)| format!("{n} {}", why.words()));
+    let fields = counts.left_out().map(|(field, n)| format!("{n} without {field}"));
+    (counts.refused_total(), reasons.chain(fields).collect::<Vec<_>>().join(", "))
 }
 
 /// Time on the wire: ten bits a byte (8N1).
