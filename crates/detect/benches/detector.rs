@@ -13,6 +13,7 @@ use windhover_detect::tracking::FrameDetector;
 use windhover_detect::{Detector, GrayImage, ImageView, Limits, Roi, Simd, TagFamily, tag_pattern};
 
 #[path = "../tests/detector/common.rs"]
+#[expect(dead_code, reason = "the discs of the tests are not timed")]
 mod common;
 
 fn put_tag(image: &mut GrayImage, id: u32, at: (usize, usize), cell: usize) {
