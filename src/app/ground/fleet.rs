@@ -94,7 +94,7 @@ fn configuration(words: &str) -> zenoh::Result<zenoh::Config> {
 }
 
 impl Fleet {
-    /// Joins Zenoh as told (see [`configuration`]) and answers queries out of the files under `root`, until
+    /// Joins Zenoh as told (see `configuration`) and answers queries out of the files under `root`, until
     /// the program ends.
     pub async fn open(words: &str, root: PathBuf) -> zenoh::Result<Self> {
         let session = zenoh::open(configuration(words)?).await?;
