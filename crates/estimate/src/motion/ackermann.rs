@@ -1,8 +1,6 @@
 //! A car: it rolls, and turns only as it rolls.
 
-use super::{Intensities, VehicleMotion, rolling};
-use crate::blocks::{TARGET, TargetBlock};
-use crate::matrix::Grid;
+use super::VehicleMotion;
 
 /// Steepest wheel angle of a car-like vehicle, rad: 40° is at the upper end of what is built.
 const MAX_STEER: f64 = 0.7;
@@ -28,23 +26,5 @@ impl VehicleMotion for Ackermann {
     /// Half the tightest turn as one sigma, changing over a second; a thousandth of a radian a second at rest.
     fn most_yaw_rate_q(&self, speed2: f64) -> Option<f64> {
         self.max_curvature.map(|curvature| 2.0 * (0.5 * curvature).powi(2) * speed2 + 1e-6)
-    }
-
-    fn advance(&self, mean: &mut [f64; TARGET], dt: f64) {
-        rolling::advance(mean, dt);
-    }
-
-    fn carry(
-        &self,
-        mean: &[f64; TARGET],
-        dt: f64,
-        at: TargetBlock,
-        grids: &mut dyn Iterator<Item = &mut Grid>,
-    ) {
-        rolling::carry(mean, dt, at, grids);
-    }
-
-    fn add_noise(&self, mean: &[f64; TARGET], dt: f64, walks: Intensities, at: TargetBlock, p: &mut Grid) {
-        rolling::add_noise(mean, dt, walks, at, p);
     }
 }

@@ -46,20 +46,27 @@ pub(crate) trait VehicleMotion {
     /// The largest intensity of the yaw rate's walk at a squared speed; `None` where speed does not bound it.
     fn most_yaw_rate_q(&self, speed2: f64) -> Option<f64>;
 
-    /// Carries the mean on.
-    fn advance(&self, mean: &mut [f64; TARGET], dt: f64);
+    /// Carries the mean on; by itself, as a vehicle that rolls where it points.
+    fn advance(&self, mean: &mut [f64; TARGET], dt: f64) {
+        rolling::advance(mean, dt);
+    }
 
-    /// `row ← row Fᵀ` for all rows of the grids, in the columns of `at`; F is taken at `mean`.
+    /// `row ← row Fᵀ` for all rows of the grids, in the columns of `at`; F is taken at `mean`, and is that of
+    /// [`Self::advance`].
     fn carry(
         &self,
         mean: &[f64; TARGET],
         dt: f64,
         at: TargetBlock,
         grids: &mut dyn Iterator<Item = &mut Grid>,
-    );
+    ) {
+        rolling::carry(mean, dt, at, grids);
+    }
 
     /// Adds Q of the step from `mean`.
-    fn add_noise(&self, mean: &[f64; TARGET], dt: f64, walks: Intensities, at: TargetBlock, p: &mut Grid);
+    fn add_noise(&self, mean: &[f64; TARGET], dt: f64, walks: Intensities, at: TargetBlock, p: &mut Grid) {
+        rolling::add_noise(mean, dt, walks, at, p);
+    }
 }
 
 /// The models of motion: a row each.
