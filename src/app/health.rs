@@ -4,7 +4,7 @@ use tracing::Level;
 
 use crate::config::Config;
 use crate::io::records::DaemonFigures;
-use windhover_base::msg::{FixKind, Health, Source, SourceHealth, TargetHealth, TrackStatus};
+use windhover_base::msg::{Health, Source, SourceHealth, TargetHealth, TrackStatus};
 use windhover_base::time::Span;
 
 use super::callsite::RuntimeCallsite;
@@ -191,17 +191,12 @@ impl HealthLine {
 
 /// The fields and their values; the fields are the same whatever the health is.
 fn fields(health: &Health, targets: &[String], figures: Option<&Figures>) -> Fields {
-    let fix = match health.fix {
-        FixKind::None => "none",
-        FixKind::TwoD => "2d",
-        FixKind::ThreeD => "3d",
-    };
     let mut fields = Fields::default();
     fields.0.push(("t_ns".into(), Some(Value::Time(health.t.ns()))));
     for &source in Source::ALL {
         fields.source(&health.source(source));
         if source == Source::Gps {
-            fields.text("fix", Some(fix));
+            fields.text("fix", Some(health.fix.name()));
             fields.count("sats", health.sats.map(u64::from));
         }
     }

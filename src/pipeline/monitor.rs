@@ -171,12 +171,11 @@ impl Monitor {
         clock_sigma: Option<Span>,
         out: &mut Vec<Output>,
     ) {
-        let had = self.fix != FixKind::None;
-        let has = fix != FixKind::None;
+        let had = self.fix.has_position();
+        let has = fix.has_position();
         if has && !had {
             let satellites = sats.map_or(String::new(), |n| format!(", {n} satellites"));
-            let kind = if fix == FixKind::ThreeD { "3d" } else { "2d" };
-            let detail = format!("the receiver has a {kind} fix{satellites}");
+            let detail = format!("the receiver has a {} fix{satellites}", fix.name());
             out.push(notice(t, NoticeKind::FixAcquired, Some(Source::Gps), detail));
         } else if had && !has {
             let detail = "the receiver has no fix".to_owned();

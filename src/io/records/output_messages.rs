@@ -35,7 +35,15 @@ pub(super) fn fix_number(fix: FixKind) -> u32 {
     match fix {
         FixKind::None => 0,
         FixKind::TwoD => 2,
-        FixKind::ThreeD => 3,
+        FixKind::ThreeD | FixKind::RtkFloat | FixKind::RtkFixed => 3,
+    }
+}
+
+pub(super) fn rtk(fix: FixKind) -> wh::Rtk {
+    match fix {
+        FixKind::RtkFloat => wh::Rtk::Float,
+        FixKind::RtkFixed => wh::Rtk::Fixed,
+        FixKind::None | FixKind::TwoD | FixKind::ThreeD => wh::Rtk::None,
     }
 }
 

@@ -19,7 +19,7 @@ pub struct Stamped<T> {
     pub value: T,
 }
 
-/// What kind of fix a receiver reports.
+/// What kind of fix a receiver reports; each says more than the one before.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug, Default)]
 pub enum FixKind {
     /// No position.
@@ -29,6 +29,31 @@ pub enum FixKind {
     TwoD,
     /// Position and height.
     ThreeD,
+    /// Position and height, from carrier phases of unknown whole cycles (GGA quality 5): decimetres.
+    RtkFloat,
+    /// Position and height, from carrier phases of known whole cycles (GGA quality 4): centimetres.
+    RtkFixed,
+}
+
+impl FixKind {
+    /// Whether there is a position.
+    pub fn has_position(self) -> bool {
+        self != Self::None
+    }
+
+    /// Whether there is a position with its height.
+    pub fn has_height(self) -> bool {
+        self >= Self::ThreeD
+    }
+
+    /// `none`, `2d` or `3d`, as logs and files tell it: RTK is `3d`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::TwoD => "2d",
+            Self::ThreeD | Self::RtkFloat | Self::RtkFixed => "3d",
+        }
+    }
 }
 
 /// Everything a receiver said of one instant. `None` where it did not say.
