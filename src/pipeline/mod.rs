@@ -364,7 +364,10 @@ impl Pipeline {
                 EstimatorOutput::Reset { reason } => {
                     out.push(notice(t, NoticeKind::FilterReset, None, (*reason).to_owned()));
                 }
-                EstimatorOutput::Smoothed(_) | EstimatorOutput::Ownship(_) => {}
+                EstimatorOutput::Smoothed(_)
+                | EstimatorOutput::Ownship(_)
+                | EstimatorOutput::TiltFelt { .. }
+                | EstimatorOutput::Misfit(_) => {}
             }
             out.push(Output::Estimator(estimated));
         }

@@ -113,7 +113,10 @@ impl OutputEncoder {
             EstimatorOutput::Smoothed(e) => self.state(topic::target_smoothed(self.name(e)), e, log, out),
             EstimatorOutput::Fusion(result) => out.push(fusion(result, log)),
             // The pipeline's notice tells of these.
-            EstimatorOutput::Anchored { .. } | EstimatorOutput::Reset { .. } => {}
+            EstimatorOutput::Anchored { .. }
+            | EstimatorOutput::Reset { .. }
+            | EstimatorOutput::TiltFelt { .. }
+            | EstimatorOutput::Misfit(_) => {}
         }
     }
 

@@ -176,6 +176,42 @@ pub struct Ownship {
     pub attitude_sigma_rad: Vector3<f64>,
 }
 
+/// What a tilt sensor is found to feel.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum FeltTilt {
+    /// Attitude, as an AHRS tells it.
+    Attitude,
+    /// Specific force.
+    Force,
+    /// A share of the tilt.
+    Share(f64),
+}
+
+/// Something measured does not fit what the configuration, or the filter's model, says of it.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Misfit {
+    /// When it was found, host time.
+    pub t: MonoTime,
+    /// Which source.
+    pub source: FusionSource,
+    /// The figure that shows it; see [`MisfitCause`].
+    pub figure: f64,
+    /// What does not fit.
+    pub cause: MisfitCause,
+}
+
+/// What does not fit.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum MisfitCause {
+    /// The tilt sensor feels something else than configured. Figure: slope of acceleration over what the reading
+    /// means, 1 where it tells the tilt.
+    TiltKind(FeltTilt),
+    /// It errs more than it is said to. Figure: mean normalised square of its innovations, 1 where they fit.
+    Noise,
+    /// It errs to one side. Figure: mean of its innovations over what they should scatter by.
+    Bias,
+}
+
 /// What the joint filter says.
 #[derive(Clone, PartialEq, Debug)]
 pub enum EstimatorOutput {
@@ -192,6 +228,15 @@ pub enum EstimatorOutput {
         /// By how much, NED.
         moved_m: Vector3<f64>,
     },
+    /// What the tilt sensor feels was found out, and is believed from here on.
+    TiltFelt {
+        /// What it feels.
+        felt: FeltTilt,
+        /// Slope of acceleration over what the reading means.
+        slope: f64,
+    },
+    /// Something measured does not fit.
+    Misfit(Misfit),
     /// The filter started again.
     Reset {
         /// Why.

@@ -13,8 +13,8 @@ mod source;
 mod warm_state;
 
 pub use estimate::{
-    Disposition, EstimatorOutput, FusionResult, FusionSource, Ownship, TargetEstimate, TargetState,
-    TrackStatus,
+    Disposition, EstimatorOutput, FeltTilt, FusionResult, FusionSource, Misfit, MisfitCause, Ownship,
+    TargetEstimate, TargetState, TrackStatus,
 };
 pub use event::{Event, EventBody, FrameEncoding, FramePayload};
 pub use family::{FamilySpec, TagFamily};

@@ -14,6 +14,6 @@ pub use montecarlo::{Distribution, MonteCarloConfig};
 pub use rig::Rig;
 pub use sensors::{
     CameraConfig, CameraMount, CompassConfig, CompassFormat, Datum, Declination, GpsConfig, GroundConfig,
-    GroundSource, PixelFormat,
+    GroundSource, PixelFormat, TiltKind,
 };
 pub use target::{Brightness, MarkerConfig, MarkerKind, TargetConfig, TargetModel};
