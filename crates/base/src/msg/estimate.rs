@@ -52,6 +52,14 @@ pub enum FusionSource {
     CompassHeading,
     /// Compass tilt.
     CompassTilt,
+    /// Heading of the second source of attitude.
+    AttitudeHeading,
+    /// Tilt of the second source of attitude.
+    AttitudeTilt,
+    /// Rates of turn.
+    ImuRate,
+    /// Specific forces.
+    ImuForce,
     /// A marker's pixels.
     Marker,
     /// A ground feature's pixel.
@@ -66,6 +74,10 @@ impl FusionSource {
             Self::GpsVelocity => "gps_velocity",
             Self::CompassHeading => "compass_heading",
             Self::CompassTilt => "compass_tilt",
+            Self::AttitudeHeading => "attitude_heading",
+            Self::AttitudeTilt => "attitude_tilt",
+            Self::ImuRate => "imu_rate",
+            Self::ImuForce => "imu_force",
             Self::Marker => "marker",
             Self::Feature => "feature",
         }
@@ -188,6 +200,9 @@ pub enum FeltTilt {
 }
 
 /// Something measured does not fit what the configuration, or the filter's model, says of it.
+///
+/// The filter tells it as often as it finds it, at most once a second for the same source and cause. The pipeline
+/// tells the operator once, again where the figure changes, and counts it as over when it was not told for a while.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Misfit {
     /// When it was found, host time.
@@ -210,6 +225,36 @@ pub enum MisfitCause {
     Noise,
     /// It errs to one side. Figure: mean of its innovations over what they should scatter by.
     Bias,
+    /// More of its measurements lie outside the gate than should. Figure: their share.
+    Outside,
+    /// A tag's edge is not its `size_m`, as another marker of the target shows. Figure: measured over configured.
+    MarkerSize(MarkerPair),
+    /// A marker lies elsewhere on its target, as another one shows. Figure: by how much, m.
+    MarkerPlace(MarkerPair),
+    /// A marker is turned on its target, as another one shows. Figure: by how much, rad, clockwise from above.
+    MarkerTurn(MarkerPair),
+    /// Markers show another height over the ground than receiver and ground do. Figure: by how much higher, m.
+    Height,
+    /// What was taken for ground moves. Figure: share of the tracked features.
+    MovingGround,
+    /// A vehicle turns faster than its model can. Figure: its yaw rate over the model's bound.
+    TargetTurns {
+        /// Index of the target in the configuration.
+        target: usize,
+    },
+    /// Its measurements are true earlier than their stamps say. Figure: by how much, s.
+    Late,
+}
+
+/// A marker that does not fit, and the one that shows it: indices in the configuration.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct MarkerPair {
+    /// The target.
+    pub target: usize,
+    /// Its marker that does not fit.
+    pub marker: usize,
+    /// Its marker that it was measured against.
+    pub against: usize,
 }
 
 /// What the joint filter says.

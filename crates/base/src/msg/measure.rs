@@ -102,6 +102,15 @@ pub struct AttitudeSample {
     pub tilt: Option<Tilt>,
 }
 
+/// Rates of turn and specific forces. `None` where the device has no such sensors.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub struct InertialSample {
+    /// Rate of turn about each axis, rad/s.
+    pub rate_rps: Option<Vector3<f64>>,
+    /// Specific force along each axis, m/s²: level and at rest (0, 0, −9.8) in forward-right-down.
+    pub force_mps2: Option<Vector3<f64>>,
+}
+
 /// What a source's bytes were decoded to.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum SensorReading {

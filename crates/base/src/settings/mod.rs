@@ -4,12 +4,14 @@
 //! ranges are made where the whole configuration is read.
 
 mod estimator;
+mod inertial;
 mod montecarlo;
 mod rig;
 mod sensors;
 mod target;
 
 pub use estimator::{DetectorConfig, EstimatorConfig};
+pub use inertial::{AttitudeConfig, ImuConfig};
 pub use montecarlo::{Distribution, MonteCarloConfig};
 pub use rig::Rig;
 pub use sensors::{
