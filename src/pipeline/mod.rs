@@ -11,7 +11,6 @@ mod site;
 mod ticks;
 
 pub use settings::PipelineSettings;
-pub use ticks::next_tick;
 
 use std::sync::Arc;
 
@@ -19,7 +18,7 @@ use crate::pixels::{self, DecodedFrame, FrameFault};
 use lines::SourceLines;
 use monitor::{Monitor, notice};
 use site::SiteFinder;
-use ticks::Ticks;
+use ticks::{Due, Schedule};
 use windhover_base::geo::{Geodetic, Tile};
 use windhover_base::msg::{
     AttitudeSample, Delivery, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload,
@@ -44,7 +43,7 @@ pub struct Pipeline {
     /// An earlier run's filter, until there is one to continue it.
     warm: Option<WarmFilter>,
     monitor: Monitor,
-    ticks: Ticks,
+    schedule: Schedule,
     /// Time of the last event or tick.
     now: MonoTime,
     last_exposure: Option<MonoTime>,
@@ -84,7 +83,7 @@ impl Pipeline {
             estimators: None,
             warm: None,
             monitor: Monitor::new(watched, names),
-            ticks: Ticks::default(),
+            schedule: Schedule::new(settings.filter.ownship_hz),
             now: MonoTime::default(),
             last_exposure: None,
             outputs: Vec::new(),
@@ -113,7 +112,12 @@ impl Pipeline {
     /// The latest tick that is due at `now`; `None` where it was made already. Where nothing arrives, an
     /// [`EventBody::Tick`] of this time lets time pass.
     pub fn tick_due(&mut self, now: MonoTime) -> Option<MonoTime> {
-        self.ticks.due(now)
+        self.schedule.due(now)
+    }
+
+    /// The first tick after `now`: so long whoever feeds the pipeline may wait for an event.
+    pub fn next_tick(&self, now: MonoTime) -> MonoTime {
+        self.schedule.next(now)
     }
 
     /// As [`Self::handle`], with the event's frame already decoded elsewhere.
@@ -124,8 +128,11 @@ impl Pipeline {
         out: &mut Vec<TimedOutput>,
     ) {
         let mut outputs = std::mem::take(&mut self.outputs);
-        for t in self.ticks.until(event.t_recv) {
-            self.tick(t, event.seq, &mut outputs);
+        for (t, due) in self.schedule.until(event.t_recv) {
+            match due {
+                Due::TimeOuts => self.time_outs(t, event.seq, &mut outputs),
+                Due::Ownship => self.ownship(t, &mut outputs),
+            }
             self.pass_on(t, &mut outputs, out);
         }
         if !matches!(event.body, EventBody::Tick) {
@@ -141,7 +148,7 @@ impl Pipeline {
         out.extend(outputs.drain(..).map(|output| TimedOutput { t_cause: t, output }));
     }
 
-    fn tick(&mut self, t: MonoTime, seq: u64, out: &mut Vec<Output>) {
+    fn time_outs(&mut self, t: MonoTime, seq: u64, out: &mut Vec<Output>) {
         self.monitor.advance(t, out);
         for &source in Source::ALL {
             if let Some(line) = self.lines.of(source) {
@@ -153,6 +160,12 @@ impl Pipeline {
             estimators.joint.tick(t, &mut self.estimated);
         }
         self.take_estimated(t, out);
+    }
+
+    /// The helicopter's own state, whether there are frames or not.
+    fn ownship(&mut self, t: MonoTime, out: &mut Vec<Output>) {
+        let told = self.estimators.as_mut().and_then(|estimators| estimators.joint.ownship(t));
+        out.extend(told.map(|own| Output::Estimator(EstimatorOutput::Ownship(own))));
     }
 
     fn event(

@@ -17,11 +17,8 @@ pub(super) fn section(context: &Context<'_>, pictures: &Pictures) -> Option<Sect
     for (name, track) in &context.flight.targets {
         body += &paragraph(&of_target(context, name, track));
     }
-    if context.flight.targets.is_empty() {
-        body += &paragraph(
-            "It holds no estimates: it is a bare capture. Replay it (windhover replay CAPTURE.mcap --out \
-             FLIGHT.mcap) and report the result.",
-        );
+    if let Some(words) = without_targets(context) {
+        body += &paragraph(words);
     }
     body += &tiles(&figures(context));
     let troubles = troubles(context, pictures);
@@ -32,6 +29,22 @@ pub(super) fn section(context: &Context<'_>, pictures: &Pictures) -> Option<Sect
         body += &list("", &troubles);
     }
     Some(Section { id: "summary", title: "Summary", body })
+}
+
+/// What to say where there is nothing of any vehicle.
+fn without_targets(context: &Context<'_>) -> Option<&'static str> {
+    let flight = context.flight;
+    match (flight.targets.is_empty(), flight.ownship.is_empty()) {
+        (false, _) => None,
+        (true, false) => Some(
+            "No frame came from the camera, so no vehicle was looked for: the report tells of the helicopter's own \
+             flight alone.",
+        ),
+        (true, true) => Some(
+            "It holds no estimates: it is a bare capture. Replay it (windhover replay CAPTURE.mcap --out \
+             FLIGHT.mcap) and report the result.",
+        ),
+    }
 }
 
 fn opening(context: &Context<'_>) -> String {
@@ -175,6 +188,9 @@ fn figures(context: &Context<'_>) -> Vec<(String, String)> {
 fn troubles(context: &Context<'_>, pictures: &Pictures) -> Vec<String> {
     let flight = context.flight;
     let mut found = flight.warnings.clone();
+    if !flight.had_frames() && !flight.health.is_empty() {
+        found.push("No frame came from the camera.".to_owned());
+    }
     for stream in streams(context) {
         let Some(t) = stream.timing() else { continue };
         if t.longest.0 > LONG_GAP * t.median_ms && t.longest.0 > 333.0 {

@@ -1,6 +1,6 @@
 //! Protobuf messages of what the pipeline says: our own, and Foxglove's where a schema exists.
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::{SMatrix, UnitQuaternion, Vector3};
 use prost_types::Timestamp;
 
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
@@ -145,7 +145,7 @@ pub fn ownship(own: &Ownship) -> wh::Ownship {
     let q = own.ned_from_body.quaternion();
     wh::Ownship {
         timestamp: stamp(own.t_valid),
-        frame: own.frame,
+        frame: own.frame.unwrap_or(0),
         lat_deg: own.lat_deg,
         lon_deg: own.lon_deg,
         height_m: own.height_m,
@@ -159,9 +159,16 @@ pub fn ownship(own: &Ownship) -> wh::Ownship {
         qx: q.i,
         qy: q.j,
         qz: q.k,
-        position_sigma_m: own.position_sigma_m.as_slice().to_vec(),
-        attitude_sigma_rad: own.attitude_sigma_rad.as_slice().to_vec(),
+        position_sigma_m: own.position_sigma_m().as_slice().to_vec(),
+        attitude_sigma_rad: own.attitude_sigma_rad().as_slice().to_vec(),
+        covariance: upper_triangle(&own.covariance),
+        between_frames: own.frame.is_none(),
     }
+}
+
+/// Row by row.
+fn upper_triangle<const N: usize>(p: &SMatrix<f64, N, N>) -> Vec<f64> {
+    (0..N).flat_map(|row| (row..N).map(move |column| p[(row, column)])).collect()
 }
 
 fn status(status: TrackStatus) -> wh::TrackStatus {
@@ -192,8 +199,7 @@ pub fn target_state(estimate: &TargetEstimate, name: &str) -> wh::TargetState {
         message.lat_deg = s.lat_deg;
         message.lon_deg = s.lon_deg;
         if let Some(p) = &s.covariance {
-            message.covariance =
-                (0..5).flat_map(|row| (row..5).map(move |column| p[(row, column)])).collect();
+            message.covariance = upper_triangle(p);
         }
     }
     message

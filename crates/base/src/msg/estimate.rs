@@ -168,8 +168,8 @@ pub struct TargetEstimate {
 pub struct Ownship {
     /// When.
     pub t_valid: MonoTime,
-    /// Number of the frame it belongs to.
-    pub frame: u32,
+    /// Number of the frame at whose exposure it is; `None` between frames.
+    pub frame: Option<u32>,
     /// North, east, down of the datum, metres.
     pub position_ned_m: Vector3<f64>,
     /// Velocity north, east, down, m/s.
@@ -182,10 +182,30 @@ pub struct Ownship {
     pub lon_deg: f64,
     /// Height above the ellipsoid, metres.
     pub height_m: f64,
+    /// Covariance of position (north, east, down; m), velocity (likewise; m/s) and attitude (small rotations about
+    /// north, east, down: `ned_from_body = exp(δ) estimate`; rad).
+    pub covariance: SMatrix<f64, 9, 9>,
+}
+
+impl Ownship {
     /// One-sigma of position (north, east, down), metres.
-    pub position_sigma_m: Vector3<f64>,
+    pub fn position_sigma_m(&self) -> Vector3<f64> {
+        self.sigma(0)
+    }
+
+    /// One-sigma of velocity (north, east, down), m/s.
+    pub fn velocity_sigma_mps(&self) -> Vector3<f64> {
+        self.sigma(3)
+    }
+
     /// One-sigma of attitude as small rotations about north, east, down, radians.
-    pub attitude_sigma_rad: Vector3<f64>,
+    pub fn attitude_sigma_rad(&self) -> Vector3<f64> {
+        self.sigma(6)
+    }
+
+    fn sigma(&self, first: usize) -> Vector3<f64> {
+        Vector3::from_fn(|i, _| self.covariance[(first + i, first + i)].max(0.0).sqrt())
+    }
 }
 
 /// What a tilt sensor is found to feel.
@@ -258,13 +278,14 @@ pub struct MarkerPair {
 }
 
 /// What the joint filter says.
+#[expect(clippy::large_enum_variant, reason = "a box would be an allocation for each of them")]
 #[derive(Clone, PartialEq, Debug)]
 pub enum EstimatorOutput {
     /// A target at a frame, as known when the frame had been looked at.
     Estimate(TargetEstimate),
     /// A target at an earlier frame, with what was measured up to the smoother's lag after it.
     Smoothed(TargetEstimate),
-    /// The helicopter at a frame.
+    /// The helicopter at a frame, or between frames.
     Ownship(Ownship),
     /// What became of a measurement.
     Fusion(FusionResult),
