@@ -5,7 +5,10 @@
 //! looked at, so a replay of the same events gives the same outputs to the last bit.
 
 mod lines;
+mod misfit_words;
+mod misfits;
 mod monitor;
+mod seen;
 mod settings;
 mod site;
 mod ticks;
@@ -16,14 +19,16 @@ use std::sync::Arc;
 
 use crate::pixels::{self, DecodedFrame, FrameFault};
 use lines::SourceLines;
+use misfit_words::felt_words;
 use monitor::{Monitor, notice};
+use seen::SeenMarkers;
 use site::SiteFinder;
 use ticks::{Due, Schedule};
 use windhover_base::geo::{Geodetic, Tile};
 use windhover_base::msg::{
     AttitudeSample, Delivery, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload,
-    FramePrediction, GnssEpoch, MarkerDetection, MarkerId, NoticeKind, Output, SensorReading, Source,
-    Stamped, TargetEstimate, TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
+    FramePrediction, GnssEpoch, NoticeKind, Output, SensorReading, Source, Stamped, TargetEstimate,
+    TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
 };
 use windhover_base::settings::{MarkerKind, TargetConfig};
 use windhover_base::time::{MonoTime, Span};
@@ -43,6 +48,7 @@ pub struct Pipeline {
     /// An earlier run's filter, until there is one to continue it.
     warm: Option<WarmFilter>,
     monitor: Monitor,
+    seen: SeenMarkers,
     schedule: Schedule,
     /// Time of the last event or tick.
     now: MonoTime,
@@ -72,7 +78,6 @@ impl Pipeline {
         let mut lines = SourceLines::new(rig);
         let there = |source: &Source| source.delivers() == Delivery::Frames || lines.of(*source).is_some();
         let watched = Source::ALL.iter().copied().filter(there).collect();
-        let names = rig.target.iter().map(|target| target.name.clone()).collect();
         Self {
             want_rgb: wants_rgb(&rig.target),
             lines,
@@ -82,7 +87,8 @@ impl Pipeline {
             finder: SiteFinder::new(&settings, terrain),
             estimators: None,
             warm: None,
-            monitor: Monitor::new(watched, names),
+            monitor: Monitor::new(watched, rig),
+            seen: SeenMarkers::new(rig),
             schedule: Schedule::new(settings.filter.ownship_hz),
             now: MonoTime::default(),
             last_exposure: None,
@@ -312,7 +318,7 @@ impl Pipeline {
                 });
                 let rgb = decoded.rgb.as_ref();
                 self.detector.process(decoded.gray.view(), rgb, prediction, &mut self.observations);
-                self.note_seen();
+                self.note_seen(t, out);
                 out.push(Output::Detections {
                     frame: payload.index,
                     t_valid,
@@ -328,17 +334,14 @@ impl Pipeline {
         self.estimate(t_valid, event, out);
     }
 
-    fn note_seen(&mut self) {
-        for (index, target) in self.settings.rig.target.iter().enumerate() {
-            let of_target = |seen: &MarkerDetection| match seen.marker {
-                MarkerId::Disc { target, .. } => target == index,
-                MarkerId::Tag { family, id } => {
-                    target.marker.iter().any(|m| m.family == Some(family) && m.id == Some(id))
-                }
-            };
-            if self.observations.markers.iter().any(of_target) {
-                self.monitor.seen(index);
+    fn note_seen(&mut self, t: MonoTime, out: &mut Vec<Output>) {
+        for target in 0..self.settings.rig.target.len() {
+            if self.observations.markers.iter().any(|seen| self.seen.target_of(seen) == Some(target)) {
+                self.monitor.seen(target);
             }
+        }
+        for words in self.seen.twice(&self.observations, t) {
+            out.push(notice(t, NoticeKind::MarkerSeenTwice, Some(Source::Camera), words));
         }
     }
 
@@ -377,10 +380,13 @@ impl Pipeline {
                 EstimatorOutput::Reset { reason } => {
                     out.push(notice(t, NoticeKind::FilterReset, None, (*reason).to_owned()));
                 }
-                EstimatorOutput::Smoothed(_)
-                | EstimatorOutput::Ownship(_)
-                | EstimatorOutput::TiltFelt { .. }
-                | EstimatorOutput::Misfit(_) => {}
+                EstimatorOutput::TiltFelt { felt, slope } => {
+                    let detail =
+                        format!("the compass's tilt sensor {} (slope {slope:.2})", felt_words(*felt));
+                    out.push(notice(t, NoticeKind::TiltFelt, Some(Source::Compass), detail));
+                }
+                EstimatorOutput::Misfit(misfit) => self.monitor.misfit(misfit, t, out),
+                EstimatorOutput::Smoothed(_) | EstimatorOutput::Ownship(_) => {}
             }
             out.push(Output::Estimator(estimated));
         }

@@ -208,6 +208,7 @@ fn troubles(context: &Context<'_>, pictures: &Pictures) -> Vec<String> {
             ));
         }
     }
+    found.extend(misfits(context));
     if let Some(last) = flight.health.last() {
         for s in &last.sources {
             if s.refused > 0 {
@@ -240,4 +241,51 @@ fn troubles(context: &Context<'_>, pictures: &Pictures) -> Vec<String> {
         found.push(format!("{} of the frames looked at could not be read.", pictures.unreadable));
     }
     found
+}
+
+/// What did not fit the configuration: each thing once, as it was told last, and from when to when.
+fn misfits(context: &Context<'_>) -> Vec<String> {
+    let mut known: Vec<(&wh::Misfit, f64, f64)> = Vec::new();
+    for health in &context.flight.health {
+        let t = context.flight.at(health.timestamp.as_ref());
+        for misfit in &health.misfits {
+            let same = |m: &wh::Misfit| m.source == misfit.source && m.kind == misfit.kind;
+            match known.iter_mut().find(|(known, ..)| same(known)) {
+                Some((last, _, until)) => (*last, *until) = (misfit, t),
+                None => known.push((misfit, t, t)),
+            }
+        }
+    }
+    let sentence = |(m, from, until): &(&wh::Misfit, f64, f64)| {
+        let wh::Misfit { source, figure, cause, advice, .. } = m;
+        format!("{source} does not fit, {from:.0} to {until:.0} s: {cause} ({figure}). What to do: {advice}.")
+    };
+    known.iter().map(sentence).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::app::flight::Flight;
+
+    #[test]
+    fn what_did_not_fit_is_worth_a_look_once_with_its_last_figure() {
+        let misfit = |figure: &str| wh::Misfit {
+            source: "ugv tag 1".into(),
+            kind: "marker_size".into(),
+            figure: figure.into(),
+            cause: format!("tag 1 is wrong by {figure}"),
+            advice: "measure it".into(),
+        };
+        let health = |misfits| wh::Health { misfits, ..wh::Health::default() };
+        let health = vec![health(vec![]), health(vec![misfit("-4 %")]), health(vec![misfit("-5 %")])];
+        let flight = Flight { health, ..Flight::default() };
+        let page = section(&Context { flight: &flight, truth: None }, &Pictures::default());
+        let body = page.expect("there is always a summary").body;
+        assert!(
+            body.contains("Worth a look") && body.contains("-5 %") && body.contains("measure it"),
+            "{body}"
+        );
+        assert_eq!(body.matches("does not fit").count(), 1, "{body}");
+    }
 }

@@ -5,8 +5,8 @@ use prost_types::Timestamp;
 
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
 use windhover_base::msg::{
-    FeatureTrack, FixKind, Health, MarkerDetection, MarkerId, Notice, NoticeKind, Ownship, SourceHealth,
-    TargetEstimate, TrackStatus,
+    FeatureTrack, FixKind, Health, MarkerDetection, MarkerId, MisfitWords, Notice, NoticeKind, Ownship,
+    SourceHealth, TargetEstimate, TrackStatus,
 };
 use windhover_base::time::MonoTime;
 
@@ -215,6 +215,8 @@ pub(super) fn log_message(notice: &Notice) -> fox::Log {
         | NoticeKind::Dropped
         | NoticeKind::ClockJump
         | NoticeKind::TerrainMissing
+        | NoticeKind::ModelMisfit
+        | NoticeKind::MarkerSeenTwice
         | NoticeKind::BytesRefused => fox::log::Level::Warning,
         _ => fox::log::Level::Info,
     };
@@ -225,6 +227,11 @@ pub(super) fn log_message(notice: &Notice) -> fox::Log {
         name: notice.kind.name().into(),
         ..Default::default()
     }
+}
+
+fn misfit(words: &MisfitWords) -> wh::Misfit {
+    let MisfitWords { source, kind, figure, cause, advice } = words.clone();
+    wh::Misfit { source, kind: kind.into(), figure, cause, advice }
 }
 
 /// Health, as a message; `names` are the targets'.
@@ -253,6 +260,7 @@ pub fn health(now: &Health, names: &[String]) -> wh::Health {
         fix: fix_number(now.fix),
         sats: now.sats.unwrap_or(0),
         clock_sigma_ms: now.clock_sigma.map_or(-1.0, |s| s.ms()),
+        misfits: now.misfits.iter().map(misfit).collect(),
         dispositions: now.dispositions.iter().map(|(d, n)| (d.name().to_owned(), *n)).collect(),
         ..Default::default()
     }

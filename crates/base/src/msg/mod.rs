@@ -24,7 +24,7 @@ pub use measure::{
     AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, InertialSample, MarkerDetection,
     MarkerId, SensorReading, Stamped,
 };
-pub use notice::{Notice, NoticeKind};
+pub use notice::{MisfitWords, Notice, NoticeKind};
 pub use output::{Output, TimedOutput};
 pub use predict::{FramePrediction, MarkerPrediction};
 pub use source::{Delivery, PerSource, Source};
