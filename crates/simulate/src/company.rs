@@ -38,7 +38,7 @@ pub(super) struct Companion {
 #[derive(Clone, Debug)]
 enum Way {
     /// Beside the first vehicle: offset from it, north and east, and how it strays.
-    Walks { offset_m: (f64, f64), stray: [Wander; 2] },
+    Walks { offset_m: (f64, f64), stray: Box<[Wander; 2]> },
     /// Along the first vehicle's path, this far ahead and right of it.
     Drives { beside_m: (f64, f64) },
 }
@@ -96,7 +96,7 @@ impl Way {
         let (s, c) = bearing.sin_cos();
         let far_m = stream.uniform(NEAR_M.0, NEAR_M.1);
         let (rms, short_s, long_s) = STRAY;
-        let stray = [(); 2].map(|()| Wander::new(rms, short_s, long_s, &mut stream));
+        let stray = Box::new([(); 2].map(|()| Wander::new(rms, short_s, long_s, &mut stream)));
         Self::Walks { offset_m: (far_m * c, far_m * s), stray }
     }
 }
