@@ -6,11 +6,13 @@
 //! through the fit between them.
 
 mod fit;
+mod frames;
 mod jitter;
 mod steady;
 mod utc;
 
 pub use fit::{ClockFit, GnssClock};
+pub use frames::FrameClock;
 pub use steady::SteadyClock;
 pub use utc::{Civil, UtcTime, days_in_month};
 
