@@ -393,7 +393,10 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
                 }
                 EstimatorOutput::Smoothed(e) => s.add(&e, &world),
                 EstimatorOutput::Reset { .. } | EstimatorOutput::Anchored { .. } => resets += 1,
-                EstimatorOutput::Ownship(_) | EstimatorOutput::Fusion(_) => {}
+                EstimatorOutput::Ownship(_)
+                | EstimatorOutput::Fusion(_)
+                | EstimatorOutput::TiltFelt { .. }
+                | EstimatorOutput::Misfit(_) => {}
             }
         }
         for estimate in paper_out.drain(..) {

@@ -3,4 +3,5 @@
 mod filter;
 mod ground;
 mod honesty;
+mod ownship;
 mod time;
