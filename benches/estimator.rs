@@ -392,7 +392,7 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
                 }
                 EstimatorOutput::Smoothed(e) => s.add(&e, &world),
                 EstimatorOutput::Reset { .. } | EstimatorOutput::Anchored { .. } => resets += 1,
-                EstimatorOutput::Ownship(_) | EstimatorOutput::Fusion(_) => {}
+                EstimatorOutput::Coasted(_) | EstimatorOutput::Ownship(_) | EstimatorOutput::Fusion(_) => {}
             }
         }
         for estimate in paper_out.drain(..) {

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use windhover_base::msg::{
-    Disposition, FixKind, Health, Notice, NoticeKind, Output, PerSource, Source, SourceHealth,
-    TargetEstimate, TargetHealth, TrackStatus,
+    Disposition, FixKind, GnssEpoch, Health, Notice, NoticeKind, Output, PerSource, Source, SourceHealth,
+    Stamped, TargetEstimate, TargetHealth, TrackStatus,
 };
 use windhover_base::time::{MonoTime, Span};
 
@@ -31,6 +31,7 @@ pub(super) struct Monitor {
     fix: FixKind,
     sats: Option<u32>,
     clock_sigma: Option<Span>,
+    utc_minus_host: Option<Span>,
     targets: Vec<TargetHealth>,
     dispositions: BTreeMap<Disposition, u64>,
     began: Option<MonoTime>,
@@ -53,6 +54,7 @@ impl Monitor {
             fix: FixKind::None,
             sats: None,
             clock_sigma: None,
+            utc_minus_host: None,
             targets: (0..names.len()).map(|i| TargetHealth { frames_seen: 0, last: lost(i) }).collect(),
             names,
             dispositions: BTreeMap::new(),
@@ -85,6 +87,10 @@ impl Monitor {
             let quiet = t - count.last.unwrap_or(began);
             if !count.silent && quiet >= source.silent_after() {
                 count.silent = true;
+                if source == Source::Gps {
+                    // What a receiver said before it fell silent is no fix of now.
+                    (self.fix, self.sats) = (FixKind::None, None);
+                }
                 let detail = format!("nothing to use from the {} for {:.1} s", source.name(), quiet.s());
                 out.push(notice(t, NoticeKind::SourceSilent, Some(source), detail));
             }
@@ -111,6 +117,7 @@ impl Monitor {
             fix: self.fix,
             sats: self.sats,
             clock_sigma: self.clock_sigma,
+            utc_minus_host: self.utc_minus_host,
             targets: self.targets.clone(),
             dispositions: self.dispositions.clone(),
         };
@@ -162,15 +169,18 @@ impl Monitor {
         out.push(notice(t, NoticeKind::Dropped, Some(source), detail));
     }
 
-    /// The receiver's fix and the state of the time fit.
+    /// The receiver's fix and the state of the time fit, with one-sigma where the epoch was put in time by it.
     pub(super) fn fix(
         &mut self,
         t: MonoTime,
-        fix: FixKind,
-        sats: Option<u32>,
+        epoch: &Stamped<GnssEpoch>,
         clock_sigma: Option<Span>,
         out: &mut Vec<Output>,
     ) {
+        let GnssEpoch { fix, sats, utc, .. } = epoch.value;
+        if let (true, Some(utc), Some(_)) = (fix != FixKind::None, utc, clock_sigma) {
+            self.utc_minus_host = Some(Span::from_ns(utc.unix_ns() - epoch.t_valid.ns()));
+        }
         let had = self.fix != FixKind::None;
         let has = fix != FixKind::None;
         if has && !had {
@@ -190,6 +200,16 @@ impl Monitor {
         if let Some(target) = self.targets.get_mut(target) {
             target.frames_seen += 1;
         }
+    }
+
+    /// Whether a target is lost, or was never found.
+    pub(super) fn is_lost(&self, target: usize) -> bool {
+        self.targets.get(target).is_none_or(|target| target.last.status == TrackStatus::Lost)
+    }
+
+    /// Whether something is known of any target.
+    pub(super) fn is_any_known(&self) -> bool {
+        (0..self.targets.len()).any(|target| !self.is_lost(target))
     }
 
     /// A target's estimate.

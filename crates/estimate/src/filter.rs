@@ -26,7 +26,7 @@ pub struct Estimator {
     /// Compass readings that came before there was a state.
     compass: VecDeque<Stamped<AttitudeSample>>,
     /// Room to look ahead in.
-    ahead: State,
+    pub(crate) ahead: State,
     lag: Span,
     /// What the next start continues from.
     warm: Option<WarmFilter>,

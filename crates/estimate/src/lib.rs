@@ -7,6 +7,7 @@ mod anchor;
 mod begin;
 mod blocks;
 mod bound;
+mod coast;
 mod core;
 mod delayed;
 mod filter;

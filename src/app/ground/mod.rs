@@ -11,6 +11,7 @@ mod feeds;
 #[cfg(feature = "zenoh")]
 pub mod fleet;
 pub mod foxglove;
+mod freshness;
 #[cfg(feature = "zenoh")]
 mod history;
 pub mod mirror;
@@ -334,11 +335,12 @@ async fn report(
     loop {
         tick.tick().await;
         let status = handle.status();
-        let passed = std::mem::replace(&mut last, tokio::time::Instant::now()).elapsed().as_secs_f64();
+        let now = tokio::time::Instant::now();
+        let passed = (now - std::mem::replace(&mut last, now)).as_secs_f64();
         let (message, lines) = {
             let mut view = lock(&view);
-            let message = view.link(&status, passed);
-            (message, status.iter().map(|s| view.line(s)).collect::<Vec<_>>())
+            let message = view.link(&status, passed, now);
+            (message, status.iter().map(|s| view.line(s, now)).collect::<Vec<_>>())
         };
         let _ = live.send(message);
         terminal.status(&lines);
@@ -375,7 +377,7 @@ async fn tell(
     Ok(())
 }
 
-/// RMC and GGA of every vehicle whose state is new, to every client.
+/// RMC and GGA of every vehicle whose state is new, and once a second of one that is lost, to every client.
 async fn serve_nmea(listener: tokio::net::TcpListener, view: Arc<Mutex<View>>) -> std::io::Result<()> {
     let sentences = broadcast::Sender::<Arc<str>>::new(64);
     let source = sentences.clone();
@@ -383,10 +385,12 @@ async fn serve_nmea(listener: tokio::net::TcpListener, view: Arc<Mutex<View>>) -
         let mut told = std::collections::BTreeMap::new();
         loop {
             tokio::time::sleep(NMEA_EVERY).await;
-            for vehicle in lock(&view).vehicles() {
+            for vehicle in lock(&view).vehicles(tokio::time::Instant::now()) {
                 let key = (vehicle.payload.clone(), vehicle.target.clone());
-                let t = vehicle.state.timestamp;
-                if told.insert(key, t) != Some(t) {
+                // A lost one's age in whole seconds tells when it is due again.
+                let lost = (!vehicle.is_current()).then(|| vehicle.age.s() as u64);
+                let now = (vehicle.state.timestamp, lost);
+                if told.insert(key, now) != Some(now) {
                     let _ = source.send(feeds::nmea(&vehicle).into());
                 }
             }

@@ -17,6 +17,7 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use tokio::sync::broadcast;
+use tokio::time::Instant;
 
 use super::feeds;
 use super::view::View;
@@ -186,11 +187,11 @@ async fn thumbnail(State(web): State<Web>, Path(payload): Path<String>) -> Respo
 }
 
 async fn geojson(State(web): State<Web>) -> Response {
-    text("application/geo+json", feeds::geojson(&web.view().vehicles()))
+    text("application/geo+json", feeds::geojson(&web.view().vehicles(Instant::now())))
 }
 
 async fn kml(State(web): State<Web>) -> Response {
-    text("application/vnd.google-earth.kml+xml", feeds::kml(&web.view().vehicles()))
+    text("application/vnd.google-earth.kml+xml", feeds::kml(&web.view().vehicles(Instant::now())))
 }
 
 #[derive(serde::Deserialize)]
