@@ -75,7 +75,12 @@ impl Monitor {
         while t >= due {
             self.silences(due, out);
             out.push(Output::Health(Box::new(self.health(due))));
-            due += HEALTH_PERIOD;
+            let next = due + HEALTH_PERIOD;
+            if next <= due {
+                // The end of time, which a wild stamp can name: nothing follows it.
+                break;
+            }
+            due = next;
         }
         self.next_health = Some(due);
     }
@@ -251,6 +256,16 @@ pub(super) fn notice(t: MonoTime, kind: NoticeKind, source: Option<Source>, deta
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_end_of_time_is_one_moment() {
+        let mut monitor = Monitor::new(vec![Source::Gps], vec!["ugv".into()]);
+        let mut out = Vec::new();
+        for t in [0, i64::MAX - 1, i64::MAX, i64::MAX] {
+            monitor.advance(MonoTime::from_ns(t), &mut out);
+        }
+        assert!(out.len() < 10, "{} outputs", out.len());
+    }
 
     #[test]
     fn only_the_sources_there_are_can_be_silent() {
