@@ -392,7 +392,11 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
                 }
                 EstimatorOutput::Smoothed(e) => s.add(&e, &world),
                 EstimatorOutput::Reset { .. } | EstimatorOutput::Anchored { .. } => resets += 1,
-                EstimatorOutput::Coasted(_) | EstimatorOutput::Ownship(_) | EstimatorOutput::Fusion(_) => {}
+                EstimatorOutput::Coasted(_)
+                | EstimatorOutput::Ownship(_)
+                | EstimatorOutput::Fusion(_)
+                | EstimatorOutput::TiltFelt { .. }
+                | EstimatorOutput::Misfit(_) => {}
             }
         }
         for estimate in paper_out.drain(..) {

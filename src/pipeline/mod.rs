@@ -6,27 +6,31 @@
 
 mod frame_pace;
 mod lines;
+mod misfit_words;
+mod misfits;
 mod monitor;
+mod seen;
 mod settings;
 mod site;
 mod ticks;
 
 pub use settings::PipelineSettings;
-pub use ticks::next_tick;
 
 use std::sync::Arc;
 
 use crate::pixels::{self, DecodedFrame, FrameFault};
 use frame_pace::FramePace;
 use lines::SourceLines;
+use misfit_words::felt_words;
 use monitor::{Monitor, notice};
+use seen::SeenMarkers;
 use site::SiteFinder;
-use ticks::Ticks;
+use ticks::{Due, Schedule};
 use windhover_base::geo::{Geodetic, Tile};
 use windhover_base::msg::{
     AttitudeSample, Delivery, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload,
-    FramePrediction, GnssEpoch, MarkerDetection, MarkerId, NoticeKind, Output, SensorReading, Source,
-    Stamped, TargetEstimate, TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
+    FramePrediction, GnssEpoch, NoticeKind, Output, SensorReading, Source, Stamped, TargetEstimate,
+    TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
 };
 use windhover_base::settings::{MarkerKind, TargetConfig};
 use windhover_base::time::{MonoTime, Span};
@@ -46,7 +50,8 @@ pub struct Pipeline {
     /// An earlier run's filter, until there is one to continue it.
     warm: Option<WarmFilter>,
     monitor: Monitor,
-    ticks: Ticks,
+    seen: SeenMarkers,
+    schedule: Schedule,
     /// Time of the last event or tick.
     now: MonoTime,
     last_exposure: Option<MonoTime>,
@@ -76,7 +81,6 @@ impl Pipeline {
         let mut lines = SourceLines::new(rig);
         let there = |source: &Source| source.delivers() == Delivery::Frames || lines.of(*source).is_some();
         let watched = Source::ALL.iter().copied().filter(there).collect();
-        let names = rig.target.iter().map(|target| target.name.clone()).collect();
         Self {
             want_rgb: wants_rgb(&rig.target),
             lines,
@@ -86,8 +90,9 @@ impl Pipeline {
             finder: SiteFinder::new(&settings, terrain),
             estimators: None,
             warm: None,
-            monitor: Monitor::new(watched, names),
-            ticks: Ticks::default(),
+            monitor: Monitor::new(watched, rig),
+            seen: SeenMarkers::new(rig),
+            schedule: Schedule::new(settings.filter.ownship_hz),
             now: MonoTime::default(),
             last_exposure: None,
             pace: FramePace::new(rig.camera.fps),
@@ -117,7 +122,12 @@ impl Pipeline {
     /// The latest tick that is due at `now`; `None` where it was made already. Where nothing arrives, an
     /// [`EventBody::Tick`] of this time lets time pass.
     pub fn tick_due(&mut self, now: MonoTime) -> Option<MonoTime> {
-        self.ticks.due(now)
+        self.schedule.due(now)
+    }
+
+    /// The first tick after `now`: so long whoever feeds the pipeline may wait for an event.
+    pub fn next_tick(&self, now: MonoTime) -> MonoTime {
+        self.schedule.next(now)
     }
 
     /// As [`Self::handle`], with the event's frame already decoded elsewhere.
@@ -128,8 +138,11 @@ impl Pipeline {
         out: &mut Vec<TimedOutput>,
     ) {
         let mut outputs = std::mem::take(&mut self.outputs);
-        for t in self.ticks.until(event.t_recv) {
-            self.tick(t, event.seq, &mut outputs);
+        for (t, due) in self.schedule.until(event.t_recv) {
+            match due {
+                Due::TimeOuts => self.time_outs(t, event.seq, &mut outputs),
+                Due::Ownship => self.ownship(t, &mut outputs),
+            }
             self.pass_on(t, &mut outputs, out);
         }
         if !matches!(event.body, EventBody::Tick) {
@@ -145,7 +158,7 @@ impl Pipeline {
         out.extend(outputs.drain(..).map(|output| TimedOutput { t_cause: t, output }));
     }
 
-    fn tick(&mut self, t: MonoTime, seq: u64, out: &mut Vec<Output>) {
+    fn time_outs(&mut self, t: MonoTime, seq: u64, out: &mut Vec<Output>) {
         self.monitor.advance(t, out);
         for &source in Source::ALL {
             if let Some(line) = self.lines.of(source) {
@@ -166,6 +179,12 @@ impl Pipeline {
             }
         }
         self.take_estimated(t, out);
+    }
+
+    /// The helicopter's own state, whether there are frames or not.
+    fn ownship(&mut self, t: MonoTime, out: &mut Vec<Output>) {
+        let told = self.estimators.as_mut().and_then(|estimators| estimators.joint.ownship(t));
+        out.extend(told.map(|own| Output::Estimator(EstimatorOutput::Ownship(own))));
     }
 
     fn event(
@@ -313,7 +332,7 @@ impl Pipeline {
                 });
                 let rgb = decoded.rgb.as_ref();
                 self.detector.process(decoded.gray.view(), rgb, prediction, &mut self.observations);
-                self.note_seen();
+                self.note_seen(t, out);
                 out.push(Output::Detections {
                     frame: payload.index,
                     t_valid,
@@ -329,17 +348,14 @@ impl Pipeline {
         self.estimate(t_valid, event, out);
     }
 
-    fn note_seen(&mut self) {
-        for (index, target) in self.settings.rig.target.iter().enumerate() {
-            let of_target = |seen: &MarkerDetection| match seen.marker {
-                MarkerId::Disc { target, .. } => target == index,
-                MarkerId::Tag { family, id } => {
-                    target.marker.iter().any(|m| m.family == Some(family) && m.id == Some(id))
-                }
-            };
-            if self.observations.markers.iter().any(of_target) {
-                self.monitor.seen(index);
+    fn note_seen(&mut self, t: MonoTime, out: &mut Vec<Output>) {
+        for target in 0..self.settings.rig.target.len() {
+            if self.observations.markers.iter().any(|seen| self.seen.target_of(seen) == Some(target)) {
+                self.monitor.seen(target);
             }
+        }
+        for words in self.seen.twice(&self.observations, t) {
+            out.push(notice(t, NoticeKind::MarkerSeenTwice, Some(Source::Camera), words));
         }
     }
 
@@ -380,6 +396,12 @@ impl Pipeline {
                 EstimatorOutput::Reset { reason } => {
                     out.push(notice(t, NoticeKind::FilterReset, None, (*reason).to_owned()));
                 }
+                EstimatorOutput::TiltFelt { felt, slope } => {
+                    let detail =
+                        format!("the compass's tilt sensor {} (slope {slope:.2})", felt_words(*felt));
+                    out.push(notice(t, NoticeKind::TiltFelt, Some(Source::Compass), detail));
+                }
+                EstimatorOutput::Misfit(misfit) => self.monitor.misfit(misfit, t, out),
                 EstimatorOutput::Smoothed(_) | EstimatorOutput::Ownship(_) => {}
             }
             out.push(Output::Estimator(estimated));

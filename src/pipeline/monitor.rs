@@ -3,10 +3,13 @@
 use std::collections::BTreeMap;
 
 use windhover_base::msg::{
-    Disposition, FixKind, GnssEpoch, Health, Notice, NoticeKind, Output, PerSource, Source, SourceHealth,
+    Disposition, FixKind, GnssEpoch, Health, Misfit, Notice, NoticeKind, Output, PerSource, Source, SourceHealth,
     Stamped, TargetEstimate, TargetHealth, TrackStatus,
 };
+use windhover_base::settings::Rig;
 use windhover_base::time::{MonoTime, Span};
+
+use super::misfits::Misfits;
 
 /// Health is told this often.
 const HEALTH_PERIOD: Span = Span::from_ns(1_000_000_000);
@@ -26,6 +29,7 @@ struct SourceCount {
 /// Watches what flows and says what an operator should know.
 pub(super) struct Monitor {
     names: Vec<String>,
+    misfits: Misfits,
     watched: Vec<Source>,
     sources: PerSource<SourceCount>,
     fix: FixKind,
@@ -39,8 +43,9 @@ pub(super) struct Monitor {
 }
 
 impl Monitor {
-    /// Watches these sources and targets of these names.
-    pub(super) fn new(watched: Vec<Source>, names: Vec<String>) -> Self {
+    /// Watches these sources, and the targets of the rig.
+    pub(super) fn new(watched: Vec<Source>, rig: &Rig) -> Self {
+        let names: Vec<String> = rig.target.iter().map(|target| target.name.clone()).collect();
         let lost = |target| TargetEstimate {
             t_valid: MonoTime::default(),
             frame: 0,
@@ -57,6 +62,7 @@ impl Monitor {
             utc_minus_host: None,
             targets: (0..names.len()).map(|i| TargetHealth { frames_seen: 0, last: lost(i) }).collect(),
             names,
+            misfits: Misfits::new(rig),
             dispositions: BTreeMap::new(),
             began: None,
             next_health: None,
@@ -125,6 +131,7 @@ impl Monitor {
             utc_minus_host: self.utc_minus_host,
             targets: self.targets.clone(),
             dispositions: self.dispositions.clone(),
+            misfits: self.misfits.now(t),
         };
         self.targets.iter_mut().for_each(|target| target.frames_seen = 0);
         health
@@ -183,15 +190,14 @@ impl Monitor {
         out: &mut Vec<Output>,
     ) {
         let GnssEpoch { fix, sats, utc, .. } = epoch.value;
-        if let (true, Some(utc), Some(_)) = (fix != FixKind::None, utc, clock_sigma) {
+        if let (true, Some(utc), Some(_)) = (fix.has_position(), utc, clock_sigma) {
             self.utc_minus_host = Some(Span::from_ns(utc.unix_ns() - epoch.t_valid.ns()));
         }
-        let had = self.fix != FixKind::None;
-        let has = fix != FixKind::None;
+        let had = self.fix.has_position();
+        let has = fix.has_position();
         if has && !had {
             let satellites = sats.map_or(String::new(), |n| format!(", {n} satellites"));
-            let kind = if fix == FixKind::ThreeD { "3d" } else { "2d" };
-            let detail = format!("the receiver has a {kind} fix{satellites}");
+            let detail = format!("the receiver has a {} fix{satellites}", fix.name());
             out.push(notice(t, NoticeKind::FixAcquired, Some(Source::Gps), detail));
         } else if had && !has {
             let detail = "the receiver has no fix".to_owned();
@@ -239,7 +245,15 @@ impl Monitor {
             _ => return,
         };
         let target = Some(name.clone());
-        out.push(Output::Notice(Notice { t, kind, source: None, target, detail }));
+        out.push(Output::Notice(Notice { t, kind, source: None, target, detail, misfit: None }));
+    }
+
+    /// Something does not fit.
+    pub(super) fn misfit(&mut self, misfit: &Misfit, t: MonoTime, out: &mut Vec<Output>) {
+        let Some(words) = self.misfits.take(misfit, t) else { return };
+        let (kind, detail) = (NoticeKind::ModelMisfit, words.to_string());
+        let misfit = Some(words);
+        out.push(Output::Notice(Notice { t, kind, source: None, target: None, detail, misfit }));
     }
 
     /// What became of a measurement.
@@ -250,16 +264,18 @@ impl Monitor {
 
 /// A notice as an output.
 pub(super) fn notice(t: MonoTime, kind: NoticeKind, source: Option<Source>, detail: String) -> Output {
-    Output::Notice(Notice { t, kind, source, target: None, detail })
+    Output::Notice(Notice { t, kind, source, target: None, detail, misfit: None })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Config;
 
     #[test]
     fn the_end_of_time_is_one_moment() {
-        let mut monitor = Monitor::new(vec![Source::Gps], vec!["ugv".into()]);
+        let config = Config::parse(include_str!("../../config/windhover.toml")).expect("valid");
+        let mut monitor = Monitor::new(vec![Source::Gps], &config.rig());
         let mut out = Vec::new();
         for t in [0, i64::MAX - 1, i64::MAX, i64::MAX] {
             monitor.advance(MonoTime::from_ns(t), &mut out);
@@ -270,7 +286,8 @@ mod tests {
     #[test]
     fn only_the_sources_there_are_can_be_silent() {
         // Given a pipeline that has a receiver and a camera.
-        let mut monitor = Monitor::new(vec![Source::Gps, Source::Camera], vec!["ugv".into()]);
+        let config = Config::parse(include_str!("../../config/windhover.toml")).expect("valid");
+        let mut monitor = Monitor::new(vec![Source::Gps, Source::Camera], &config.rig());
         let mut out = Vec::new();
         let at = |s: f64| MonoTime::from_ns(0) + Span::from_s(s);
         monitor.advance(at(0.0), &mut out);

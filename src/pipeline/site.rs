@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::settings::PipelineSettings;
 use windhover_base::geo::{self, Geodetic, Ground, LocalFrame, Terrain, Tile};
-use windhover_base::msg::{FixKind, GnssEpoch, WarmSite};
+use windhover_base::msg::{GnssEpoch, WarmSite};
 use windhover_base::settings::{Datum, Declination, GroundConfig, GroundSource};
 use windhover_estimate::Site;
 
@@ -159,7 +159,7 @@ const SAME_FLIGHT_DEG: f64 = 0.1;
 
 /// A three-dimensional position above the ellipsoid.
 fn position(epoch: &GnssEpoch) -> Option<Geodetic> {
-    if epoch.fix != FixKind::ThreeD {
+    if !epoch.fix.has_height() {
         return None;
     }
     let height_m = epoch.alt_msl_m? + epoch.geoid_m.unwrap_or(0.0);
@@ -175,6 +175,7 @@ fn median(values: &mut [f64]) -> f64 {
 mod tests {
     use super::*;
     use crate::config::Config;
+    use windhover_base::msg::FixKind;
 
     #[test]
     fn level_ground_lies_under_the_first_fix_however_far_the_datum_is() {

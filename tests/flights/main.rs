@@ -4,6 +4,7 @@ mod calibration_doc;
 mod compass_conventions;
 mod contract;
 mod import;
+mod no_camera;
 mod silent_camera;
 mod simulated_lines;
 mod warm_start;

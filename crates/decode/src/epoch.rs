@@ -1,7 +1,7 @@
 //! An epoch put together of sentences of one time.
 
 use super::lines::LineSpan;
-use super::report::{Date, Kind, Report};
+use super::report::{Date, Kind, Report, Solution};
 use nalgebra::Vector3;
 use windhover_base::msg::{FixKind, GnssEpoch};
 use windhover_base::time::{Civil, MonoTime, NS_PER_S, Span, UtcTime};
@@ -26,6 +26,7 @@ pub(super) struct Draft {
     confirmed: bool,
     epoch: GnssEpoch,
     fix_told: Option<FixKind>,
+    solution: Option<Solution>,
     sats_listed: Option<u32>,
     ranks: Ranks,
 }
@@ -34,6 +35,7 @@ pub(super) struct Draft {
 #[derive(Clone, Copy, Debug)]
 struct Ranks {
     position: u8,
+    solution: u8,
     motion: u8,
     hdop: u8,
 }
@@ -51,8 +53,9 @@ impl Draft {
             confirmed: false,
             epoch: GnssEpoch::default(),
             fix_told: None,
+            solution: None,
             sats_listed: None,
-            ranks: Ranks { position: u8::MAX, motion: u8::MAX, hdop: u8::MAX },
+            ranks: Ranks { position: u8::MAX, solution: u8::MAX, motion: u8::MAX, hdop: u8::MAX },
         }
     }
 
@@ -96,6 +99,10 @@ impl Draft {
             self.ranks.position = rank;
             self.epoch.lat_deg = Some(lat);
             self.epoch.lon_deg = Some(lon);
+        }
+        if report.solution.is_some() && rank < self.ranks.solution {
+            self.ranks.solution = rank;
+            self.solution = report.solution;
         }
         self.epoch.alt_msl_m = self.epoch.alt_msl_m.or(report.alt_msl_m);
         self.epoch.geoid_m = self.epoch.geoid_m.or(report.geoid_m);
@@ -145,10 +152,15 @@ impl Draft {
         if self.void || !self.confirmed || self.epoch.lat_deg.is_none() {
             return FixKind::None;
         }
-        match self.fix_told {
-            Some(told) => told,
-            None if self.epoch.alt_msl_m.is_some() => FixKind::ThreeD,
+        let told = self.fix_told;
+        let flat_or_not = told.unwrap_or(match self.epoch.alt_msl_m {
+            Some(_) => FixKind::ThreeD,
             None => FixKind::TwoD,
+        });
+        match (flat_or_not, self.solution) {
+            (FixKind::ThreeD, Some(Solution::RtkFixed)) => FixKind::RtkFixed,
+            (FixKind::ThreeD, Some(Solution::RtkFloat)) => FixKind::RtkFloat,
+            _ => flat_or_not,
         }
     }
 }

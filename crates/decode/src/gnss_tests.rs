@@ -187,7 +187,7 @@ fn a_receiver_of_rmc_and_gns_alone_has_altitude() {
     assert_eq!((epochs.len(), counts.refused_total()), (5, 0), "{counts}");
     for heard in epochs {
         let epoch = heard.epoch;
-        assert_eq!((epoch.fix, epoch.alt_msl_m, epoch.sats), (FixKind::ThreeD, Some(50.1), Some(14)));
+        assert_eq!((epoch.fix, epoch.alt_msl_m, epoch.sats), (FixKind::RtkFixed, Some(50.1), Some(14)));
     }
 }
 
@@ -219,6 +219,38 @@ fn a_fix_of_no_satellites_needs_another_witness() {
     let fix = |text: &str| decode(GnssDecoder::patient(), text).0[0].epoch.fix;
     assert_eq!(fix(&empty), FixKind::None);
     assert_eq!(fix(&(rmc("101101", "3030.00000") + &empty)), FixKind::ThreeD);
+}
+
+#[test]
+fn rtk_is_told_by_quality_or_modes() {
+    let gga = |quality: u32| {
+        line(&format!("GNGGA,101101,3030.00000,N,08530.00000,W,{quality},19,0.5,10.0,M,-27.0,M,1.0,0001"))
+    };
+    let rmc = |mode: &str| {
+        line(&format!("GNRMC,101101,A,3030.00000,N,08530.00000,W,010.0,090.0,010226,,,{mode},V"))
+    };
+    let gns =
+        |modes: &str| line(&format!("GNGNS,101101,3030.0,N,08530.0,W,{modes},14,0.6,50.1,48.0,1.0,0000,V"));
+    let gsa = |fix: u32| line(&format!("GNGSA,A,{fix},01,02,03,04,,,,,,,,,1.6,0.9,1.3"));
+    let fix = |text: &str| decode(GnssDecoder::patient(), text).0[0].epoch.fix;
+    for (text, kind) in [
+        (gga(1), FixKind::ThreeD),
+        (gga(2), FixKind::ThreeD),
+        (gga(4), FixKind::RtkFixed),
+        (gga(5), FixKind::RtkFloat),
+        (gga(4) + &gsa(3), FixKind::RtkFixed),
+        (gga(5) + &gsa(2), FixKind::TwoD),
+        (gns("RRNR"), FixKind::RtkFixed),
+        (gns("RF"), FixKind::RtkFloat),
+        (gns("RA"), FixKind::ThreeD),
+        // GGA decides over the others, whatever their order is.
+        (rmc("R") + &gga(5), FixKind::RtkFloat),
+        (gga(4) + &rmc("A"), FixKind::RtkFixed),
+        (gns("FF") + &rmc("R"), FixKind::RtkFloat),
+        (gga(0) + &rmc("R"), FixKind::None),
+    ] {
+        assert_eq!(fix(&text), kind, "{text}");
+    }
 }
 
 #[test]

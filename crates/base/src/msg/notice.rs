@@ -1,5 +1,7 @@
 //! Notices: what an operator should know of a flight.
 
+use std::fmt;
+
 use super::Source;
 use crate::time::MonoTime;
 
@@ -36,6 +38,12 @@ pub enum NoticeKind {
     FilterReset,
     /// A stamp went back or leapt ahead.
     ClockJump,
+    /// Something measured does not fit the configuration, or the filter's model.
+    ModelMisfit,
+    /// The same marker was seen at two places of a frame.
+    MarkerSeenTwice,
+    /// What the compass's tilt sensor feels was found out.
+    TiltFelt,
 }
 
 impl NoticeKind {
@@ -57,6 +65,9 @@ impl NoticeKind {
             Self::TargetLost => "target_lost",
             Self::FilterReset => "filter_reset",
             Self::ClockJump => "clock_jump",
+            Self::ModelMisfit => "model_misfit",
+            Self::MarkerSeenTwice => "marker_seen_twice",
+            Self::TiltFelt => "tilt_felt",
         }
     }
 }
@@ -74,4 +85,28 @@ pub struct Notice {
     pub target: Option<String>,
     /// In words: what, where, how many.
     pub detail: String,
+    /// Of a misfit: its parts.
+    pub misfit: Option<MisfitWords>,
+}
+
+/// What does not fit, in the operator's words.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct MisfitWords {
+    /// The measurements, setting or marker that does not fit: `gps_velocity`, `compass.tilt`, `ugv tag 1`.
+    pub source: String,
+    /// A fixed name for what does not fit.
+    pub kind: &'static str,
+    /// The figure that shows it, with its unit.
+    pub figure: String,
+    /// The likely cause.
+    pub cause: String,
+    /// What to do.
+    pub advice: String,
+}
+
+impl fmt::Display for MisfitWords {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { source, figure, cause, advice, .. } = self;
+        write!(f, "{source}: {cause} ({figure}); {advice}")
+    }
 }

@@ -140,6 +140,7 @@ function panels() {
     list.push(["fix", fix, dot(h.fix && !silent ? "good" : "bad")]);
     if (p.utc == null) list.push(["UTC", "not known; times are the payload's own", "warn"]);
     else if (h.clock_sigma_ms >= 0) list.push(["UTC", `±${h.clock_sigma_ms.toFixed(1)} ms`, dot("good")]);
+    for (const m of h.misfits) list.push([m.source, `${m.cause} (${m.figure}): ${m.advice}`, dot("warn")]);
     for (const [name, word] of Object.entries(h.words)) list.push([name, word, dot(/fail|full|none|lost|error|stopped|cannot/i.test(word) ? "bad" : "good")]);
     if (old) list.unshift(["all of this", since == null ? "age not known" : `${(since / 1000).toFixed(0)} s old`, "bad"]);
     rows(table, list); $("sensors").replaceChildren(table);
@@ -259,7 +260,11 @@ $("theme").onclick = () => {
 $("zoom-in").onclick = () => map.zoom(1.5);
 $("zoom-out").onclick = () => map.zoom(1 / 1.5);
 $("follow").onclick = () => { map.follow = true; dirty = true; };
-$("whole").onclick = () => { const p = fleet.get(chosen); if (p) map.fit([...p.targets.values()].flatMap(t => t.trail).concat(p.own ? [p.own.position] : [])); };
+$("whole").onclick = () => {
+  const p = fleet.get(chosen), trails = p ? [...p.targets.values()].flatMap(t => t.trail) : [];
+  // Without a vehicle the helicopter's own way is what there is to show.
+  if (p) map.fit(trails.length ? trails.concat(p.own ? [p.own.position] : []) : p.ownTrail);
+};
 setInterval(() => {
   $("follow").classList.toggle("on", map.follow);
   if (socket && socket.readyState === 1 && performance.now() - heardAt > 4000) { chip($("server"), "station silent", "warn"); }
