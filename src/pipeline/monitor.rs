@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use windhover_base::msg::{
-    Disposition, FixKind, GnssEpoch, Health, Misfit, Notice, NoticeKind, Output, PerSource, Source, SourceHealth,
-    Stamped, TargetEstimate, TargetHealth, TrackStatus,
+    Disposition, FixKind, GnssEpoch, Health, Misfit, Notice, NoticeKind, Output, PerSource, Source,
+    SourceHealth, Stamped, TargetEstimate, TargetHealth, TrackStatus,
 };
 use windhover_base::settings::Rig;
 use windhover_base::time::{MonoTime, Span};

@@ -7,7 +7,6 @@
 //! viewer of the present takes the latest message for the newest.
 
 use std::collections::{BTreeMap, HashMap};
-use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use axum::Router;
@@ -23,6 +22,7 @@ use prost::Message as _;
 use serde_json::{Value, json};
 use tokio::sync::broadcast;
 
+use super::door::Door;
 use super::web::{query_token, same};
 use crate::io::link::{Arrival, Class, downlink_class};
 use crate::io::proto::link::Thumbnail;
@@ -381,7 +381,7 @@ pub async fn serve(listener: tokio::net::TcpListener, server: Server) -> std::io
         .route("/", get(upgrade))
         .layer(axum::middleware::from_fn_with_state(server.clone(), guard))
         .with_state(server);
-    axum::serve(listener, router.into_make_service_with_connect_info::<SocketAddr>()).await
+    axum::serve(Door::new(listener, "foxglove"), router).await
 }
 
 #[cfg(test)]

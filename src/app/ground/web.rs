@@ -4,7 +4,6 @@
 //! cookie. Names other than addresses and `localhost` are refused on loopback, so that no page of the
 //! Internet can point its own name here.
 
-use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -19,6 +18,7 @@ use axum::routing::get;
 use tokio::sync::broadcast;
 use tokio::time::Instant;
 
+use super::door::Door;
 use super::feeds;
 use super::view::View;
 
@@ -228,7 +228,7 @@ fn deepest_tiles(dir: &std::path::Path) -> u32 {
 
 /// Serves until the program ends.
 pub async fn serve(listener: tokio::net::TcpListener, web: Web) -> std::io::Result<()> {
-    axum::serve(listener, web.router().into_make_service_with_connect_info::<SocketAddr>()).await
+    axum::serve(Door::new(listener, "page"), web.router()).await
 }
 
 #[cfg(test)]
