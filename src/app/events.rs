@@ -99,10 +99,16 @@ table! {
     BytesRefused: "bytes_refused", WARN, every 5 s;
     /// A frame could not be read, or has the wrong size.
     FrameUnusable: "frame_unusable", WARN, every 5 s;
+    /// Parts of a frame are lost; the others are used.
+    FrameDamaged: "frame_damaged", WARN, every 5 s;
     /// Frames or bytes were lost before they could be recorded.
     Dropped: "dropped", WARN, every 5 s;
     /// The origin of the NED frame was settled.
     DatumSet: "datum_set", INFO, every 0 s;
+    /// Positions of the receiver cannot be used, and why.
+    PositionsUnused: "positions_unused", WARN, every 0 s;
+    /// The receiver's pulses come and are not used, and why.
+    PulseUnused: "pulse_unused", WARN, every 60 s;
     /// The terrain tile of the configuration cannot be used here: the ground is level instead.
     TerrainMissing: "terrain_missing", WARN, every 0 s;
     /// Declination was taken from the World Magnetic Model, or could not be.
@@ -265,8 +271,11 @@ impl From<NoticeKind> for OperatorEvent {
             NoticeKind::SourceBack => Self::SourceBack,
             NoticeKind::BytesRefused => Self::BytesRefused,
             NoticeKind::FrameUnusable => Self::FrameUnusable,
+            NoticeKind::FrameDamaged => Self::FrameDamaged,
             NoticeKind::Dropped => Self::Dropped,
             NoticeKind::DatumSet => Self::DatumSet,
+            NoticeKind::PositionsUnused => Self::PositionsUnused,
+            NoticeKind::PulseUnused => Self::PulseUnused,
             NoticeKind::TerrainMissing => Self::TerrainMissing,
             NoticeKind::Declination => Self::Declination,
             NoticeKind::TargetTracking => Self::TargetTracking,

@@ -269,6 +269,7 @@ fn decode_compass(
 fn decode_as(bytes: &[u8], format: CompassFormat) -> (Vec<HeardAttitude>, DecodeCounts) {
     let (mut decoder, mut heard) = (CompassDecoder::new(format), Vec::new());
     decoder.push(bytes, MonoTime::default(), &mut heard);
+    decoder.flush(&mut heard);
     (heard, decoder.counts().clone())
 }
 

@@ -18,6 +18,8 @@ pub use settings::PipelineSettings;
 
 use std::sync::Arc;
 
+use nalgebra::Vector2;
+
 use crate::pixels::{self, DecodedFrame, FrameFault};
 use frame_pace::FramePace;
 use lines::SourceLines;
@@ -37,6 +39,12 @@ use windhover_base::time::{MonoTime, Span};
 use windhover_detect::tracking::FrameDetector;
 use windhover_estimate::{Estimator, PaperEstimator};
 
+/// What is seen so near to a lost part of a frame is not used: the neighbourhood a feature is known by.
+const LOST_MARGIN_PX: f64 = 12.0;
+
+/// Most readings held until the datum is settled: some seconds of both lines.
+const HELD_MAX: usize = 512;
+
 /// Events in, outputs out.
 pub struct Pipeline {
     settings: PipelineSettings,
@@ -47,6 +55,8 @@ pub struct Pipeline {
     prediction: FramePrediction,
     finder: SiteFinder,
     estimators: Option<Estimators>,
+    /// What was measured since the first of the fixes that agree: the filter begins with it.
+    held: Vec<SensorReading>,
     /// An earlier run's filter, until there is one to continue it.
     warm: Option<WarmFilter>,
     monitor: Monitor,
@@ -89,6 +99,7 @@ impl Pipeline {
             prediction: FramePrediction::default(),
             finder: SiteFinder::new(&settings, terrain),
             estimators: None,
+            held: Vec::new(),
             warm: None,
             monitor: Monitor::new(watched, rig),
             seen: SeenMarkers::new(rig),
@@ -262,9 +273,12 @@ impl Pipeline {
 
     fn gnss(&mut self, epoch: &Stamped<GnssEpoch>, t: MonoTime, out: &mut Vec<Output>) {
         self.monitor.fix(t, epoch, self.lines.gps.clock_sigma(), out);
+        self.monitor.pulses(t, self.lines.gps.pulse_trouble(), out);
         out.push(Output::Reading(SensorReading::Gnss(*epoch)));
+        let agreed = self.finder.agreeing();
+        self.settle(&epoch.value, t, out);
         if self.estimators.is_none() {
-            self.settle(&epoch.value, t, out);
+            self.hold_fix(epoch, agreed);
         }
         if let Some(estimators) = &mut self.estimators {
             estimators.joint.gnss(epoch, &mut self.estimated);
@@ -277,11 +291,36 @@ impl Pipeline {
         if let Some(estimators) = &mut self.estimators {
             estimators.joint.attitude(sample, &mut self.estimated);
             estimators.paper.attitude(sample, &mut self.papered);
+        } else if !self.held.is_empty() && self.held.len() < HELD_MAX {
+            self.held.push(SensorReading::Attitude(*sample));
+        }
+    }
+
+    /// Holds a fix that agrees with `agreed` before it; one that does not begins anew.
+    fn hold_fix(&mut self, epoch: &Stamped<GnssEpoch>, agreed: usize) {
+        let agreeing = self.finder.agreeing();
+        if agreeing == 1 {
+            self.held.clear();
+        }
+        if (agreeing == 1 || agreeing > agreed) && self.held.len() < HELD_MAX {
+            self.held.push(SensorReading::Gnss(*epoch));
         }
     }
 
     fn settle(&mut self, epoch: &GnssEpoch, t: MonoTime, out: &mut Vec<Output>) {
-        let Some(settled) = self.finder.offer(epoch) else { return };
+        let settled = match &self.estimators {
+            None => self.finder.offer(epoch),
+            Some(estimators) => {
+                let [lat_deg, lon_deg, height_m] = estimators.site.datum;
+                let datum = Geodetic { lat_deg, lon_deg, height_m };
+                self.finder.offer_again(epoch, datum, self.monitor.has_tracked())
+            }
+        };
+        if let Some(why) = self.finder.unused_word() {
+            let words = format!("the receiver's positions are not used: {why}");
+            out.push(notice(t, NoticeKind::PositionsUnused, Some(Source::Gps), words));
+        }
+        let Some(settled) = settled else { return };
         if let Some(words) = settled.declination_notice {
             out.push(notice(t, NoticeKind::Declination, Some(Source::Compass), words));
         }
@@ -300,7 +339,19 @@ impl Pipeline {
         if let Some(warm) = self.warm.take().filter(|_| settled.continued) {
             joint.resume(warm);
         }
-        let paper = PaperEstimator::new(rig, filter, &settled.site);
+        let mut paper = PaperEstimator::new(rig, filter, &settled.site);
+        for reading in self.held.drain(..) {
+            match reading {
+                SensorReading::Gnss(epoch) => {
+                    joint.gnss(&epoch, &mut self.estimated);
+                    paper.gnss(&epoch, &mut self.papered);
+                }
+                SensorReading::Attitude(sample) => {
+                    joint.attitude(&sample, &mut self.estimated);
+                    paper.attitude(&sample, &mut self.papered);
+                }
+            }
+        }
         self.estimators = Some(Estimators { joint, paper, site: settled.warm });
     }
 
@@ -332,6 +383,13 @@ impl Pipeline {
                 });
                 let rgb = decoded.rgb.as_ref();
                 self.detector.process(decoded.gray.view(), rgb, prediction, &mut self.observations);
+                if !decoded.missing.is_empty() {
+                    self.keep_whole(&decoded);
+                    let lost = decoded.missing.len();
+                    let words =
+                        format!("frame {}: {lost} parts of it are lost, the rest is used", payload.index);
+                    out.push(notice(t, NoticeKind::FrameDamaged, Some(Source::Camera), words));
+                }
                 self.note_seen(t, out);
                 out.push(Output::Detections {
                     frame: payload.index,
@@ -346,6 +404,22 @@ impl Pipeline {
             }
         }
         self.estimate(t_valid, event, out);
+    }
+
+    /// Leaves out what was seen where parts of the frame are lost.
+    fn keep_whole(&mut self, frame: &DecodedFrame) {
+        self.observations
+            .features
+            .retain(|f| frame.is_whole((f.px.x, f.px.y), (f.px.x, f.px.y), LOST_MARGIN_PX));
+        self.observations.markers.retain(|marker| {
+            let radius = 0.5 * marker.size_px;
+            let center = marker.center_px;
+            let around = [(-radius, -radius), (radius, radius)].map(|(u, v)| center + Vector2::new(u, v));
+            let corners = marker.corners_px.unwrap_or([around[0], around[0], around[1], around[1]]);
+            let from = corners.iter().fold(center, |low, c| low.inf(c));
+            let to = corners.iter().fold(center, |high, c| high.sup(c));
+            frame.is_whole((from.x, from.y), (to.x, to.y), LOST_MARGIN_PX)
+        });
     }
 
     fn note_seen(&mut self, t: MonoTime, out: &mut Vec<Output>) {

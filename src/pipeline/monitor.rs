@@ -7,7 +7,7 @@ use windhover_base::msg::{
     SourceHealth, Stamped, TargetEstimate, TargetHealth, TrackStatus,
 };
 use windhover_base::settings::Rig;
-use windhover_base::time::{MonoTime, Span};
+use windhover_base::time::{MonoTime, PulseTrouble, Span};
 
 use super::misfits::Misfits;
 
@@ -40,6 +40,8 @@ pub(super) struct Monitor {
     dispositions: BTreeMap<Disposition, u64>,
     began: Option<MonoTime>,
     next_health: Option<MonoTime>,
+    tracked: bool,
+    pulses_unused: Option<PulseTrouble>,
 }
 
 impl Monitor {
@@ -66,7 +68,14 @@ impl Monitor {
             dispositions: BTreeMap::new(),
             began: None,
             next_health: None,
+            tracked: false,
+            pulses_unused: None,
         }
+    }
+
+    /// Whether any target was tracked so far.
+    pub(super) fn has_tracked(&self) -> bool {
+        self.tracked
     }
 
     /// Time has come to `t`: health that is due, silences that have lasted long enough. Both fall on
@@ -206,6 +215,14 @@ impl Monitor {
         (self.fix, self.sats, self.clock_sigma) = (fix, sats, clock_sigma);
     }
 
+    /// Why the receiver's pulses are not used, if they are not.
+    pub(super) fn pulses(&mut self, t: MonoTime, trouble: Option<PulseTrouble>, out: &mut Vec<Output>) {
+        if let Some(trouble) = trouble.filter(|trouble| self.pulses_unused != Some(*trouble)) {
+            out.push(notice(t, NoticeKind::PulseUnused, Some(Source::Gps), trouble.words().to_owned()));
+        }
+        self.pulses_unused = trouble;
+    }
+
     /// A frame in which a marker of the target was seen.
     pub(super) fn seen(&mut self, target: usize) {
         if let Some(target) = self.targets.get_mut(target) {
@@ -228,6 +245,7 @@ impl Monitor {
         let Some(target) = self.targets.get_mut(estimate.target) else { return };
         let before = target.last.status;
         target.last = *estimate;
+        self.tracked |= estimate.status == TrackStatus::Tracking;
         let name = &self.names[estimate.target];
         let (kind, detail) = match (before, estimate.status) {
             (TrackStatus::Lost | TrackStatus::Acquiring, TrackStatus::Tracking) => {

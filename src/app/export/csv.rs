@@ -70,7 +70,8 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
         } else if name == topic::OWNSHIP {
             ownship_rows.extend(decoded::<Ownship>(&message, &mut damaged).map(|own| ownship_row(&own)));
         } else if name == topic::DATUM {
-            datum = datum.or_else(|| decoded::<Datum>(&message, &mut damaged));
+            // One that moved holds.
+            datum = decoded::<Datum>(&message, &mut damaged).or(datum);
         } else if let Some(kind) = name.strip_prefix("/target/").and_then(|rest| rest.rsplit('/').next()) {
             let (table, covariance) = match kind {
                 "state" => (&mut estimates, true),

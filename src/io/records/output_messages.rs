@@ -214,8 +214,11 @@ pub(super) fn log_message(notice: &Notice) -> fox::Log {
         | NoticeKind::TargetLost
         | NoticeKind::FilterReset
         | NoticeKind::FrameUnusable
+        | NoticeKind::FrameDamaged
         | NoticeKind::Dropped
         | NoticeKind::ClockJump
+        | NoticeKind::PositionsUnused
+        | NoticeKind::PulseUnused
         | NoticeKind::TerrainMissing
         | NoticeKind::ModelMisfit
         | NoticeKind::MarkerSeenTwice

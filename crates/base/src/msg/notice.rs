@@ -20,10 +20,16 @@ pub enum NoticeKind {
     BytesRefused,
     /// A frame could not be read, or has the wrong size.
     FrameUnusable,
+    /// Parts of a frame are lost; the others are used.
+    FrameDamaged,
     /// Frames or bytes were lost before they could be recorded.
     Dropped,
     /// The origin of the NED frame was settled.
     DatumSet,
+    /// Positions of the receiver cannot be used, and why.
+    PositionsUnused,
+    /// The receiver's pulses come and are not used, and why.
+    PulseUnused,
     /// The terrain tile of the configuration cannot be used here: the ground is level instead.
     TerrainMissing,
     /// Declination was taken from the World Magnetic Model, or could not be.
@@ -56,8 +62,11 @@ impl NoticeKind {
             Self::SourceBack => "source_back",
             Self::BytesRefused => "bytes_refused",
             Self::FrameUnusable => "frame_unusable",
+            Self::FrameDamaged => "frame_damaged",
             Self::Dropped => "dropped",
             Self::DatumSet => "datum_set",
+            Self::PositionsUnused => "positions_unused",
+            Self::PulseUnused => "pulse_unused",
             Self::TerrainMissing => "terrain_missing",
             Self::Declination => "declination",
             Self::TargetTracking => "target_tracking",

@@ -148,7 +148,9 @@ compass_formats! {
     Pni = "pni";
     /// `$PASHR`.
     Pashr = "pashr";
-    /// Generic NMEA heading sentences.
+    /// VectorNav ASCII: `$VNYPR`, `$VNYMR`, `$VNQMR`, `$VNINS` and others.
+    Vectornav = "vectornav";
+    /// Plain NMEA, and headings that receivers measure between antennas.
     Nmea = "nmea";
 }
 
