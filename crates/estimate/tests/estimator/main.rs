@@ -1,5 +1,6 @@
 //! The estimator on simulated flights, as values: neither bytes nor pixels.
 
+mod blind;
 mod filter;
 mod ground;
 mod honesty;
