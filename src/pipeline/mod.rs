@@ -35,7 +35,7 @@ use windhover_base::msg::{
     TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
 };
 use windhover_base::settings::{MarkerKind, TargetConfig};
-use windhover_base::time::{MonoTime, Span};
+use windhover_base::time::{FrameClock, MonoTime, Span};
 use windhover_detect::tracking::FrameDetector;
 use windhover_estimate::{Estimator, PaperEstimator};
 
@@ -66,6 +66,7 @@ pub struct Pipeline {
     now: MonoTime,
     last_exposure: Option<MonoTime>,
     pace: FramePace,
+    exposures: FrameClock,
     outputs: Vec<Output>,
     readings: Vec<SensorReading>,
     estimated: Vec<EstimatorOutput>,
@@ -107,6 +108,7 @@ impl Pipeline {
             now: MonoTime::default(),
             last_exposure: None,
             pace: FramePace::new(rig.camera.fps),
+            exposures: FrameClock::default(),
             outputs: Vec::new(),
             readings: Vec::new(),
             estimated: Vec::new(),
@@ -364,7 +366,8 @@ impl Pipeline {
     ) {
         let t = event.t_recv;
         self.pace.frame(t, payload.index);
-        let t_valid = payload.t_exposure + Span::from_ms(self.settings.rig.camera.exposure_offset_ms);
+        let offset = Span::from_ms(self.settings.rig.camera.exposure_offset_ms);
+        let t_valid = self.exposures.exposed(payload.t_exposure) + offset;
         if self.last_exposure.is_some_and(|last| payload.t_exposure <= last) {
             let words = format!("frame {} is stamped no later than the one before", payload.index);
             out.push(notice(t, NoticeKind::ClockJump, Some(Source::Camera), words));

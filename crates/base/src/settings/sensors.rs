@@ -197,6 +197,10 @@ pub struct CameraConfig {
     /// Added to the driver's stamp to reach mid-exposure, ms.
     #[serde(default)]
     pub exposure_offset_ms: f64,
+    /// Rolling shutter: from the exposure of the first row to that of the last, ms; 0 where all are exposed together. The
+    /// driver's stamp with `exposure_offset_ms` is then the middle row's mid-exposure.
+    #[serde(default)]
+    pub readout_ms: f64,
     /// The lens.
     pub intrinsics: CameraModel,
     /// How it is mounted.
