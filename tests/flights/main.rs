@@ -5,5 +5,6 @@ mod compass_conventions;
 mod contract;
 mod import;
 mod no_camera;
+mod samples;
 mod simulated_lines;
 mod warm_start;
