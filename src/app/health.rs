@@ -127,11 +127,11 @@ impl Fields {
         self.figure(&format!("{name}_sigma"), sigma.filter(|sigma| sigma.is_finite()));
     }
 
-    /// Rate, and the age where there is one.
-    fn source(&mut self, health: &SourceHealth) {
-        let name = health.source.name();
-        self.figure(&format!("{name}_hz"), Some(health.rate_hz));
-        self.figure(&format!("{name}_age_s"), health.age.map(|age| age.s()));
+    /// Rate, and the age where there is one, of a source that there is.
+    fn source(&mut self, source: Source, health: Option<&SourceHealth>) {
+        let name = source.name();
+        self.figure(&format!("{name}_hz"), health.map(|health| health.rate_hz));
+        self.figure(&format!("{name}_age_s"), health.and_then(|health| health.age).map(|age| age.s()));
     }
 
     /// Status, figures and the age of a target's last estimate at `t`.
@@ -209,7 +209,7 @@ fn fields(health: &Health, targets: &[String], figures: Option<&Figures>) -> Fie
     let mut fields = Fields::default();
     fields.0.push(("t_ns".into(), Some(Value::Time(health.t.ns()))));
     for &source in Source::ALL {
-        fields.source(&health.source(source));
+        fields.source(source, health.sources.iter().find(|listed| listed.source == source));
         if source == Source::Gps {
             fields.text("fix", Some(health.fix.name()));
             fields.count("sats", health.sats.map(u64::from));

@@ -30,8 +30,8 @@ use site::SiteFinder;
 use ticks::{Due, Schedule};
 use windhover_base::geo::{Geodetic, Tile};
 use windhover_base::msg::{
-    AttitudeSample, Delivery, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload,
-    FramePrediction, GnssEpoch, NoticeKind, Output, SensorReading, Source, Stamped, TargetEstimate,
+    AttitudeSample, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload, FramePrediction,
+    GnssEpoch, InertialSample, NoticeKind, Output, SensorReading, Source, Stamped, TargetEstimate,
     TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
 };
 use windhover_base::settings::{MarkerKind, TargetConfig};
@@ -90,8 +90,7 @@ impl Pipeline {
     pub fn with_terrain(settings: PipelineSettings, terrain: Option<Arc<Tile>>) -> Self {
         let rig = &settings.rig;
         let mut lines = SourceLines::new(rig);
-        let there = |source: &Source| source.delivers() == Delivery::Frames || lines.of(*source).is_some();
-        let watched = Source::ALL.iter().copied().filter(there).collect();
+        let watched = Source::ALL.iter().copied().filter(|source| lines.awaits(*source)).collect();
         Self {
             want_rgb: wants_rgb(&rig.target),
             lines,
@@ -214,6 +213,8 @@ impl Pipeline {
                 let decoded = prepared.unwrap_or_else(|| pixels::decode(frame, self.want_rgb));
                 self.frame(frame, decoded, event, out);
             }
+            EventBody::Inertial { source, sample } => self.inertial(*source, sample, event, out),
+            EventBody::Attitude { source, sample } => self.second_attitude(*source, sample, event, out),
             EventBody::Dropped { source, count } => self.monitor.dropped(*source, t, *count, out),
             EventBody::Pulse => self.lines.gps.pulse(t),
             EventBody::Warm(state) => self.resume(state),
@@ -260,6 +261,50 @@ impl Pipeline {
         let (refused, why) = lines::refused(line.counts());
         self.monitor.refused(source, t, refused, &why, out);
         self.take_readings(source, t, out);
+    }
+
+    /// Rates and forces go to the filter as they are: the flight has them as they were heard.
+    fn inertial(&mut self, source: Source, sample: &InertialSample, event: &Event, out: &mut Vec<Output>) {
+        let Some(line) = &mut self.lines.imu else { return };
+        let stamped = line.stamp(sample, event.t_recv, event.seq);
+        let refused = line.refused();
+        self.heard_or_refused(source, event.t_recv, stamped.is_some(), refused, out);
+        if let (Some(sample), Some(estimators)) = (stamped, &mut self.estimators) {
+            estimators.joint.inertial(&sample, &mut self.estimated);
+        }
+        self.take_estimated(event.t_recv, out);
+    }
+
+    /// So does the second source of attitude.
+    fn second_attitude(
+        &mut self,
+        source: Source,
+        sample: &AttitudeSample,
+        event: &Event,
+        out: &mut Vec<Output>,
+    ) {
+        let Some(line) = &mut self.lines.attitude else { return };
+        let stamped = line.stamp(sample, event.t_recv, event.seq);
+        let refused = line.refused();
+        self.heard_or_refused(source, event.t_recv, stamped.is_some(), refused, out);
+        if let (Some(sample), Some(estimators)) = (stamped, &mut self.estimators) {
+            estimators.joint.second_attitude(&sample, &mut self.estimated);
+        }
+        self.take_estimated(event.t_recv, out);
+    }
+
+    fn heard_or_refused(
+        &mut self,
+        source: Source,
+        t: MonoTime,
+        heard: bool,
+        refused: u64,
+        out: &mut Vec<Output>,
+    ) {
+        match heard {
+            true => self.monitor.heard(source, t, out),
+            false => self.monitor.refused(source, t, refused, "values that cannot be", out),
+        }
     }
 
     fn take_readings(&mut self, source: Source, t: MonoTime, out: &mut Vec<Output>) {

@@ -5,8 +5,8 @@ use prost_types::Timestamp;
 
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
 use windhover_base::msg::{
-    FeatureTrack, FixKind, Health, MarkerDetection, MarkerId, MisfitWords, Notice, NoticeKind, Ownship,
-    SourceHealth, TargetEstimate, TrackStatus,
+    AttitudeSample, FeatureTrack, FixKind, Health, InertialSample, MarkerDetection, MarkerId, MisfitWords,
+    Notice, NoticeKind, Ownship, SourceHealth, TargetEstimate, TrackStatus,
 };
 use windhover_base::time::MonoTime;
 
@@ -138,6 +138,28 @@ pub(super) fn annotations(
         });
     }
     overlay
+}
+
+/// An attitude as a device put it, true at `t`.
+pub(super) fn attitude(t: MonoTime, heard: MonoTime, sample: &AttitudeSample) -> wh::Attitude {
+    wh::Attitude {
+        timestamp: stamp(t),
+        heading_rad: sample.heading,
+        heading_is_true: sample.heading_is_true,
+        pitch_rad: sample.tilt.map(|t| t.pitch),
+        roll_rad: sample.tilt.map(|t| t.roll),
+        heard: stamp(heard),
+    }
+}
+
+/// Rates and forces as a sensor put them, heard at `t`.
+pub(super) fn inertial(t: MonoTime, sample: &InertialSample) -> wh::Inertial {
+    let figures = |value: Option<Vector3<f64>>| value.map_or(Vec::new(), |v| v.as_slice().to_vec());
+    wh::Inertial {
+        timestamp: stamp(t),
+        rate_rps: figures(sample.rate_rps),
+        force_mps2: figures(sample.force_mps2),
+    }
 }
 
 /// The helicopter's own state, as a message.

@@ -6,7 +6,8 @@ use nalgebra::{UnitQuaternion, Vector3};
 use prost::Message;
 
 use super::output_messages::{
-    annotations, detections, fix_number, health, log_message, ownship, rtk, stamp, target_state, transform,
+    annotations, attitude, detections, fix_number, health, log_message, ownship, rtk, stamp, target_state,
+    transform,
 };
 use super::{Record, Schema, topic};
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
@@ -77,7 +78,7 @@ impl OutputEncoder {
                 out.push(record(topic::DATUM.into(), Schema::Datum, log, *t, &message));
             }
             Output::Reading(SensorReading::Gnss(epoch)) => fix(epoch, log, out),
-            Output::Reading(SensorReading::Attitude(sample)) => out.push(attitude(sample, log)),
+            Output::Reading(SensorReading::Attitude(sample)) => out.push(attitude_record(sample, log)),
             Output::Detections { frame, t_valid, markers, features } => {
                 let whole = detections(*frame, *t_valid, markers, features);
                 out.push(record(topic::CAMERA_DETECTIONS.into(), Schema::Detections, log, *t_valid, &whole));
@@ -207,16 +208,8 @@ fn fix(epoch: &Stamped<GnssEpoch>, log: MonoTime, out: &mut Vec<Record>) {
     out.push(record(topic::GPS_FIX.into(), Schema::LocationFix, log, t, &location));
 }
 
-fn attitude(sample: &Stamped<AttitudeSample>, log: MonoTime) -> Record {
-    let s = &sample.value;
-    let message = wh::Attitude {
-        timestamp: stamp(sample.t_valid),
-        heading_rad: s.heading,
-        heading_is_true: s.heading_is_true,
-        pitch_rad: s.tilt.map(|t| t.pitch),
-        roll_rad: s.tilt.map(|t| t.roll),
-        heard: stamp(sample.t_recv),
-    };
+fn attitude_record(sample: &Stamped<AttitudeSample>, log: MonoTime) -> Record {
+    let message = attitude(sample.t_valid, sample.t_recv, &sample.value);
     record(topic::COMPASS_ATTITUDE.into(), Schema::Attitude, log, sample.t_valid, &message)
 }
 
