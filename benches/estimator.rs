@@ -10,7 +10,7 @@ use windhover::io::clock::HostClock;
 use windhover_base::geo::{Ground, wrap_angle};
 use windhover_base::msg::{FrameObservations, MarkerId, Stamped, TargetEstimate, TrackStatus};
 use windhover_base::settings::{EstimatorConfig, Rig};
-use windhover_base::time::{MonoTime, Span};
+use windhover_base::time::{FrameClock, MonoTime, Span};
 use windhover_estimate::{Bound, BoundTruth, Estimator, EstimatorOutput, PaperEstimator, Site};
 use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 
@@ -355,6 +355,7 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
     let (mut busy, mut frames, mut resets) = (Span::ZERO, 0usize, 0usize);
     let offset = Span::from_ms(rig.camera.exposure_offset_ms);
     let error = suite.gps_latency_error().ms();
+    let mut exposures = FrameClock::default();
     while let Some(sample) = suite.next() {
         let begun = HostClock::thread_processor_time();
         match &sample {
@@ -363,7 +364,7 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
             Sample::Frame { truth, seq } => {
                 frames += 1;
                 let frame = Stamped {
-                    t_valid: truth.t_stamp + offset,
+                    t_valid: exposures.exposed(truth.t_stamp) + offset,
                     t_recv: truth.t_recv,
                     seq: *seq,
                     value: suite.observations().clone(),

@@ -33,7 +33,7 @@ use windhover_base::msg::{
     TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
 };
 use windhover_base::settings::{MarkerKind, TargetConfig};
-use windhover_base::time::{MonoTime, Span};
+use windhover_base::time::{FrameClock, MonoTime, Span};
 use windhover_detect::tracking::FrameDetector;
 use windhover_estimate::{Estimator, PaperEstimator};
 
@@ -63,6 +63,7 @@ pub struct Pipeline {
     /// Time of the last event or tick.
     now: MonoTime,
     last_exposure: Option<MonoTime>,
+    exposures: FrameClock,
     outputs: Vec<Output>,
     readings: Vec<SensorReading>,
     estimated: Vec<EstimatorOutput>,
@@ -102,6 +103,7 @@ impl Pipeline {
             schedule: Schedule::new(settings.filter.ownship_hz),
             now: MonoTime::default(),
             last_exposure: None,
+            exposures: FrameClock::default(),
             outputs: Vec::new(),
             readings: Vec::new(),
             estimated: Vec::new(),
@@ -395,7 +397,8 @@ impl Pipeline {
         out: &mut Vec<Output>,
     ) {
         let t = event.t_recv;
-        let t_valid = payload.t_exposure + Span::from_ms(self.settings.rig.camera.exposure_offset_ms);
+        let offset = Span::from_ms(self.settings.rig.camera.exposure_offset_ms);
+        let t_valid = self.exposures.exposed(payload.t_exposure) + offset;
         if self.last_exposure.is_some_and(|last| payload.t_exposure <= last) {
             let words = format!("frame {} is stamped no later than the one before", payload.index);
             out.push(notice(t, NoticeKind::ClockJump, Some(Source::Camera), words));

@@ -14,6 +14,9 @@ mod gnss_tests;
 mod report;
 mod sentence;
 mod standard;
+mod ubx;
+#[cfg(test)]
+mod ubx_tests;
 
 pub use compass::{CompassDecoder, CompassReading, HeardAttitude};
 pub use counts::{DecodeCounts, Refusal};

@@ -312,6 +312,39 @@ fn tag_corners_discs_and_features() {
     }
 }
 
+/// Rows of a rolling shutter: how what moves changes a pixel. What the time of a row makes of how a place or a direction does
+/// is left out: of 1,000 px a radian and 100 px a metre some tens and some.
+#[test]
+fn rows_exposed_one_after_the_other() {
+    let left_out = |columns, at_most| {
+        let term = "what a row's time makes of where and how a point is seen";
+        Omitted { term, columns, rows: ALL_ROWS, at_most }
+    };
+    for seed in 0..STATES {
+        let mut core = random_core(seed, Ground::Flat { down_m: 0.0 });
+        core.models.readout_s = 0.025;
+        let low = Vector2::new(640.0, 900.0);
+        let (target, slot, layout) = (0, 3, core.state.layout());
+        let of_pose = |seen: std::ops::Range<usize>| {
+            [
+                left_out(own::POSITION.range(), 5.0),
+                left_out(own::ATTITUDE.range(), 60.0),
+                left_out(seen, 20.0),
+            ]
+        };
+        let mut seen = detection(&core, target, 0);
+        (seen.center_px, seen.corners_px) = (low, Some([low; 4]));
+        let omitted = of_pose(layout.target(target).pose().range());
+        check_measurement("tag", seed, &core, &omitted, &|core| {
+            core.fuse_marker(target, 0, &seen);
+        });
+        let pixel = FeaturePixel { slot, px: low, sigma_px: 1.0 };
+        check_measurement("feature", seed, &core, &of_pose(layout.feature(slot).range()), &|core| {
+            pixel.fuse(core);
+        });
+    }
+}
+
 /// Turning helicopter, velocity and everything seen about the vertical changes no pixel, whatever was fused before:
 /// the covariance is carried along so that no heading comes of it (`State::keep_heading_unobserved`).
 #[test]

@@ -59,6 +59,8 @@ pub(crate) struct Models {
     pub(crate) ground: Ground,
     pub(crate) camera: CameraModel,
     pub(crate) image_px: (f64, f64),
+    /// From the first row's exposure to the last one's, s.
+    pub(crate) readout_s: f64,
     pub(crate) camera_from_body: Matrix3<f64>,
     pub(crate) camera_at: Vector3<f64>,
     pub(crate) antenna_at: Vector3<f64>,
@@ -111,6 +113,7 @@ impl Models {
             ground: site.ground.clone(),
             camera: camera.intrinsics,
             image_px: (f64::from(camera.width), f64::from(camera.height)),
+            readout_s: camera.readout_ms * 1e-3,
             camera_from_body: mount.body_from_camera().matrix().transpose(),
             camera_at: mount.position(),
             antenna_at: Vector3::from(gps.antenna_position_m),

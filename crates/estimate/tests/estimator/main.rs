@@ -5,3 +5,4 @@ mod filter;
 mod ground;
 mod honesty;
 mod ownship;
+mod time;
