@@ -398,7 +398,8 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
                 }
                 EstimatorOutput::Smoothed(e) => s.add(&e, &world),
                 EstimatorOutput::Reset { .. } | EstimatorOutput::Anchored { .. } => resets += 1,
-                EstimatorOutput::Ownship(_)
+                EstimatorOutput::Coasted(_)
+                | EstimatorOutput::Ownship(_)
                 | EstimatorOutput::Fusion(_)
                 | EstimatorOutput::TiltFelt { .. }
                 | EstimatorOutput::Misfit(_) => {}

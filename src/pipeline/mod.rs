@@ -4,6 +4,7 @@
 //! from it. It reads no clock: time is what the events say, and so are the ticks at which time-outs are
 //! looked at, so a replay of the same events gives the same outputs to the last bit.
 
+mod frame_pace;
 mod lines;
 mod misfit_words;
 mod misfits;
@@ -20,6 +21,7 @@ use std::sync::Arc;
 use nalgebra::Vector2;
 
 use crate::pixels::{self, DecodedFrame, FrameFault};
+use frame_pace::FramePace;
 use lines::SourceLines;
 use misfit_words::felt_words;
 use monitor::{Monitor, notice};
@@ -63,6 +65,7 @@ pub struct Pipeline {
     /// Time of the last event or tick.
     now: MonoTime,
     last_exposure: Option<MonoTime>,
+    pace: FramePace,
     exposures: FrameClock,
     outputs: Vec<Output>,
     readings: Vec<SensorReading>,
@@ -103,6 +106,7 @@ impl Pipeline {
             schedule: Schedule::new(settings.filter.ownship_hz),
             now: MonoTime::default(),
             last_exposure: None,
+            pace: FramePace::new(rig.camera.fps),
             exposures: FrameClock::default(),
             outputs: Vec::new(),
             readings: Vec::new(),
@@ -176,6 +180,15 @@ impl Pipeline {
         }
         if let Some(estimators) = &mut self.estimators {
             estimators.joint.tick(t, &mut self.estimated);
+            // While no frame comes, targets coast and are lost all the same; what is lost already is not said again.
+            if let Some(frame) = self.pace.missing_after(t)
+                && self.monitor.is_any_known()
+            {
+                estimators.joint.coast(t, frame, &mut self.estimated);
+                let monitor = &self.monitor;
+                self.estimated
+                    .retain(|said| !matches!(said, EstimatorOutput::Coasted(e) if monitor.is_lost(e.target)));
+            }
         }
         self.take_estimated(t, out);
     }
@@ -306,7 +319,7 @@ impl Pipeline {
     }
 
     fn gnss(&mut self, epoch: &Stamped<GnssEpoch>, t: MonoTime, out: &mut Vec<Output>) {
-        self.monitor.fix(t, epoch.value.fix, epoch.value.sats, self.lines.gps.clock_sigma(), out);
+        self.monitor.fix(t, epoch, self.lines.gps.clock_sigma(), out);
         self.monitor.pulses(t, self.lines.gps.pulse_trouble(), out);
         out.push(Output::Reading(SensorReading::Gnss(*epoch)));
         let agreed = self.finder.agreeing();
@@ -397,6 +410,7 @@ impl Pipeline {
         out: &mut Vec<Output>,
     ) {
         let t = event.t_recv;
+        self.pace.frame(t, payload.index);
         let offset = Span::from_ms(self.settings.rig.camera.exposure_offset_ms);
         let t_valid = self.exposures.exposed(payload.t_exposure) + offset;
         if self.last_exposure.is_some_and(|last| payload.t_exposure <= last) {
@@ -490,7 +504,9 @@ impl Pipeline {
     fn take_estimated(&mut self, t: MonoTime, out: &mut Vec<Output>) {
         for estimated in self.estimated.drain(..) {
             match &estimated {
-                EstimatorOutput::Estimate(estimate) => self.monitor.estimate(estimate, t, out),
+                EstimatorOutput::Estimate(estimate) | EstimatorOutput::Coasted(estimate) => {
+                    self.monitor.estimate(estimate, t, out);
+                }
                 EstimatorOutput::Fusion(result) => self.monitor.disposition(result.disposition),
                 EstimatorOutput::Anchored { moved_m: d } => {
                     let detail = format!(

@@ -6,5 +6,6 @@ mod contract;
 mod import;
 mod no_camera;
 mod samples;
+mod silent_camera;
 mod simulated_lines;
 mod warm_start;

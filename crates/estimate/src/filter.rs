@@ -31,7 +31,7 @@ pub struct Estimator {
     has_second: bool,
     blocks: Blocks,
     /// Room to look ahead in.
-    ahead: State,
+    pub(crate) ahead: State,
     /// The state as it was last told between frames.
     carried: State,
     /// Time of the state in the history from which it was carried on; `None` where a measurement came since.

@@ -7,6 +7,7 @@ mod anchor;
 mod begin;
 mod blocks;
 mod bound;
+mod coast;
 mod consider;
 mod core;
 mod delayed;

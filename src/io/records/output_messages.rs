@@ -220,6 +220,8 @@ pub fn target_state(estimate: &TargetEstimate, name: &str) -> wh::TargetState {
         message.yaw_rate_radps = s.yaw_rate_radps;
         message.lat_deg = s.lat_deg;
         message.lon_deg = s.lon_deg;
+        message.height_m = s.height_m;
+        message.relative_sigma_m = s.relative_sigma_m;
         if let Some(p) = &s.covariance {
             message.covariance = upper_triangle(p);
         }
@@ -285,6 +287,7 @@ pub fn health(now: &Health, names: &[String]) -> wh::Health {
         fix: fix_number(now.fix),
         sats: now.sats.unwrap_or(0),
         clock_sigma_ms: now.clock_sigma.map_or(-1.0, |s| s.ms()),
+        utc_minus_host_ns: now.utc_minus_host.map(|ahead| ahead.ns()),
         misfits: now.misfits.iter().map(misfit).collect(),
         dispositions: now.dispositions.iter().map(|(d, n)| (d.name().to_owned(), *n)).collect(),
         ..Default::default()

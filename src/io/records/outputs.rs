@@ -52,7 +52,6 @@ pub fn opening(camera: &CameraConfig, t: MonoTime) -> Vec<Record> {
 /// Turns outputs into records.
 pub struct OutputEncoder {
     targets: Vec<String>,
-    datum_height_m: f64,
     /// What the next health message tells of the daemon.
     pub figures: DaemonFigures,
 }
@@ -62,7 +61,6 @@ impl OutputEncoder {
     pub fn new(targets: &[TargetConfig]) -> Self {
         Self {
             targets: targets.iter().map(|target| target.name.clone()).collect(),
-            datum_height_m: 0.0,
             figures: DaemonFigures::default(),
         }
     }
@@ -71,7 +69,6 @@ impl OutputEncoder {
     pub fn output(&mut self, output: &Output, log: MonoTime, out: &mut Vec<Record>) {
         match output {
             Output::Datum(t, datum) => {
-                self.datum_height_m = datum.height_m;
                 let message = wh::Datum {
                     timestamp: Some(timestamp(*t)),
                     lat_deg: datum.lat_deg,
@@ -110,7 +107,14 @@ impl OutputEncoder {
                 let tf = transform(own.t_valid, "ned", "body", own.position_ned_m, &own.ned_from_body);
                 out.push(record(topic::TF.into(), Schema::FrameTransform, log, own.t_valid, &tf));
             }
-            EstimatorOutput::Estimate(estimate) => self.estimate(estimate, log, out),
+            EstimatorOutput::Estimate(e) => {
+                self.state(topic::target_state(self.name(e)), e, log, out);
+                self.place(e, log, out);
+            }
+            EstimatorOutput::Coasted(e) => {
+                self.state(topic::target_coasting(self.name(e)), e, log, out);
+                self.place(e, log, out);
+            }
             EstimatorOutput::Smoothed(e) => self.state(topic::target_smoothed(self.name(e)), e, log, out),
             EstimatorOutput::Fusion(result) => out.push(fusion(result, log)),
             // The pipeline's notice tells of these.
@@ -130,8 +134,8 @@ impl OutputEncoder {
         out.push(record(topic, Schema::TargetState, log, estimate.t_valid, &message));
     }
 
-    fn estimate(&self, estimate: &TargetEstimate, log: MonoTime, out: &mut Vec<Record>) {
-        self.state(topic::target_state(self.name(estimate)), estimate, log, out);
+    /// Where a target is, for maps and for viewers of transforms.
+    fn place(&self, estimate: &TargetEstimate, log: MonoTime, out: &mut Vec<Record>) {
         let Some(state) = &estimate.state else { return };
         let name = self.name(estimate);
         let t = estimate.t_valid;
@@ -149,7 +153,7 @@ impl OutputEncoder {
             frame_id: format!("target/{name}"),
             latitude: state.lat_deg,
             longitude: state.lon_deg,
-            altitude: self.datum_height_m,
+            altitude: state.height_m,
             position_covariance: covariance,
             position_covariance_type: known.into(),
             ..Default::default()
