@@ -128,13 +128,13 @@ pub struct LinkTask {
 /// Serves stations until the end is asked for.
 pub async fn run(task: LinkTask) {
     let mut beside = JoinSet::new();
-    if task.config.mavlink.enabled {
-        if let Some(sender) = task.open_mavlink().await {
-            let every = Duration::from_secs_f64(sender.every().s());
-            task.downlink.lines().mavlink = Some(sender);
-            let (downlink, status) = (task.downlink.clone(), task.status.clone());
-            beside.spawn(send_mavlink(downlink, status, task.context.clock, every));
-        }
+    if task.config.mavlink.enabled
+        && let Some(sender) = task.open_mavlink().await
+    {
+        let every = Duration::from_secs_f64(sender.every().s());
+        task.downlink.lines().mavlink = Some(sender);
+        let (downlink, status) = (task.downlink.clone(), task.status.clone());
+        beside.spawn(send_mavlink(downlink, status, task.context.clock, every));
     }
     while !task.context.stop.is_cancelled() {
         if !task.config.link.enabled {

@@ -202,7 +202,7 @@ mod tests {
         assert!(text.contains("GPGGA,000045.25,3100.000000,N,08530.000000,W,6,"), "{text}");
         let lost = Vehicle { status: "lost", age: Span::from_s(35.2), ..vehicle() };
         assert_eq!(nmea(&lost), "$GPRMC,,V,,,,,,,,,,N*53\r\n$GPGGA,,,,,,0,,,,M,,M,,*66\r\n");
-        let parsed: Value = serde_json::from_str(&geojson(&[lost.clone()])).expect("JSON");
+        let parsed: Value = serde_json::from_str(&geojson(std::slice::from_ref(&lost))).expect("JSON");
         assert_eq!(parsed["features"][0]["geometry"], Value::Null);
         assert_eq!(parsed["features"][0]["properties"]["status"], json!("lost"));
         assert_eq!(parsed["features"][0]["properties"]["age_s"], json!(35.2));

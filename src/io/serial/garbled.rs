@@ -8,7 +8,8 @@ pub(super) struct TextShare {
     heard: Vec<u8>,
     /// Windows without anything sound since the last that had something.
     unsound: u32,
-    was_sound: bool,
+    /// Windows that mixed what is no text with something sound.
+    mixed: u32,
 }
 
 /// Bytes judged at a time: about a second of NMEA at 4800 baud.
@@ -19,6 +20,8 @@ const GARBLED_PERCENT: usize = 25;
 /// Windows that a device which was understood may fill with binary packets of its own between two sentences:
 /// raw measurements of a second.
 const UNSOUND_MAX: u32 = 20;
+/// Mixed windows from which on a device is known to mix: a burst of rubbish after good sentences makes one.
+const MIXES: u32 = 2;
 /// Longest that a packet or sentence over the end of a window is waited for.
 const KEPT: usize = 1_100;
 
@@ -36,13 +39,14 @@ impl TextShare {
         let odd =
             self.heard.iter().filter(|byte| !matches!(byte, b' '..=b'~' | b'\r' | b'\n' | b'\t')).count();
         let percent = odd * 100 / self.heard.len();
-        if percent >= GARBLED_PERCENT && holds_anything_sound(&self.heard) {
-            (self.was_sound, self.unsound) = (true, 0);
+        let is_sound = percent >= GARBLED_PERCENT && holds_anything_sound(&self.heard);
+        if is_sound {
+            (self.mixed, self.unsound) = (self.mixed.saturating_add(1), 0);
         } else {
             self.unsound += 1;
         }
         self.heard.clear();
-        let is_mixed = self.was_sound && self.unsound <= UNSOUND_MAX;
+        let is_mixed = is_sound || self.mixed >= MIXES && self.unsound <= UNSOUND_MAX;
         (percent >= GARBLED_PERCENT && !is_mixed).then_some(percent)
     }
 }
@@ -80,6 +84,17 @@ mod tests {
         let mut share = TextShare::default();
         assert!(share.garbled(&noise).is_some_and(|percent| percent > 40));
         assert!(share.garbled(&line[..40]).is_none(), "a window starts anew after it was judged");
+    }
+
+    #[test]
+    fn rubbish_after_good_sentences_is_garbled() {
+        let line = b"$GPRMC,162254.00,A,3723.02837,N,12159.39853,W,0.820,188.36,110706,,,A*74\r\n";
+        for ahead in 0..12 {
+            let mut share = TextShare::default();
+            assert!((0..ahead).all(|_| share.garbled(line).is_none()));
+            let is_reported = [0xff; 900].chunks(61).any(|read| share.garbled(read).is_some());
+            assert!(is_reported, "{ahead} sentences before");
+        }
     }
 
     /// A packet of u-blox with a payload that is no text.
