@@ -39,20 +39,26 @@ impl TextShare {
         let odd =
             self.heard.iter().filter(|byte| !matches!(byte, b' '..=b'~' | b'\r' | b'\n' | b'\t')).count();
         let percent = odd * 100 / self.heard.len();
-        let is_sound = percent >= GARBLED_PERCENT && holds_anything_sound(&self.heard);
-        if is_sound {
+        let is_packets = percent >= GARBLED_PERCENT && holds_packets(&self.heard);
+        if is_packets || percent >= GARBLED_PERCENT && holds_a_sentence(&self.heard) {
             (self.mixed, self.unsound) = (self.mixed.saturating_add(1), 0);
         } else {
             self.unsound += 1;
         }
         self.heard.clear();
-        let is_mixed = is_sound || self.mixed >= MIXES && self.unsound <= UNSOUND_MAX;
+        let is_mixed = is_packets || self.mixed >= MIXES && self.unsound <= UNSOUND_MAX;
         (percent >= GARBLED_PERCENT && !is_mixed).then_some(percent)
     }
 }
 
-fn holds_anything_sound(bytes: &[u8]) -> bool {
-    bodies(&String::from_utf8_lossy(bytes)).next().is_some() || holds_a_packet(bytes)
+fn holds_a_sentence(bytes: &[u8]) -> bool {
+    bodies(&String::from_utf8_lossy(bytes)).next().is_some()
+}
+
+/// Whether this is packets of a u-blox receiver: a whole one, or the marks of one beside a sound sentence.
+fn holds_packets(bytes: &[u8]) -> bool {
+    let is_marked = bytes.windows(2).any(|pair| pair == [0xB5, 0x62]);
+    is_marked && (holds_a_packet(bytes) || holds_a_sentence(bytes))
 }
 
 /// Whether there is a packet of u-blox receivers: two marks, class and identity, length, payload, and the
@@ -94,6 +100,9 @@ mod tests {
             assert!((0..ahead).all(|_| share.garbled(line).is_none()));
             let is_reported = [0xff; 900].chunks(61).any(|read| share.garbled(read).is_some());
             assert!(is_reported, "{ahead} sentences before");
+            let mut share = TextShare::default();
+            assert!((0..ahead).all(|_| share.garbled(line).is_none()));
+            assert!(share.garbled(&[0xff; 900]).is_some(), "in one read, {ahead} sentences before");
         }
     }
 
