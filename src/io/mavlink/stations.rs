@@ -76,7 +76,7 @@ pub fn look_up(names: Vec<String>) -> Vec<Found> {
 #[derive(Debug)]
 pub struct Stations {
     v4: UdpSocket,
-    /// `None` on a computer without IPv6.
+    /// Opened for the first station that has an IPv6 address; `None` before, and on a computer without IPv6.
     v6: Option<UdpSocket>,
     all: Vec<Station>,
     asked: Option<MonoTime>,
@@ -90,7 +90,7 @@ impl Stations {
         v4.set_broadcast(true)?;
         v4.set_nonblocking(true)?;
         let all = names.iter().map(|name| Station { name: name.clone(), ..Station::default() }).collect();
-        Ok(Self { v4, v6: v6_socket().ok(), all, asked: None, news: Vec::new() })
+        Ok(Self { v4, v6: None, all, asked: None, news: Vec::new() })
     }
 
     /// The stations.
@@ -119,7 +119,12 @@ impl Stations {
         for (name, address) in found {
             let Some(station) = self.all.iter_mut().find(|station| station.name == name) else { continue };
             match address {
-                Ok(address) => station.address = Some(address),
+                Ok(address) => {
+                    station.address = Some(address);
+                    if address.is_ipv6() && self.v6.is_none() {
+                        self.v6 = v6_socket().ok();
+                    }
+                }
                 Err(why) => report(station, Some(why), &mut self.news),
             }
         }
