@@ -229,7 +229,7 @@ impl Estimator {
     }
 
     /// The helicopter's own state at `t`, from what was taken so far; `None` where it is not known or nothing was
-    /// measured for [`GUESS_S`] before.
+    /// measured for ten seconds before.
     pub fn ownship(&mut self, t: MonoTime) -> Option<Ownship> {
         let state = self.history.at(t);
         let ahead = t - state.t;

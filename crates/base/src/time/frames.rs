@@ -16,7 +16,7 @@ const FEWEST: f64 = 12.0;
 ///
 /// A stamp made by the sensor is right though it does not fall on the beat; one made when a USB transfer was done jitters by
 /// milliseconds about it. How far stamps lie from their beat (the straight line through them) tells which: of a deviation
-/// `r`, with a variance `V` beyond [`GOOD_MS2`], the share `REAL / (REAL + V − GOOD)` is taken as real, which is its
+/// `r`, with a variance `V` beyond `GOOD`, the share `REAL / (REAL + V − GOOD)` is taken as real, which is its
 /// expectation where the rest is the stamp's error. Good stamps are given back as they are.
 #[derive(Clone, Debug, Default)]
 pub struct FrameClock {
