@@ -22,7 +22,7 @@ use nalgebra::Vector2;
 
 use crate::pixels::{self, DecodedFrame, FrameFault};
 use frame_pace::FramePace;
-use lines::SourceLines;
+use lines::{Sample, SourceLines};
 use misfit_words::felt_words;
 use monitor::{Monitor, notice};
 use seen::SeenMarkers;
@@ -31,8 +31,8 @@ use ticks::{Due, Schedule};
 use windhover_base::geo::{Geodetic, Tile};
 use windhover_base::msg::{
     AttitudeSample, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload, FramePrediction,
-    GnssEpoch, InertialSample, NoticeKind, Output, SensorReading, Source, Stamped, TargetEstimate,
-    TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
+    GnssEpoch, NoticeKind, Output, SensorReading, Source, Stamped, TargetEstimate, TimedOutput, TrackStatus,
+    WarmFilter, WarmSite, WarmState,
 };
 use windhover_base::settings::{MarkerKind, TargetConfig};
 use windhover_base::time::{FrameClock, MonoTime, Span};
@@ -213,8 +213,12 @@ impl Pipeline {
                 let decoded = prepared.unwrap_or_else(|| pixels::decode(frame, self.want_rgb));
                 self.frame(frame, decoded, event, out);
             }
-            EventBody::Inertial { source, sample } => self.inertial(*source, sample, event, out),
-            EventBody::Attitude { source, sample } => self.second_attitude(*source, sample, event, out),
+            EventBody::Inertial { source, sample } => {
+                self.sample(*source, sample, event, Estimator::inertial, out);
+            }
+            EventBody::Attitude { source, sample } => {
+                self.sample(*source, sample, event, Estimator::second_attitude, out);
+            }
             EventBody::Dropped { source, count } => self.monitor.dropped(*source, t, *count, out),
             EventBody::Pulse => self.lines.gps.pulse(t),
             EventBody::Warm(state) => self.resume(state),
@@ -263,32 +267,21 @@ impl Pipeline {
         self.take_readings(source, t, out);
     }
 
-    /// Rates and forces go to the filter as they are: the flight has them as they were heard.
-    fn inertial(&mut self, source: Source, sample: &InertialSample, event: &Event, out: &mut Vec<Output>) {
-        let Some(line) = &mut self.lines.imu else { return };
-        let stamped = line.stamp(sample, event.t_recv, event.seq);
-        let refused = line.refused();
-        self.heard_or_refused(source, event.t_recv, stamped.is_some(), refused, out);
-        if let (Some(sample), Some(estimators)) = (stamped, &mut self.estimators) {
-            estimators.joint.inertial(&sample, &mut self.estimated);
-        }
-        self.take_estimated(event.t_recv, out);
-    }
-
-    /// So does the second source of attitude.
-    fn second_attitude(
+    /// Samples go to the filter as they are: the flight has them as they were received.
+    fn sample<T: Sample>(
         &mut self,
         source: Source,
-        sample: &AttitudeSample,
+        sample: &T,
         event: &Event,
+        fuse: fn(&mut Estimator, &Stamped<T>, &mut Vec<EstimatorOutput>),
         out: &mut Vec<Output>,
     ) {
-        let Some(line) = &mut self.lines.attitude else { return };
+        let Some(line) = self.lines.samples(source) else { return };
         let stamped = line.stamp(sample, event.t_recv, event.seq);
         let refused = line.refused();
         self.heard_or_refused(source, event.t_recv, stamped.is_some(), refused, out);
         if let (Some(sample), Some(estimators)) = (stamped, &mut self.estimators) {
-            estimators.joint.second_attitude(&sample, &mut self.estimated);
+            fuse(&mut estimators.joint, &sample, &mut self.estimated);
         }
         self.take_estimated(event.t_recv, out);
     }

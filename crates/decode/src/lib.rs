@@ -22,3 +22,4 @@ pub use compass::{CompassDecoder, CompassReading, HeardAttitude};
 pub use counts::{DecodeCounts, Refusal};
 pub use gnss::{GnssDecoder, HeardEpoch};
 pub use sentence::{Sentence, framed};
+pub use ubx::{holds_ubx_packet, ubx_framed};

@@ -118,12 +118,38 @@ impl Splitter {
         if packet.len() < length + AROUND {
             return Held::Begun;
         }
-        let sum = packet[2..packet.len() - 2].iter().fold((0u8, 0u8), |(a, b), byte| {
-            let a = a.wrapping_add(*byte);
-            (a, b.wrapping_add(a))
-        });
-        if packet.ends_with(&[sum.0, sum.1]) { Held::Whole } else { Held::Damaged }
+        if packet.ends_with(&checksum(&packet[2..packet.len() - 2])) { Held::Whole } else { Held::Damaged }
     }
+}
+
+/// Fletcher sum of 8 bits over class, identity, length and payload.
+fn checksum(summed: &[u8]) -> [u8; 2] {
+    let (a, b) = summed.iter().fold((0u8, 0u8), |(a, b), byte| {
+        let a = a.wrapping_add(*byte);
+        (a, b.wrapping_add(a))
+    });
+    [a, b]
+}
+
+/// A whole packet on the wire. Payloads have 65,535 bytes at the most; the rest of a longer one is left out.
+pub fn ubx_framed(class: u8, identity: u8, payload: &[u8]) -> Vec<u8> {
+    let length = u16::try_from(payload.len()).unwrap_or(u16::MAX);
+    let mut packet = vec![0xB5, 0x62, class, identity];
+    packet.extend_from_slice(&length.to_le_bytes());
+    packet.extend_from_slice(&payload[..usize::from(length)]);
+    let sum = checksum(&packet[2..]);
+    packet.extend_from_slice(&sum);
+    packet
+}
+
+/// Whether bytes hold a whole packet of any class, its checksum sound.
+pub fn holds_ubx_packet(bytes: &[u8]) -> bool {
+    bytes.windows(HEAD).enumerate().any(|(at, head)| {
+        let &[0xB5, 0x62, _, _, low, high] = head else { return false };
+        let end = at + HEAD + usize::from(u16::from_le_bytes([low, high]));
+        let sum = bytes.get(at + 2..end).map(checksum);
+        sum.is_some_and(|sum| bytes.get(end..end + 2) == Some(&sum[..]))
+    })
 }
 
 /// Name of a packet, for the order of a burst.

@@ -4,21 +4,11 @@ use proptest::prelude::*;
 
 use super::gnss::{GnssDecoder, HeardEpoch};
 use super::sentence::framed;
+use super::ubx::ubx_framed;
 use super::{DecodeCounts, Refusal};
 use windhover_base::msg::FixKind;
 use windhover_base::settings::GpsFormat;
 use windhover_base::time::MonoTime;
-
-fn packet(class: u8, identity: u8, payload: &[u8]) -> Vec<u8> {
-    let mut summed = vec![class, identity];
-    summed.extend_from_slice(&(payload.len() as u16).to_le_bytes());
-    summed.extend_from_slice(payload);
-    let sum = summed.iter().fold((0u8, 0u8), |(a, b), byte| {
-        let a = a.wrapping_add(*byte);
-        (a, b.wrapping_add(a))
-    });
-    [&[0xB5, 0x62], summed.as_slice(), &[sum.0, sum.1]].concat()
-}
 
 /// NAV-PVT of 2026-11-18 15:04:`second`, `nanoseconds` beside it, with this fix type and flags.
 fn pvt(second: u8, nanoseconds: i32, fix: u8, flags: u8) -> Vec<u8> {
@@ -43,7 +33,7 @@ fn pvt(second: u8, nanoseconds: i32, fix: u8, flags: u8) -> Vec<u8> {
     ] {
         payload[at..at + 4].copy_from_slice(&i32::to_le_bytes(value));
     }
-    packet(1, 7, &payload)
+    ubx_framed(1, 7, &payload)
 }
 
 fn decode(format: GpsFormat, bytes: &[u8]) -> (Vec<HeardEpoch>, DecodeCounts) {
@@ -116,24 +106,24 @@ fn other_packets_are_passed_over_and_damage_is_counted() {
     let mut damaged = pvt(6, 0, 3, 1);
     damaged[40] ^= 4;
     let bytes = [
-        packet(1, 0x35, &[7; 300]),
+        ubx_framed(1, 0x35, &[7; 300]),
         pvt(5, 0, 3, 1),
         damaged,
-        packet(2, 0x15, &[0xB5; 900]),
+        ubx_framed(2, 0x15, &[0xB5; 900]),
         pvt(7, 0, 3, 1),
     ]
     .concat();
     let (epochs, counts) = decode(GpsFormat::Auto, &bytes);
     assert_eq!((epochs.len(), counts.used, counts.ignored), (2, 2, 2), "{counts}");
     assert_eq!(counts.refused(Refusal::BadChecksum), 1, "{counts}");
-    let wrong_length = packet(1, 7, &[0; 20]);
+    let wrong_length = ubx_framed(1, 7, &[0; 20]);
     assert_eq!(decode(GpsFormat::Auto, &wrong_length).1.refused(Refusal::Malformed), 1);
 }
 
 #[test]
 fn the_seventh_generation_is_read() {
     let long = pvt(5, 0, 3, 1);
-    let (epochs, counts) = decode(GpsFormat::Auto, &packet(1, 7, &long[6..90]));
+    let (epochs, counts) = decode(GpsFormat::Auto, &ubx_framed(1, 7, &long[6..90]));
     assert_eq!((epochs.len(), epochs[0].epoch.fix), (1, FixKind::ThreeD), "{counts}");
 }
 
@@ -149,7 +139,7 @@ proptest! {
         if sized {
             payload.resize(length, 0xFF);
         }
-        let bytes = packet(class, identity, &payload);
+        let bytes = ubx_framed(class, identity, &payload);
         for heard in decode(GpsFormat::Auto, &bytes).0 {
             prop_assert!(heard.epoch.lat_deg.is_none_or(|lat| (-90.0..=90.0).contains(&lat)));
             prop_assert!(heard.epoch.course_deg.is_none_or(|course| (0.0..=360.0).contains(&course)));

@@ -132,12 +132,7 @@ impl Estimator {
             self.refused(FusionSource::CompassHeading, sample.t_valid, Disposition::NoOwnship, out);
             return;
         }
-        let value = sample.value;
-        self.take(stamp_of(sample), FusionSource::CompassHeading, out, |m| {
-            m.kind = Kind::Attitude;
-            m.attitude = value;
-        });
-        self.emit_smoothed(out);
+        self.take_attitude(sample, Kind::Attitude, FusionSource::CompassHeading, out);
     }
 
     /// Takes a reading of the second source of attitude, in body axes. Nothing becomes of it where the rig has no
@@ -150,9 +145,19 @@ impl Estimator {
             self.refused(FusionSource::AttitudeHeading, sample.t_valid, Disposition::NoOwnship, out);
             return;
         }
+        self.take_attitude(sample, Kind::SecondAttitude, FusionSource::AttitudeHeading, out);
+    }
+
+    fn take_attitude(
+        &mut self,
+        sample: &Stamped<AttitudeSample>,
+        kind: Kind,
+        source: FusionSource,
+        out: &mut Vec<EstimatorOutput>,
+    ) {
         let value = sample.value;
-        self.take(stamp_of(sample), FusionSource::AttitudeHeading, out, |m| {
-            m.kind = Kind::SecondAttitude;
+        self.take(stamp_of(sample), source, out, |m| {
+            m.kind = kind;
             m.attitude = value;
         });
         self.emit_smoothed(out);

@@ -2,6 +2,7 @@
 
 use std::net::UdpSocket;
 
+use super::vehicle::tests::state_of;
 use super::*;
 use crate::config::Config;
 use windhover_base::msg::TargetEstimate;
@@ -30,18 +31,7 @@ impl Bench {
     }
 
     fn estimate(&mut self, s: f64, status: TrackStatus, relative_sigma_m: f64) {
-        let state = TargetState {
-            north_m: 1.0,
-            east_m: 2.0,
-            heading_rad: 0.1,
-            speed_mps: 1.0,
-            yaw_rate_radps: 0.0,
-            lat_deg: 30.0,
-            lon_deg: -85.0,
-            height_m: 8.5,
-            covariance: None,
-            relative_sigma_m: Some(relative_sigma_m),
-        };
+        let state = state_of(8.5, Some(relative_sigma_m));
         let state = (status != TrackStatus::Lost).then_some(state);
         let estimate =
             TargetEstimate { t_valid: START + Span::from_s(s), frame: 1, target: 0, status, state };

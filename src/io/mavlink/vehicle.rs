@@ -64,7 +64,7 @@ impl Vehicle {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
     const LIMITS: Limits =
@@ -74,8 +74,9 @@ mod tests {
         MonoTime::default() + Span::from_s(s)
     }
 
-    fn estimate(s: f64, status: TrackStatus, relative_sigma_m: Option<f64>) -> TargetEstimate {
-        let state = TargetState {
+    /// A state at this height, known so well relative to the helicopter.
+    pub(in crate::io::mavlink) fn state_of(height_m: f64, relative_sigma_m: Option<f64>) -> TargetState {
+        TargetState {
             north_m: 1.0,
             east_m: 2.0,
             heading_rad: 0.1,
@@ -83,10 +84,14 @@ mod tests {
             yaw_rate_radps: 0.0,
             lat_deg: 30.0,
             lon_deg: -85.0,
-            height_m: 6.0,
+            height_m,
             covariance: None,
             relative_sigma_m,
-        };
+        }
+    }
+
+    fn estimate(s: f64, status: TrackStatus, relative_sigma_m: Option<f64>) -> TargetEstimate {
+        let state = state_of(6.0, relative_sigma_m);
         TargetEstimate { t_valid: at(s), frame: 1, target: 0, status, state: Some(state) }
     }
 

@@ -1,6 +1,7 @@
 //! Tells a wrong line speed by what arrives: text read at the wrong speed is not text, and holds no sound sentence.
 
 use super::garmin::bodies;
+use windhover_decode::holds_ubx_packet;
 
 /// Counts bytes that have no place in a text protocol, and looks for what only the right speed gives.
 #[derive(Debug, Default)]
@@ -58,28 +59,13 @@ fn holds_a_sentence(bytes: &[u8]) -> bool {
 /// Whether this is packets of a u-blox receiver: a whole one, or the marks of one beside a sound sentence.
 fn holds_packets(bytes: &[u8]) -> bool {
     let is_marked = bytes.windows(2).any(|pair| pair == [0xB5, 0x62]);
-    is_marked && (holds_a_packet(bytes) || holds_a_sentence(bytes))
-}
-
-/// Whether there is a packet of u-blox receivers: two marks, class and identity, length, payload, and the
-/// Fletcher sum over all but the marks.
-fn holds_a_packet(bytes: &[u8]) -> bool {
-    bytes.windows(6).enumerate().any(|(at, head)| {
-        let &[0xB5, 0x62, _, _, low, high] = head else { return false };
-        let end = at + 6 + usize::from(u16::from_le_bytes([low, high]));
-        let sum = bytes.get(at + 2..end).map(|summed| {
-            summed.iter().fold((0u8, 0u8), |(a, b), byte| {
-                let a = a.wrapping_add(*byte);
-                (a, b.wrapping_add(a))
-            })
-        });
-        sum.zip(bytes.get(end..end + 2)).is_some_and(|((a, b), told)| told == [a, b])
-    })
+    is_marked && (holds_ubx_packet(bytes) || holds_a_sentence(bytes))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use windhover_decode::ubx_framed;
 
     #[test]
     fn text_passes_and_noise_does_not() {
@@ -108,14 +94,8 @@ mod tests {
 
     /// A packet of u-blox with a payload that is no text.
     fn packet(length: u16) -> Vec<u8> {
-        let mut packet = vec![1, 7];
-        packet.extend_from_slice(&length.to_le_bytes());
-        packet.extend((0..length).map(|n| n.wrapping_mul(91) as u8));
-        let sum = packet.iter().fold((0u8, 0u8), |(a, b), byte| {
-            let a = a.wrapping_add(*byte);
-            (a, b.wrapping_add(a))
-        });
-        [&[0xB5, 0x62], packet.as_slice(), &[sum.0, sum.1]].concat()
+        let payload: Vec<u8> = (0..length).map(|n| n.wrapping_mul(91) as u8).collect();
+        ubx_framed(1, 7, &payload)
     }
 
     #[test]

@@ -7,7 +7,7 @@ mod samples;
 
 pub(super) use compass::CompassLine;
 pub(super) use gps::GpsLine;
-pub(super) use samples::SampleLine;
+pub(super) use samples::{Sample, SampleLine};
 
 use windhover_base::msg::{Delivery, SensorReading, Source};
 use windhover_base::settings::Rig;
@@ -56,13 +56,21 @@ impl SourceLines {
         }
     }
 
+    /// The line of a source of samples; `None` where it delivers something else, or is not configured.
+    pub(super) fn samples(&mut self, source: Source) -> Option<&mut SampleLine> {
+        match source {
+            Source::Imu => self.imu.as_mut(),
+            Source::Attitude => self.attitude.as_mut(),
+            Source::Gps | Source::Compass | Source::Camera => None,
+        }
+    }
+
     /// Whether something is to come from a source.
     pub(super) fn awaits(&mut self, source: Source) -> bool {
         match source.delivers() {
             Delivery::Bytes => self.of(source).is_some(),
             Delivery::Frames => true,
-            Delivery::Inertial => self.imu.is_some(),
-            Delivery::Attitude => self.attitude.is_some(),
+            Delivery::Inertial | Delivery::Attitude => self.samples(source).is_some(),
         }
     }
 }
