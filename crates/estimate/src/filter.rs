@@ -193,15 +193,21 @@ impl Estimator {
             self.refused(FusionSource::Marker, t, Disposition::NoOwnship, out);
             None
         };
-        // The state after this frame; where it was not taken, the newest one.
-        let state = match taken {
-            Some(index) => self.history.before(index + 1),
-            None => &self.core.state,
+        // The state after this frame; where it was not taken, what all else shows of that time, and nothing beyond the
+        // newest measurement.
+        let (state, t) = match taken {
+            Some(index) => (self.history.before(index + 1), t),
+            None => {
+                let t = t.min(self.core.state.t);
+                self.ahead.copy_present(self.history.at(t));
+                self.ahead.propagate(t, &self.core.models);
+                (&self.ahead, self.ahead.t)
+            }
         };
         for target in 0..state.targets.len() {
             out.push(EstimatorOutput::Estimate(state.estimate(&self.core.models, target, number, t)));
         }
-        if taken.is_some() {
+        if state.alive {
             out.push(EstimatorOutput::Ownship(state.ownship(&self.core.models, Some(number), t)));
         }
         self.emit_smoothed(out);
