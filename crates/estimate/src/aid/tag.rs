@@ -5,7 +5,7 @@ use nalgebra::{Matrix2, Matrix2x5, Vector2, Vector3};
 use windhover_base::msg::{Disposition, FusionSource};
 
 use super::Aid;
-use super::pixel::{self, CameraColumns, Moment};
+use super::pixel::{self, CameraColumns, Curvature, Moment};
 use crate::blocks::own;
 use crate::core::Core;
 use crate::fitted::blend_factor;
@@ -53,7 +53,7 @@ pub(super) fn linearise_points<'a>(
     z: &mut Measurement,
 ) -> Result<(), Disposition> {
     let mean = &state.targets[target].mean;
-    let curvature = pixel::curvature_px2(&state.cov, models);
+    let curvature = Curvature::of(&state.cov, &state.own, models);
     let factor = state.learnt.marker_factor[target];
     z.begin(2 * seen.len());
     let camera = CameraColumns::touch(z);
@@ -64,12 +64,12 @@ pub(super) fn linearise_points<'a>(
         let (world, derivatives) = pixel::target_point(mean, models, point);
         let view = pixel::view(&state.own, models, &world).ok_or(Disposition::Invalid)?;
         let known = cov_px2 + Matrix2::identity() * models.marker_var_px2;
-        let noise = known * factor + Matrix2::identity() * curvature;
+        let bent = curvature.noise_px2(&(world - state.own.position));
         // The point's velocity and its derivatives by speed, yaw rate and heading.
         let [north, east, turn] = derivatives;
         let ahead = north * c + east * s;
         let moment = Moment::of(&state.own, models, &view, &(ahead * speed + turn * yaw_rate), px);
-        camera.set_point(z, i, px, &state.own, &view, &moment, &noise);
+        camera.set_point(z, i, px, &state.own, &view, &moment, &(known * factor), &bent);
         let later = moment.after_s;
         let sideways = (east * c - north * s) * (speed * later);
         let by = [north, east, turn + sideways, ahead * later, turn * later];
@@ -94,8 +94,7 @@ impl Tag<'_> {
 
 /// Fuses the marker that stands in `z` through the gate, its noise raised by a factor; whether it was inside.
 pub(super) fn fuse_expected(core: &mut Core, target: usize, worse: f64) -> bool {
-    let curvature = pixel::curvature_px2(&core.state.cov, &core.models);
-    let settled = curvature < pixel::LITTLE_CURVATURE * core.z.noise[0][0];
+    let settled = !core.z.unsettled;
     core.z.scale_noise(worse);
     let outcome = core.fuse_gated(FusionSource::Marker);
     if settled && core.teaches(&outcome) {
