@@ -304,7 +304,7 @@ fn tag_corners_discs_and_features() {
                     core.fuse_marker(target, marker, &seen);
                 });
             }
-            let pixel = FeaturePixel { slot: 3, px: Vector2::new(640.0, 512.0), sigma_px: 1.0 };
+            let pixel = FeaturePixel { slot: 3, px: Vector2::new(640.0, 512.0), sigma_px: 1.0, slack_m: 0.0 };
             check_measurement("feature", seed, &core, omitted, &|core| {
                 pixel.fuse(core);
             });
@@ -375,6 +375,42 @@ fn nothing_seen_shows_absolute_heading() {
             });
             let pixels = (h * &turn).amax();
             assert!(pixels < 1e-8, "seed {seed}, target {target}: {pixels} px per radian");
+        }
+    }
+}
+
+/// Along the two directions in which nobody can tell who is wrong (all that is seen larger, all tags turned on their
+/// vehicle) no pixel changes, of tags nor of ground features.
+#[test]
+fn nothing_seen_shows_scale_or_how_tags_are_turned() {
+    for seed in 0..STATES {
+        let mut core = random_core(seed, Ground::Flat { down_m: 0.0 });
+        core.state.tags.iter_mut().for_each(|tag| tag.mean = [0.0; 4]);
+        let mut along = vec![0.0; core.state.layout().len()];
+        for target in 0..core.state.targets.len() {
+            let seen = detection(&core, target, 0);
+            let pixels = |along: &[f64], fuse: &dyn Fn(&mut Core)| {
+                let (h, _) = measured(&mut core.clone(), fuse);
+                (h * nalgebra::DVector::from_column_slice(along)).amax()
+            };
+            let tag = |core: &mut Core| _ = core.fuse_marker(target, 0, &seen);
+            let ground = |core: &mut Core| {
+                FeaturePixel { slot: 3, px: Vector2::new(640.0, 512.0), sigma_px: 1.0, slack_m: 0.0 }
+                    .fuse(core);
+            };
+            assert!(core.scale_direction(target, &mut along));
+            assert!(
+                pixels(&along, &tag) < 1e-6,
+                "seed {seed}, scale of target {target}: {}",
+                pixels(&along, &tag)
+            );
+            assert!(pixels(&along, &ground) < 1e-6, "seed {seed}: {} of the ground", pixels(&along, &ground));
+            core.turn_direction(target, &mut along);
+            assert!(
+                pixels(&along, &tag) < 1e-6,
+                "seed {seed}, turn of target {target}: {}",
+                pixels(&along, &tag)
+            );
         }
     }
 }
