@@ -270,7 +270,7 @@ impl Estimator {
         format!(
             "heading bias {:.2}±{:.2} deg, tilt felt {:?} (slope {:.2}) gain {:.2}±{:.2} error {:.2},{:.2}±{:.2} deg \
              bias {:.2},{:.2}±{:.2} deg, trim {:.1},{:.1}±{:.1} deg, wind {:.2},{:.2}±{:.2} m/s2, drag {:.2}±{:.2}, delay {:.0}±{:.0} ms, \
-             sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} gust {:.2} thrust {:.2} targets {} pixels {:.2?} {:.2}",
+             sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} gust {:.2} thrust {:.2} targets {} pixels {:.2?} {:.2} tags {}",
             own.heading_bias.to_degrees(),
             cov.sigma(own::HEADING_BIAS, 0).to_degrees(),
             self.core.state.tilt[0].felt,
@@ -301,7 +301,8 @@ impl Estimator {
             l.thrust_var.sqrt(),
             targets.join(" "),
             l.marker_factor,
-            l.feature_factor
+            l.feature_factor,
+            self.core.state.tags_in_words()
         )
     }
 
@@ -390,7 +391,7 @@ impl Estimator {
             return;
         }
         self.looked = Some(t);
-        let misfits = self.core.misfits();
+        let misfits = self.core.misfits().chain(self.core.vehicle_misfits());
         out.extend(
             misfits
                 .map(|(source, cause, figure)| EstimatorOutput::Misfit(Misfit { t, source, figure, cause })),

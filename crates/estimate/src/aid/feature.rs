@@ -20,6 +20,8 @@ pub(crate) struct FeaturePixel {
     pub(crate) px: Vector2<f64>,
     /// As the detector has it.
     pub(crate) sigma_px: f64,
+    /// By how much it may seem to have moved on the ground, one sigma, m.
+    pub(crate) slack_m: f64,
 }
 
 /// Sightings the fitted noise remembers: some seconds of eight features.
@@ -36,6 +38,8 @@ impl Aid for FeaturePixel {
         let known = self.sigma_px.powi(2) * models.feature_factor2;
         let noise = Matrix2::identity() * (known * state.learnt.feature_factor);
         let bent = Curvature::of(&state.cov, &state.own, models).noise_px2(&(world - state.own.position));
+        let slack = view.d_point.fixed_columns::<2>(0) * self.slack_m;
+        let noise = noise + slack * slack.transpose();
         z.begin(2);
         let moment = Moment::of(&state.own, models, &view, &Vector3::zeros(), &self.px);
         CameraColumns::touch(z).set_point(z, 0, &self.px, &state.own, &view, &moment, &noise, &bent);
