@@ -205,7 +205,7 @@ impl LinkTask {
 
     async fn open_mavlink(&self) -> Option<MavlinkSender> {
         let config = Arc::clone(&self.config);
-        let open = move || MavlinkSender::open(&config.mavlink, &config.target, &config.ground);
+        let open = move || MavlinkSender::open(&config);
         blocking(open).await.inspect_err(|error| self.fault(error)).ok()
     }
 

@@ -11,7 +11,7 @@ mod store;
 
 pub use check::ConfigError;
 pub use daemon::{DaemonConfig, GoingLine, Part, PowerConfig};
-pub use link::{LinkConfig, MavlinkConfig};
+pub use link::{LandingFrame, LinkConfig, MavlinkConfig, MavlinkMessage};
 pub use log::{LogConfig, LogFormat, LogLevel};
 pub use store::{FramePolicy, StoreConfig};
 
