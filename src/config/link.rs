@@ -56,13 +56,16 @@ impl Default for LinkConfig {
     }
 }
 
+/// The station that is the helicopter's autopilot: reached by the link of `[autopilot]`.
+pub const AUTOPILOT: &str = "autopilot";
+
 /// `[mavlink]`: the vehicle as MAVLink 2 over UDP.
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MavlinkConfig {
     /// Whether anything is sent.
     pub enabled: bool,
-    /// Where to (`host:port`); ground stations listen on UDP 14550.
+    /// Where to (`host:port`, or "autopilot": the link of `[autopilot]`); ground stations listen on UDP 14550.
     pub send_to: Vec<String>,
     /// System id of the first target; the others follow. Must differ from the helicopter's own.
     pub system_id: u8,
@@ -178,7 +181,7 @@ impl LinkConfig {
 impl MavlinkConfig {
     pub(super) fn check(&self) -> Result<(), ConfigError> {
         for address in &self.send_to {
-            if !has_port(address) {
+            if address != AUTOPILOT && !has_port(address) {
                 refuse(
                     "mavlink.send_to",
                     format!("{address:?} is not HOST:PORT, for example 10.0.0.5:14550"),

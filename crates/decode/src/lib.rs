@@ -23,8 +23,8 @@ pub use compass::{CompassDecoder, CompassReading, HeardAttitude};
 pub use counts::{DecodeCounts, Refusal};
 pub use gnss::{GnssDecoder, HeardEpoch};
 pub use mavlink::{
-    AutopilotDecoder, AutopilotSaid, HeardAutopilot, MavlinkFrame, MavlinkFrames,
-    question as timesync_question,
+    AutopilotDecoder, AutopilotSaid, HeardAutopilot, MavlinkFrame, MavlinkFrames, asked as timesync_asked,
+    is_autopilot, question as timesync_question,
 };
 pub use sentence::{Sentence, framed};
 pub use ubx::{holds_ubx_packet, ubx_framed};

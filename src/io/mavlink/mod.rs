@@ -4,6 +4,7 @@
 //! for three things: commands to the camera, others that use our system ids, and signatures where a key is set.
 
 mod camera;
+pub mod companion;
 mod helicopter;
 pub mod messages;
 mod motion;
@@ -20,6 +21,7 @@ use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
 use crate::config::Config;
+use crate::io::autopilot::ToAutopilot;
 use crate::io::link::keys::{KeyError, read_private};
 use windhover_base::msg::Output;
 use windhover_base::time::{MonoTime, Span, UtcTime};
@@ -82,12 +84,12 @@ pub fn signing_key(path: Option<&str>) -> Result<Option<SigningKey>, MavlinkErro
 }
 
 impl MavlinkSender {
-    /// As configured.
-    pub fn open(config: &Config) -> Result<Self, MavlinkError> {
+    /// As configured; what goes to the autopilot goes by its own link.
+    pub fn open(config: &Config, to_autopilot: ToAutopilot) -> Result<Self, MavlinkError> {
         let mavlink = &config.mavlink;
         let key = signing_key(mavlink.signing_key.as_deref())?;
         Ok(Self {
-            stations: Stations::open(&mavlink.send_to).map_err(MavlinkError::Socket)?,
+            stations: Stations::open(&mavlink.send_to, to_autopilot).map_err(MavlinkError::Socket)?,
             teller: Teller::new(mavlink, &config.target, &config.ground, &config.camera, key.clone()),
             targets: config.target.len(),
             key,

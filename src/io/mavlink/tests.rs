@@ -37,7 +37,7 @@ impl Bench {
         let mut config = Config::parse(include_str!("../../../config/windhover.toml")).expect("valid");
         config.mavlink = mavlink;
         config.target.push(config.target[0].clone());
-        let mut sender = MavlinkSender::open(&config).expect("opened");
+        let mut sender = MavlinkSender::open(&config, ToAutopilot::default()).expect("opened");
         let names = sender.unresolved(START).expect("to be looked up");
         sender.found(look_up(names));
         sender.output(&Output::Datum(START, DATUM));

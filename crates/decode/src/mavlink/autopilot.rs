@@ -48,13 +48,21 @@ pub enum AutopilotSaid {
     Position(AutopilotPosition),
 }
 
+/// Whether a frame is an autopilot's HEARTBEAT.
+pub fn is_autopilot(frame: &MavlinkFrame) -> bool {
+    matches!(&frame.message, MavMessage::HEARTBEAT(beat)
+        if frame.component == AUTOPILOT
+            && !matches!(beat.mavtype, MavType::MAV_TYPE_GCS | MavType::MAV_TYPE_GROUND_ROVER)
+            && beat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID)
+}
+
 /// The time that a question for an autopilot's time carries: `now`, marked as ours.
 pub fn question(now: MonoTime) -> i64 {
     now.ns().div_euclid(1_000) * 1_000 + MARK_NS
 }
 
 /// When a question of ours was asked; `None` for one that is not ours.
-fn asked(ts1: i64) -> Option<MonoTime> {
+pub fn asked(ts1: i64) -> Option<MonoTime> {
     (ts1.rem_euclid(1_000) == MARK_NS).then(|| MonoTime::from_ns(ts1))
 }
 
@@ -63,7 +71,6 @@ fn asked(ts1: i64) -> Option<MonoTime> {
 pub struct AutopilotDecoder {
     frames: MavlinkFrames,
     heard: Vec<MavlinkFrame>,
-    wanted: Option<u8>,
     follows: Option<u8>,
     clock: RemoteClock,
     quaternion: Option<MonoTime>,
@@ -76,7 +83,7 @@ pub struct AutopilotDecoder {
 impl AutopilotDecoder {
     /// Of this system; of the first autopilot that is heard where `None`.
     pub fn new(system_id: Option<u8>) -> Self {
-        Self { wanted: system_id, follows: system_id, ..Self::default() }
+        Self { follows: system_id, ..Self::default() }
     }
 
     /// Takes bytes that were heard at `t`.
@@ -117,12 +124,7 @@ impl AutopilotDecoder {
         t: MonoTime,
         out: &mut Vec<HeardAutopilot>,
     ) -> Result<bool, Refusal> {
-        if let MavMessage::HEARTBEAT(beat) = &frame.message
-            && self.follows.is_none()
-            && frame.component == AUTOPILOT
-            && beat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
-            && beat.mavtype != MavType::MAV_TYPE_GCS
-        {
+        if self.follows.is_none() && is_autopilot(frame) {
             self.follows = Some(frame.system);
         }
         if self.follows != Some(frame.system) || frame.component != AUTOPILOT {

@@ -5,5 +5,5 @@ mod frames;
 #[cfg(test)]
 mod tests;
 
-pub use autopilot::{AutopilotDecoder, AutopilotSaid, HeardAutopilot, question};
+pub use autopilot::{AutopilotDecoder, AutopilotSaid, HeardAutopilot, asked, is_autopilot, question};
 pub use frames::{MavlinkFrame, MavlinkFrames};
