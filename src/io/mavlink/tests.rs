@@ -168,6 +168,43 @@ fn each_system_counts_its_own_messages_and_the_ground_is_the_terrain_there() {
 }
 
 #[test]
+fn after_a_restart_nothing_is_told_before_it_is_known_anew() {
+    let mut bench = Bench::new();
+    bench.estimate(1.0, TrackStatus::Tracking, 0.1);
+    assert_eq!(told(&bench.sent(1.0)), (ACTIVE, true));
+    // When the program starts again, then it stands by, and counts from the first message again.
+    let mut again = Bench::new();
+    let sent = again.sent(2.0);
+    assert_eq!(told(&sent), (STANDBY, false));
+    assert_eq!(sent[0].1, 0);
+    again.estimate(3.0, TrackStatus::Acquiring, 0.1);
+    assert_eq!(told(&again.sent(3.0)), (STANDBY, false));
+    again.estimate(4.0, TrackStatus::Tracking, 0.1);
+    assert_eq!(told(&again.sent(4.0)), (ACTIVE, true));
+}
+
+#[test]
+fn after_a_cut_of_the_link_the_present_is_told_and_nothing_of_before() {
+    let mut bench = Bench::new();
+    bench.estimate(1.0, TrackStatus::Tracking, 0.1);
+    assert_eq!(told(&bench.sent(1.0)), (ACTIVE, true));
+    let address = bench.receiver.local_addr().expect("an address");
+    bench.receiver = UdpSocket::bind("127.0.0.1:0").expect("another");
+    for tenths in 11..40 {
+        let s = 0.1 * f64::from(tenths);
+        bench.estimate(s, TrackStatus::Tracking, 0.1);
+        bench.sender.send(START + Span::from_s(s));
+    }
+    bench.receiver = UdpSocket::bind(address).expect("the same address again");
+    bench.receiver.set_nonblocking(true).expect("set");
+    bench.estimate(4.0, TrackStatus::Tracking, 0.1);
+    let sent = bench.sent(4.0);
+    assert_eq!(told(&sent).1, true);
+    let positions = sent.iter().filter(|(system, _, kind, _)| (*system, *kind) == (42, 33)).count();
+    assert_eq!(positions, 1, "one, of now: {sent:?}");
+}
+
+#[test]
 fn the_state_is_brought_to_the_moment_of_sending() {
     let mut bench = Bench::new();
     bench.estimate(1.0, TrackStatus::Tracking, 0.1);

@@ -1,0 +1,11 @@
+//! The loop closed: a simulated helicopter that follows what the real pipeline tells it over MAVLink.
+//!
+//! [`ClosedLoop`] goes in lock-step on simulated time, so the same scenario and seed give the same flight.
+
+mod autopilot;
+mod closed_loop;
+mod score;
+
+pub use autopilot::{SimulatedAutopilot, follow_target};
+pub use closed_loop::{ClosedLoop, LoopSettings, Moment};
+pub use score::Score;
