@@ -1,5 +1,6 @@
 //! Flights through the pipeline and the commands: simulated, imported, calibrated with, continued.
 
+mod borders;
 mod calibration_doc;
 mod compass_conventions;
 mod contract;
