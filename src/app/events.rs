@@ -365,7 +365,7 @@ pub fn flight(name: &str) {
 /// Decimals with which a field's figure is shown; those of a sigma are its figure's.
 pub fn decimals(field: &str) -> Option<usize> {
     Some(match field.strip_suffix("_sigma").unwrap_or(field) {
-        "card_free_mb" | "cpu_pct" | "mem_mb" => 0,
+        "card_free_mb" | "cpu_pct" | "mem_mb" | "recording_s" | "card_left_s" => 0,
         "latency_p50_ms" | "latency_p99_ms" | "card_sync_p99_ms" | "temp_c" => 1,
         "heading_deg" | "yaw_rate_dps" => 1,
         "supply_v" | "north_m" | "east_m" | "speed_mps" | "p50_ms" | "p99_ms" | "max_ms" => 2,
