@@ -307,10 +307,10 @@ impl Pipeline {
                 SensorReading::Gnss(epoch) => self.gnss(&epoch, t, out),
                 SensorReading::Attitude(sample) => self.attitude(&sample, out),
                 SensorReading::SecondAttitude(sample) => {
-                    self.to_joint(|joint, out| joint.second_attitude(&sample, out));
+                    self.tell_joint(|joint, out| joint.second_attitude(&sample, out));
                 }
                 SensorReading::Inertial(sample) => {
-                    self.to_joint(|joint, out| joint.inertial(&sample, out));
+                    self.tell_joint(|joint, out| joint.inertial(&sample, out));
                 }
                 SensorReading::Autopilot(_) => out.push(Output::Reading(reading)),
             }
@@ -343,7 +343,7 @@ impl Pipeline {
         }
     }
 
-    fn to_joint(&mut self, take: impl FnOnce(&mut Estimator, &mut Vec<EstimatorOutput>)) {
+    fn tell_joint(&mut self, take: impl FnOnce(&mut Estimator, &mut Vec<EstimatorOutput>)) {
         if let Some(estimators) = &mut self.estimators {
             take(&mut estimators.joint, &mut self.estimated);
         }

@@ -199,7 +199,7 @@ fn after_a_cut_of_the_link_the_present_is_told_and_nothing_of_before() {
     bench.receiver.set_nonblocking(true).expect("set");
     bench.estimate(4.0, TrackStatus::Tracking, 0.1);
     let sent = bench.sent(4.0);
-    assert_eq!(told(&sent).1, true);
+    assert!(told(&sent).1);
     let positions = sent.iter().filter(|(system, _, kind, _)| (*system, *kind) == (42, 33)).count();
     assert_eq!(positions, 1, "one, of now: {sent:?}");
 }
