@@ -93,7 +93,7 @@ pub fn replay(
     watch: &mut dyn FnMut(ReplayStep<'_>),
 ) -> Result<ReplaySummary, ReplayError> {
     let reader = CaptureReader::open(recording)?;
-    let mut run = ReplayRun::new(config, out, realtime);
+    let mut run = ReplayRun::new(recording, config, out, realtime);
     let want_rgb = run.pipeline.wants_rgb();
     let (sender, receiver) = sync_channel(AHEAD);
     thread::scope(|scope| {
@@ -149,13 +149,13 @@ struct ReplayRun {
 }
 
 impl ReplayRun {
-    fn new(config: &Config, out: Option<&Path>, realtime: bool) -> Self {
+    fn new(recording: &Path, config: &Config, out: Option<&Path>, realtime: bool) -> Self {
         let clock = HostClock::start();
         // A configuration that was checked can be written.
         let text = config.to_toml().unwrap_or_default();
         let file = out.map(|path| FlightFile::new(path.to_owned(), text, config.camera.clone()));
         Self {
-            pipeline: Pipeline::with_terrain(config.into(), config_file::terrain_of(config)),
+            pipeline: Pipeline::with_terrain(config.into(), config_file::terrain_of(config, recording)),
             outlets: Outlets::new(OutputEncoder::new(&config.target), file.into_iter().collect()),
             outputs: Vec::new(),
             summary: ReplaySummary::default(),

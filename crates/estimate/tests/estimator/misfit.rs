@@ -132,7 +132,7 @@ fn convoy(world: &World, t_s: f64) -> Vec<Mover> {
 
 #[test]
 fn people_and_other_vehicles_are_not_taken_for_ground() {
-    let bare = over_flights(4..7, |seed| {
+    let bare = over_flights(4..8, |seed| {
         let flight = fly("follow", 20.0, seed, sharp);
         let out = flight.outputs();
         assert!(told(&out).is_empty(), "{:?}", told(&out));
@@ -140,7 +140,7 @@ fn people_and_other_vehicles_are_not_taken_for_ground() {
     });
     type Movers = fn(&World, f64) -> Vec<Mover>;
     for (what, movers) in [("people", people as Movers), ("convoy", convoy)] {
-        let score = over_flights(4..7, |seed| {
+        let score = over_flights(4..8, |seed| {
             let flight = with_movers(fly("follow", 20.0, seed, sharp), movers);
             let out = flight.outputs();
             assert!(
