@@ -88,6 +88,11 @@ pub(super) fn within(key: impl Into<String>, value: f64, low: f64, high: f64) ->
     refuse(key, format!("{value} is not between {low} and {high}"))
 }
 
+/// Targets: all are states of one filter, whose memory grows with their square.
+const MOST_TARGETS: usize = 32;
+/// Markers of all targets together.
+const MOST_MARKERS: usize = 256;
+
 /// Line speeds a UART can be set to.
 const BAUDS: [u32; 13] =
     [1200, 2400, 4800, 9600, 19200, 38400, 57600, 115_200, 230_400, 460_800, 921_600, 1_000_000, 2_000_000];
@@ -263,6 +268,14 @@ impl Config {
     fn check_targets(&self) -> Result<(), ConfigError> {
         if self.target.is_empty() {
             return refuse("target", "no [[target]]: say which vehicle to watch");
+        }
+        let markers: usize = self.target.iter().map(|target| target.marker.len()).sum();
+        for (key, count, most) in
+            [("target", self.target.len(), MOST_TARGETS), ("target.marker", markers, MOST_MARKERS)]
+        {
+            if count > most {
+                refuse(key, format!("there are {count}; one helicopter watches {most} at most"))?;
+            }
         }
         let mut names = std::collections::BTreeSet::new();
         let mut tags = std::collections::BTreeSet::new();

@@ -8,11 +8,18 @@
 use std::fs::File;
 use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};
+use std::sync::mpsc::RecvTimeoutError;
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
 /// Directory of the index under the store's path.
 pub const INDEX: &str = "index";
+
+/// Longest that sled may take to open an index; a large one after a power cut takes some seconds.
+const PATIENCE: Duration = Duration::from_secs(20);
+/// Nice value of the thread that opens it, which may be left behind.
+const LEAST: i32 = 19;
 
 /// Keys of back-fill records: this byte, run, number.
 const BACKFILL: u8 = b'b';
@@ -134,8 +141,47 @@ pub struct Index {
 }
 
 impl Index {
-    /// Opens the index in directory `dir`, or makes an empty one. A panic inside sled is an error.
+    /// Opens the index in directory `dir`, or makes an empty one, and reads what is asked of it at every start. A panic
+    /// inside sled is an error, and so is an index over which sled broods for longer than [`PATIENCE`]: its thread is left
+    /// behind with the least claim to the processor, and ends with the process.
     pub fn open(dir: &Path) -> Result<Self, IndexError> {
+        let unusable = |reason: &str| IndexError::Unusable { path: dir.to_owned(), reason: reason.into() };
+        let (done, opened) = std::sync::mpsc::sync_channel(1);
+        let of = dir.to_owned();
+        let work = move || {
+            let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), LEAST);
+            let index = Self::open_now(&of).and_then(|index| index.check().map(|()| index));
+            // Where nobody waits any more, what was opened is closed again.
+            let _ = done.send(index);
+        };
+        std::thread::Builder::new()
+            .name("index".into())
+            .spawn(work)
+            .map_err(|error| unusable(&error.to_string()))?;
+        match opened.recv_timeout(PATIENCE) {
+            Ok(outcome) => outcome,
+            Err(RecvTimeoutError::Timeout) => Err(unusable(&format!("it does not open within {PATIENCE:?}"))),
+            Err(RecvTimeoutError::Disconnected) => Err(unusable("sled panicked")),
+        }
+    }
+
+    /// Reads everything but the queue.
+    fn check(&self) -> Result<(), IndexError> {
+        let unusable = |reason: String| IndexError::Unusable { path: self.dir.clone(), reason };
+        let work = || -> sled::Result<()> {
+            for kind in [CURSOR, STATE, SEGMENT, FLIGHT] {
+                // sled gives the same error again and again.
+                self.db.range(vec![kind]..vec![kind + 1]).try_for_each(|item| item.map(drop))?;
+            }
+            Ok(())
+        };
+        match std::panic::catch_unwind(AssertUnwindSafe(work)) {
+            Ok(read) => read.map_err(|error| unusable(error.to_string())),
+            Err(_) => Err(unusable("sled panicked".into())),
+        }
+    }
+
+    fn open_now(dir: &Path) -> Result<Self, IndexError> {
         let unusable = |reason: String| IndexError::Unusable { path: dir.to_owned(), reason };
         remove_half_snapshots(dir);
         let fresh = !dir.exists();
@@ -217,8 +263,8 @@ impl Index {
     }
 
     fn items(&self, from: Vec<u8>, to: Vec<u8>) -> impl DoubleEndedIterator<Item = (Vec<u8>, Vec<u8>)> {
-        // An entry that cannot be read is as good as none: the segments have it.
-        self.db.range(from..to).flatten().map(|(k, v)| (k.to_vec(), v.to_vec()))
+        // What cannot be read is as good as none: the segments have it. sled gives its error again and again.
+        self.db.range(from..to).map_while(Result::ok).map(|(k, v)| (k.to_vec(), v.to_vec()))
     }
 
     /// Queued records `first..end` of a run, ascending, as far as the card can be read. An entry that is
@@ -260,7 +306,7 @@ impl Index {
     /// All cursors of a run.
     pub fn cursors(&self, run: u32) -> Vec<(String, u32)> {
         let prefix = key(CURSOR, &[&run.to_be_bytes()]);
-        let items = self.db.scan_prefix(prefix).flatten();
+        let items = self.db.scan_prefix(prefix).map_while(Result::ok);
         items.filter_map(|(k, v)| Some((String::from_utf8(k[5..].to_vec()).ok()?, number(&v)?))).collect()
     }
 
