@@ -104,6 +104,17 @@ fn baud(key: &str, value: u32) -> Result<(), ConfigError> {
     refuse(key, format!("{value} is not a line speed; use one of {BAUDS:?}"))
 }
 
+/// A device on the network is `tcp://HOST:PORT` or `udp://ADDRESS:PORT`.
+fn network_device(key: &str, device: &str) -> Result<(), ConfigError> {
+    let Some((protocol, address)) = device.split_once("://") else { return Ok(()) };
+    let port = address.rsplit_once(':').filter(|(host, _)| !host.is_empty());
+    let has_port = port.is_some_and(|(_, port)| port.parse::<u16>().is_ok_and(|port| port > 0));
+    if matches!(protocol, "tcp" | "udp") && has_port {
+        return Ok(());
+    }
+    refuse(key, format!("{device} is no device; give a path, tcp://HOST:PORT or udp://ADDRESS:PORT"))
+}
+
 impl Config {
     /// Checks every value; the first that cannot be is the error.
     pub fn check(&self) -> Result<(), ConfigError> {
@@ -190,7 +201,8 @@ impl Config {
     fn check_sensors(&self) -> Result<(), ConfigError> {
         baud("gps.baud", self.gps.baud)?;
         baud("compass.baud", self.compass.baud)?;
-        if self.gps.device == self.compass.device {
+        // A server gives the same to everybody who asks; a serial line has one reader.
+        if self.gps.device == self.compass.device && !self.gps.device.starts_with("tcp://") {
             refuse("compass.device", format!("{} is the GPS receiver's line too", self.compass.device))?;
         }
         for (key, device) in [
@@ -201,6 +213,14 @@ impl Config {
             if device.is_empty() {
                 refuse(key, "names no device; give a path such as /dev/ttyS0")?;
             }
+        }
+        network_device("gps.device", &self.gps.device)?;
+        network_device("compass.device", &self.compass.device)?;
+        if self.gps.configure_garmin && self.gps.device.contains("://") {
+            refuse(
+                "gps.configure_garmin",
+                "a receiver behind the network is not configured; leave this out",
+            )?;
         }
         for (axis, value) in self.gps.antenna_position_m.iter().enumerate() {
             within(format!("gps.antenna_position_m[{axis}]"), *value, -20.0, 20.0)?;

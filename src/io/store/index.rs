@@ -176,7 +176,7 @@ impl Index {
             Ok(())
         };
         match std::panic::catch_unwind(AssertUnwindSafe(work)) {
-            Ok(read) => read.map_err(|error| unusable(error.to_string())),
+            Ok(read) => read.map_err(|error| unusable(error.to_string().replace(" backtrace ()", ""))),
             Err(_) => Err(unusable("sled panicked".into())),
         }
     }
@@ -262,7 +262,7 @@ impl Index {
         Ok(())
     }
 
-    fn items(&self, from: Vec<u8>, to: Vec<u8>) -> impl DoubleEndedIterator<Item = (Vec<u8>, Vec<u8>)> {
+    fn items(&self, from: Vec<u8>, to: Vec<u8>) -> impl Iterator<Item = (Vec<u8>, Vec<u8>)> {
         // What cannot be read is as good as none: the segments have it. sled gives its error again and again.
         self.db.range(from..to).map_while(Result::ok).map(|(k, v)| (k.to_vec(), v.to_vec()))
     }
@@ -290,7 +290,8 @@ impl Index {
             let (Some(run), Some(first)) = (number(&k[1..]), number(&k[5..])) else { break };
             let behind =
                 run.checked_add(1).map_or(vec![BACKFILL + 1], |r| key(BACKFILL, &[&r.to_be_bytes()]));
-            let last = self.items(k, behind.clone()).next_back().and_then(|(k, _)| number(&k[5..]));
+            let last = self.db.range(k..behind.clone()).next_back().and_then(Result::ok);
+            let last = last.and_then(|(k, _)| number(&k[5..]));
             runs.push((run, first, last.map_or(first, |n| n.saturating_add(1))));
             from = behind;
         }
@@ -356,4 +357,53 @@ pub fn move_aside(dir: &Path) -> std::io::Result<PathBuf> {
     }
     std::fs::rename(dir, &aside)?;
     Ok(aside)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{Rng as _, SeedableRng as _};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    /// Whatever a damaged index says, it says it at once: sled repeats its errors for ever.
+    #[test]
+    fn a_damaged_index_is_read_to_an_end() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let whole = dir.path().join("whole");
+        {
+            let index = Index::open(&whole).expect("a new one");
+            let entry = SegmentEntry { bytes: 1, messages: 2, span_ns: (3, 4) };
+            let changes = (0..400).flat_map(|run| {
+                [Change::Flight(run, format!("boot-{run}")), Change::Segment(run, 0, entry.clone())]
+            });
+            index.apply(&changes.collect::<Vec<_>>()).expect("durable");
+        }
+        let mut dice = ChaCha8Rng::seed_from_u64(7);
+        for round in 0..12 {
+            let copy = dir.path().join(format!("{round}"));
+            std::fs::create_dir(&copy).expect("made");
+            for file in whole.read_dir().expect("listed").flatten().filter(|file| file.path().is_file()) {
+                let mut bytes = std::fs::read(file.path()).expect("read");
+                let used = bytes.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
+                for _ in 0..if file.file_name() == "conf" { 0 } else { used / 200 * round / 4 } {
+                    bytes[dice.random_range(0..used)] = dice.random();
+                }
+                std::fs::write(copy.join(file.file_name()), bytes).expect("written");
+            }
+            let began = std::time::Instant::now();
+            match Index::open(&copy) {
+                Ok(index) => {
+                    let counts = (index.flights().len(), index.segments().len());
+                    assert!(
+                        counts.0 <= 400 && counts.1 <= 400 && (round > 0 || counts == (400, 400)),
+                        "{counts:?}"
+                    );
+                }
+                Err(IndexError::Unusable { .. }) => assert!(round > 0, "it was whole"),
+                Err(other) => panic!("{other}"),
+            }
+            assert!(began.elapsed() < PATIENCE + Duration::from_secs(5));
+        }
+    }
 }
