@@ -78,7 +78,7 @@ class Clients(unittest.TestCase):
         self.need("ogrinfo")
         for name in ("vehicles.geojson", "vehicles.kml"):
             path = self.at / name
-            rig.until(lambda: "Point" in self.fetch(name), 60, lambda: self.fetch(name))
+            rig.until(lambda: "LineString" in self.fetch(name), 60, lambda: self.fetch(name))
             path.write_text(self.fetch(name))
             run = subprocess.run(["ogrinfo", "-ro", "-al", path], capture_output=True, text=True)
             self.assertEqual(run.returncode, 0, run.stderr)
