@@ -163,6 +163,8 @@ table! {
     MavlinkFault: "mavlink_fault", WARN, every 30 s;
     /// MAVLink goes to that station again.
     MavlinkUp: "mavlink_up", INFO, every 0 s;
+    /// The autopilot is followed, was started anew, or is not the only one.
+    AutopilotNote: "autopilot_note", WARN, every 5 s;
     /// The supply voltage is going.
     PowerGoing: "power_going", ERROR, every 0 s;
     /// The supply voltage is back.
@@ -257,6 +259,7 @@ impl From<NoteKind> for OperatorEvent {
             NoteKind::FramesMissed => Self::CameraFramesMissed,
             NoteKind::Configured => Self::ReceiverConfigured,
             NoteKind::NotConfigured => Self::ReceiverNotConfigured,
+            NoteKind::Autopilot => Self::AutopilotNote,
             NoteKind::PlayedOut => Self::RecordingPlayedOut,
         }
     }

@@ -10,6 +10,7 @@ mod generate;
 mod ground;
 mod import;
 mod keys;
+mod live;
 mod montecarlo;
 mod out;
 mod place;

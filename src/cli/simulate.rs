@@ -4,6 +4,7 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use super::live::{self, Live};
 use super::{CliError, CliResult, place};
 use crate::cli::out::{note, out, outln};
 use crate::config::Config;
@@ -30,6 +31,7 @@ Examples:
   windhover simulate flight.mcap                          a minute of following a vehicle at 15 m
   windhover simulate a.mcap --scenario hover10 --seed 7   another draw of every error
   windhover simulate b.mcap --duration 10 --scale 0.5     short, at half the resolution: a small file
+  windhover simulate --live --duration 120                the helicopter follows, in real time; then windhover ground
   windhover simulate --list                               what scenarios and deviations there are
   windhover simulate c.mcap --with people=3 --with readout=15   a flight that its configuration does not fit
 
@@ -38,7 +40,7 @@ Then:
   windhover report result.mcap --truth flight.truth.csv   how far the estimates are from the truth")]
 pub(super) struct Args {
     /// Capture to write
-    #[arg(required_unless_present = "list", value_name = "OUT.mcap")]
+    #[arg(required_unless_present_any = ["list", "live"], value_name = "OUT.mcap")]
     out: Option<PathBuf>,
     /// What happens in the flight (see --list)
     #[arg(long, default_value = "follow", value_name = "NAME")]
@@ -64,6 +66,19 @@ pub(super) struct Args {
     /// Store frames as raw grey pixels instead of JPEG (large)
     #[arg(long, conflicts_with = "quality")]
     lossless: bool,
+    /// Fly in real time with a daemon on pseudo-terminals: the helicopter follows the vehicle by what the daemon says over
+    /// MAVLink
+    #[arg(long, conflicts_with_all = ["out", "lossless"])]
+    live: bool,
+    /// With --live: folder for lines, configuration, keys and card
+    #[arg(long, value_name = "DIR", default_value = "windhover-live", requires = "live")]
+    dir: PathBuf,
+    /// With --live: another program flies the helicopter, by UDP datagrams at this address (docs/autopilot.md)
+    #[arg(long, value_name = "ADDRESS:PORT", requires = "live")]
+    driver: Option<String>,
+    /// With --live: the daemon is started by hand
+    #[arg(long, requires = "live")]
+    no_daemon: bool,
     /// List scenarios and deviations and exit
     #[arg(long)]
     list: bool,
@@ -72,6 +87,15 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args) -> CliResult {
     if args.list {
         return list();
+    }
+    if args.live {
+        let live = Live {
+            folder: &args.dir,
+            seed: args.seed,
+            driver: args.driver.as_deref(),
+            no_daemon: args.no_daemon,
+        };
+        return live::run(scenario(args)?, &live);
     }
     let out = args.out.as_deref().ok_or_else(|| CliError::usage("say which capture to write"))?;
     let scenario = scenario(args)?;

@@ -1,10 +1,11 @@
 //! What a configuration must satisfy beyond its syntax.
 
 use windhover_base::settings::{
-    AttitudeConfig, GroundConfig, ImuConfig, MarkerConfig, MarkerKind, TargetConfig, TargetModel,
+    AttitudeConfig, AutopilotUse, GroundConfig, ImuConfig, MarkerConfig, MarkerKind, TargetConfig,
+    TargetModel,
 };
 
-use super::Config;
+use super::{AUTOPILOT, Config};
 
 /// What is wrong with a configuration.
 #[derive(Clone, PartialEq, Debug, thiserror::Error)]
@@ -201,16 +202,19 @@ impl Config {
     fn check_sensors(&self) -> Result<(), ConfigError> {
         baud("gps.baud", self.gps.baud)?;
         baud("compass.baud", self.compass.baud)?;
+        self.check_autopilot()?;
         // A server gives the same to everybody who asks; a serial line has one reader.
-        if self.gps.device == self.compass.device && !self.gps.device.starts_with("tcp://") {
+        let is_line = self.gps.is_there() && !self.gps.device.starts_with("tcp://");
+        if is_line && self.gps.device == self.compass.device {
             refuse("compass.device", format!("{} is the GPS receiver's line too", self.compass.device))?;
         }
-        for (key, device) in [
-            ("gps.device", &self.gps.device),
-            ("compass.device", &self.compass.device),
-            ("camera.device", &self.camera.device),
+        let given = |what| self.autopilot.as_ref().is_some_and(|autopilot| autopilot.gives(what));
+        for (key, device, what) in [
+            ("gps.device", &self.gps.device, Some(AutopilotUse::Gps)),
+            ("compass.device", &self.compass.device, Some(AutopilotUse::Attitude)),
+            ("camera.device", &self.camera.device, None),
         ] {
-            if device.is_empty() {
+            if device.is_empty() && !what.is_some_and(given) {
                 refuse(key, "names no device; give a path such as /dev/ttyS0")?;
             }
         }
@@ -249,6 +253,33 @@ impl Config {
         within("compass.tilt_noise_deg", compass.tilt_noise_deg, 1e-3, 90.0)?;
         self.imu.as_ref().map_or(Ok(()), check_imu)?;
         self.attitude.as_ref().map_or(Ok(()), check_attitude)
+    }
+
+    fn check_autopilot(&self) -> Result<(), ConfigError> {
+        let to_autopilot = self.mavlink.send_to.iter().any(|station| station == AUTOPILOT);
+        let Some(autopilot) = &self.autopilot else {
+            if to_autopilot {
+                refuse("mavlink.send_to", "names the autopilot, and there is no [autopilot]")?;
+            }
+            return Ok(());
+        };
+        baud("autopilot.baud", autopilot.baud)?;
+        match (&autopilot.device, autopilot.listen_at()) {
+            (Some(_), Some(_)) => refuse("autopilot.listen", "device is given too; keep one of them")?,
+            (None, None) => refuse("autopilot", "give device, or listen = \"udp://0.0.0.0:14550\"")?,
+            (Some(device), None) if [&self.gps.device, &self.compass.device].contains(&device) => {
+                refuse("autopilot.device", format!("{device} is another device's line too"))?;
+            }
+            (None, Some(address)) if address.parse::<std::net::SocketAddr>().is_err() => {
+                refuse("autopilot.listen", format!("{address:?} is not udp://ADDRESS:PORT"))?;
+            }
+            _ => {}
+        }
+        let mavlink = &self.mavlink;
+        if autopilot.system_id.is_some_and(|id| id == mavlink.system_id) {
+            refuse("autopilot.system_id", "is that of the first target, mavlink.system_id")?;
+        }
+        Ok(())
     }
 
     fn check_camera(&self) -> Result<(), ConfigError> {

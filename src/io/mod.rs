@@ -1,5 +1,6 @@
 //! The edge: clock, serial, camera, captures, store, link.
 
+pub mod autopilot;
 pub mod camera;
 pub mod capture;
 pub mod clock;

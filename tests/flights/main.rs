@@ -2,6 +2,7 @@
 
 mod borders;
 mod calibration_doc;
+mod closed_loop;
 mod compass_conventions;
 mod contract;
 mod import;

@@ -20,7 +20,7 @@ unsafe impl OwnsDescriptor for TTYPort {}
 
 /// A line that this program alone has open.
 #[derive(Debug)]
-pub(super) struct Line {
+pub(in crate::io) struct Line {
     device: String,
     /// Empty where it is on the network, and while the port is on a thread for work that blocks.
     port: Option<Opened<AsyncFd<TTYPort>>>,
@@ -30,7 +30,7 @@ pub(super) struct Line {
 impl Line {
     /// Opens the line for this program alone. A device that is busy, missing, forbidden or no serial
     /// line is told apart.
-    pub(super) async fn open(settings: &SerialSettings) -> Result<Self, Fault> {
+    pub(in crate::io) async fn open(settings: &SerialSettings) -> Result<Self, Fault> {
         let SerialSettings { device, baud, .. } = settings.clone();
         if is_network(&device) {
             let network = Some(Network::open(&device).await?);
@@ -43,14 +43,14 @@ impl Line {
     }
 
     /// Closes the line and waits until it is closed.
-    pub(super) async fn close(self) {
+    pub(in crate::io) async fn close(self) {
         if let Some(port) = self.port {
             port.close().await;
         }
     }
 
     /// Waits for bytes and reads them; how many. Nothing is lost where the future is dropped.
-    pub(super) async fn read(&mut self, buffer: &mut [u8]) -> Result<usize, Fault> {
+    pub(in crate::io) async fn read(&mut self, buffer: &mut [u8]) -> Result<usize, Fault> {
         if let Some(network) = &mut self.network {
             return network.read(&self.device, buffer).await;
         }
@@ -68,7 +68,7 @@ impl Line {
     }
 
     /// Writes bytes.
-    pub(super) async fn write(&mut self, bytes: &[u8]) -> Result<(), Fault> {
+    pub(in crate::io) async fn write(&mut self, bytes: &[u8]) -> Result<(), Fault> {
         if let Some(network) = &mut self.network {
             return network.write(&self.device, bytes).await;
         }

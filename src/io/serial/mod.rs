@@ -15,7 +15,7 @@ use super::device::{Backoff, Fault, FaultKind, NoteKind, Report, Reports, wait_f
 use garbled::TextShare;
 use garmin::{GarminSetup, Step};
 use garmin_speed::Settling;
-use line::Line;
+pub(super) use line::Line;
 use windhover_base::time::{MonoTime, Span};
 
 /// What a line is and how it is set.

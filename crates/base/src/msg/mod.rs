@@ -21,8 +21,8 @@ pub use family::{FamilySpec, TagFamily};
 pub use health::{Health, SourceHealth, TargetHealth};
 pub use image::{GrayImage, ImageView, RgbImage};
 pub use measure::{
-    AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, InertialSample, MarkerDetection,
-    MarkerId, SensorReading, Stamped,
+    AttitudeSample, AutopilotPosition, FeatureTrack, FixKind, FrameObservations, GnssEpoch, InertialSample,
+    MarkerDetection, MarkerId, SensorReading, Stamped,
 };
 pub use notice::{MisfitWords, Notice, NoticeKind};
 pub use output::{Output, TimedOutput};

@@ -46,6 +46,38 @@ pub struct GpsConfig {
     pub pps_device: Option<String>,
 }
 
+/// No receiver of our own: an autopilot's stands in.
+impl Default for GpsConfig {
+    fn default() -> Self {
+        Self {
+            device: String::new(),
+            baud: 38_400,
+            format: GpsFormat::default(),
+            antenna_position_m: [0.0; 3],
+            latency_ms: defaults::gps_latency_ms(),
+            latency_sigma_ms: defaults::gps_latency_sigma_ms(),
+            bias_sigma_m: defaults::gps_bias_sigma_m(),
+            bias_tau_s: defaults::gps_bias_tau_s(),
+            noise_m: defaults::gps_noise_m(),
+            velocity_noise_mps: defaults::gps_velocity_noise_mps(),
+            configure_garmin: false,
+            pps_device: None,
+        }
+    }
+}
+
+impl GpsConfig {
+    /// Whether there is a receiver of our own.
+    pub fn is_there(&self) -> bool {
+        !self.device.is_empty()
+    }
+
+    /// Whether there is none.
+    pub fn is_absent(&self) -> bool {
+        !self.is_there()
+    }
+}
+
 /// What a receiver speaks.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -103,6 +135,40 @@ pub struct CompassConfig {
     /// One-sigma of the tilt noise of the sensor at rest, degrees.
     #[serde(default = "defaults::tilt_noise_deg")]
     pub tilt_noise_deg: f64,
+}
+
+/// No compass of our own: an autopilot's attitude stands in, whose heading is true and whose tilt is an AHRS's.
+impl Default for CompassConfig {
+    fn default() -> Self {
+        Self {
+            device: String::new(),
+            baud: 38_400,
+            format: CompassFormat::Nmea,
+            angles: TiltConvention::default(),
+            tilt: TiltKind::Inertial,
+            declination_deg: None,
+            declination: None,
+            latency_ms: 0.0,
+            yaw_offset_deg: 0.0,
+            pitch_offset_deg: 0.0,
+            roll_offset_deg: 0.0,
+            heading_bias_sigma_deg: defaults::heading_bias_sigma_deg(),
+            heading_noise_deg: defaults::heading_noise_deg(),
+            tilt_noise_deg: defaults::tilt_noise_deg(),
+        }
+    }
+}
+
+impl CompassConfig {
+    /// Whether there is a compass of our own.
+    pub fn is_there(&self) -> bool {
+        !self.device.is_empty()
+    }
+
+    /// Whether there is none.
+    pub fn is_absent(&self) -> bool {
+        !self.is_there()
+    }
 }
 
 /// What a compass's tilt sensor feels.
