@@ -22,6 +22,13 @@ fn circle(duration_s: f64, scale: f64) -> Scenario {
     scenario
 }
 
+/// The same at half the resolution and ten frames a second: quickly drawn.
+fn quick(duration_s: f64) -> Scenario {
+    let mut scenario = circle(duration_s, 0.5);
+    scenario.rig.camera.fps = 10.0;
+    scenario
+}
+
 fn late() -> LoopSettings {
     LoopSettings {
         lateness: Lateness { frames_ms: 50.0, compass_ms: 50.0 },
@@ -55,23 +62,23 @@ fn scored(name: &str, moments: &[Moment], from_s: f64) -> Score {
 
 #[test]
 fn a_vehicle_on_a_circle_is_followed_on_the_estimate_as_on_the_truth() {
-    let (duration_s, from_s) = (16.0, 7.0);
+    let (duration_s, from_s) = (12.0, 6.0);
     let truth = LoopSettings { truth: true, ..late() };
-    let truth = scored("truth", &fly(circle(duration_s, 0.5), 1, |_| {}, truth), from_s);
-    let moments = fly(circle(duration_s, 0.5), 1, listening, late());
+    let truth = scored("truth", &fly(quick(duration_s), 1, |_| {}, truth), from_s);
+    let moments = fly(quick(duration_s), 1, listening, late());
     let told = scored("told", &moments, from_s);
     // Stamps are the autopilot's own, which was started 100 s before.
     let stamps = moments.iter().filter(|m| m.t_s >= from_s).filter_map(|m| Some((m.t_s, m.told?.stamp.s())));
     let worst = stamps.map(|(t_s, stamp_s)| (stamp_s - 100.0 - t_s).abs()).fold(0.0, f64::max);
     assert!(worst <= 1e-3, "stamps are off by {worst} s");
-    assert!(told.told > 80, "{told:?}");
+    assert!(told.told > 55, "{told:?}");
     assert!(told.follow_rms_m < 1.5 * truth.follow_rms_m.max(0.2), "{told:?} {truth:?}");
     assert!(told.velocity_rms_mps < 0.15, "{told:?}");
 }
 
 #[test]
 fn a_covered_tag_ends_what_is_told_and_the_helicopter_stops() {
-    let mut scenario = circle(13.0, 0.5);
+    let mut scenario = quick(13.0);
     scenario.camera.hidden = (0..2)
         .map(|marker| HiddenMarker { target: 0, marker, from_s: 6.0, to_s: 11.0, share: 1.0 })
         .collect();
@@ -99,14 +106,14 @@ fn an_autopilot_stands_in_for_receiver_and_compass() {
         config.check().expect("valid");
     };
     let settings = LoopSettings { threads: 2, ..LoopSettings::default() };
-    let score = scored("alone", &fly(circle(12.0, 0.5), 6, alone, settings), 7.0);
-    assert!(score.told >= 48 && score.follow_rms_m < 0.4 && score.velocity_rms_mps < 0.15, "{score:?}");
+    let score = scored("alone", &fly(quick(10.0), 6, alone, settings), 6.0);
+    assert!(score.told >= 38 && score.follow_rms_m < 0.4 && score.velocity_rms_mps < 0.15, "{score:?}");
 }
 
 #[test]
 fn a_dead_camera_ends_what_is_told() {
     let settings = LoopSettings { camera_dies_s: Some(5.0), threads: 2, ..LoopSettings::default() };
-    let moments = fly(circle(9.0, 0.5), 3, |_| {}, settings);
+    let moments = fly(quick(9.0), 3, |_| {}, settings);
     let told = |from: f64, to: f64| {
         moments.iter().filter(|m| (from..to).contains(&m.t_s) && m.told.is_some()).count()
     };
