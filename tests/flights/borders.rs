@@ -238,3 +238,21 @@ fn a_segment_that_is_none_is_skipped_and_told() {
     }
     assert!(!words.contains("._000000"), "{words}");
 }
+
+#[test]
+fn a_configuration_has_so_many_targets() {
+    let dir = scratch();
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/windhover.toml");
+    let mut config = std::fs::read_to_string(shipped).unwrap();
+    for n in 0..40 {
+        config += &format!(
+            "\n[[target]]\nname = \"more{n}\"\nmodel = \"static\"\n[[target.marker]]\nkind = \"apriltag\"\n\
+             family = \"36h11\"\nid = {}\nsize_m = 0.2\nposition_m = [0.0, 0.0, 0.0]\n",
+            n + 100
+        );
+    }
+    std::fs::write(dir.path().join("c.toml"), config).unwrap();
+    let run = windhover(&["check-config", "c.toml"], dir.path());
+    assert_eq!(run.status.code(), Some(78));
+    assert!(said(&run).contains("watches 32 at most"), "{}", said(&run));
+}

@@ -1,4 +1,4 @@
-//! An open serial line, waited for by readiness.
+//! An open line, waited for by readiness.
 
 use std::io::{ErrorKind as IoKind, Read, Write};
 use std::path::Path;
@@ -8,6 +8,7 @@ use serialport::TTYPort;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
+use super::network::{Network, is_network};
 use super::{SerialSettings, unplugged};
 use crate::io::device::{Fault, FaultKind, Opened, OwnsDescriptor, blocking, register};
 
@@ -21,8 +22,9 @@ unsafe impl OwnsDescriptor for TTYPort {}
 #[derive(Debug)]
 pub(in crate::io) struct Line {
     device: String,
-    /// Empty only while the port is on a thread for work that blocks.
+    /// Empty where it is on the network, and while the port is on a thread for work that blocks.
     port: Option<Opened<AsyncFd<TTYPort>>>,
+    network: Option<Network>,
 }
 
 impl Line {
@@ -30,8 +32,12 @@ impl Line {
     /// line is told apart.
     pub(in crate::io) async fn open(settings: &SerialSettings) -> Result<Self, Fault> {
         let SerialSettings { device, baud, .. } = settings.clone();
+        if is_network(&device) {
+            let network = Some(Network::open(&device).await?);
+            return Ok(Self { device, port: None, network });
+        }
         let port = blocking(move || open(&device, baud)).await?;
-        let mut line = Self { device: settings.device.clone(), port: None };
+        let mut line = Self { device: settings.device.clone(), port: None, network: None };
         line.register(port)?;
         Ok(line)
     }
@@ -45,6 +51,9 @@ impl Line {
 
     /// Waits for bytes and reads them; how many. Nothing is lost where the future is dropped.
     pub(in crate::io) async fn read(&mut self, buffer: &mut [u8]) -> Result<usize, Fault> {
+        if let Some(network) = &mut self.network {
+            return network.read(&self.device, buffer).await;
+        }
         let lost = || unplugged(&self.device);
         let port = self.port.as_deref_mut().ok_or_else(lost)?;
         loop {
@@ -60,6 +69,9 @@ impl Line {
 
     /// Writes bytes.
     pub(in crate::io) async fn write(&mut self, bytes: &[u8]) -> Result<(), Fault> {
+        if let Some(network) = &mut self.network {
+            return network.write(&self.device, bytes).await;
+        }
         let lost = || unplugged(&self.device);
         let port = self.port.as_deref_mut().ok_or_else(lost)?;
         let writing = async {

@@ -16,7 +16,7 @@ pub use estimate::{
     Disposition, EstimatorOutput, FeltTilt, FusionResult, FusionSource, MarkerPair, Misfit, MisfitCause,
     Ownship, TargetEstimate, TargetState, TrackStatus,
 };
-pub use event::{Event, EventBody, FrameEncoding, FramePayload};
+pub use event::{Bayer, Event, EventBody, FrameEncoding, FramePayload};
 pub use family::{FamilySpec, TagFamily};
 pub use health::{Health, SourceHealth, TargetHealth};
 pub use image::{GrayImage, ImageView, RgbImage};

@@ -9,7 +9,8 @@ use crate::geo::{CameraModel, ImageTop, TiltConvention, body_from_camera};
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GpsConfig {
-    /// Serial device; a `/dev/serial/by-id` path survives renumbering.
+    /// Serial device; a `/dev/serial/by-id` path survives renumbering. Or `tcp://HOST:PORT`, gpsd too, or
+    /// `udp://ADDRESS:PORT`, where datagrams come in.
     pub device: String,
     /// Line speed, bits a second.
     pub baud: u32,
@@ -94,7 +95,7 @@ pub enum GpsFormat {
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CompassConfig {
-    /// Serial device.
+    /// Serial device, or `tcp://HOST:PORT`, `udp://ADDRESS:PORT` as for the receiver.
     pub device: String,
     /// Line speed, bits a second.
     pub baud: u32,
@@ -312,6 +313,30 @@ pub enum PixelFormat {
     /// 24-bit RGB (V4L2 RGB3).
     #[serde(rename = "RGB24", alias = "RGB3")]
     Rgb24,
+    /// 8-bit mosaic of colours, red first; read as grey, evened out.
+    #[serde(rename = "RGGB")]
+    Rggb,
+    /// The same, blue first (V4L2 BA81).
+    #[serde(rename = "BGGR", alias = "BA81")]
+    Bggr,
+    /// The same, green and blue first.
+    #[serde(rename = "GBRG")]
+    Gbrg,
+    /// The same, green and red first.
+    #[serde(rename = "GRBG")]
+    Grbg,
+    /// Grey of 10 bits in two bytes.
+    #[serde(rename = "Y10")]
+    Y10,
+    /// Grey of 12 bits in two bytes.
+    #[serde(rename = "Y12")]
+    Y12,
+    /// Grey of 16 bits.
+    #[serde(rename = "Y16")]
+    Y16,
+    /// Grey of 10 bits, four pixels in five bytes.
+    #[serde(rename = "Y10P")]
+    Y10Packed,
 }
 
 /// `[camera.mount]`
