@@ -12,6 +12,7 @@ import sys
 
 import flights
 import frames
+import own_motion
 import photographs
 import serial_lines
 from program import Program
@@ -22,6 +23,7 @@ PARTS = {
     "photographs": (photographs, "images"),
     "frames": (frames, "detector"),
     "flights": (flights, "flights"),
+    "own motion": (own_motion, "real"),
 }
 
 
