@@ -65,8 +65,11 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
         },
         MisfitCause::MovingGround => of_source(
             format!("{:.0} %", 100.0 * figure),
-            "what is taken for ground moves: people, other vehicles, shadows".into(),
-            "nothing, where it passes; else set detector.ground_features = 0".into(),
+            "what is taken for ground moves: people, other vehicles, shadows, or a lens that is not as configured"
+                .into(),
+            "nothing, where it passes; else check camera.intrinsics and camera.readout_ms, or set \
+             detector.ground_features = 0"
+                .into(),
         ),
         MisfitCause::TargetTurns { target } => MisfitWords {
             source: target_name(rig, target),
