@@ -23,6 +23,18 @@ impl Bitmap {
         Self { width, height, words }
     }
 
+    /// How many runs of dark pixels there are: what labelling takes time for.
+    pub fn runs(&self) -> usize {
+        let mut carry = 0;
+        // A row ends with clear bits or with its last word: a run over two rows counts once, which is near enough.
+        let starts = self.words.iter().map(|&word| {
+            let starts = word & !(word << 1 | carry);
+            carry = word >> 63;
+            starts.count_ones() as usize
+        });
+        starts.sum()
+    }
+
     /// The words of a row.
     pub fn row(&self, v: usize) -> &[u64] {
         let per_row = self.width.div_ceil(64);
@@ -30,14 +42,17 @@ impl Bitmap {
     }
 }
 
-/// Least range over maximum, of 256, that counts as contrast: ink is a fifth to a tenth as light as paper, and
-/// blur and haze take some of that away, while most ground varies less.
-const LEAST_RELATIVE: u8 = 70;
+/// Range over maximum, of 256, that print in clear air keeps: ink is a fifth to a tenth as light as paper, and blur
+/// takes some of that away, while most ground varies less. Haze, glare and thermal cameras leave less: see `AboveNoise`.
+const CLEAR_RELATIVE: u8 = 70;
 
 /// Where more of the image than `BUSY_SHARE` has that contrast, only what has most is looked at, but all that
-/// has this much: a tag that is read keeps it, and coarse gravel does not cost more than grass.
+/// has `ENOUGH_RELATIVE`: a tag that is read keeps it, and coarse gravel does not cost more than grass.
 const ENOUGH_RELATIVE: u8 = 160;
 const BUSY_SHARE: f32 = 0.3;
+
+/// Share of an image with the contrast of print in clear air below which weak contrast is what there is.
+const HAZY_SHARE: f32 = 0.05;
 
 /// Tiles on a side of the blocks whose light is compared, and by what factor it differs among a block and its
 /// neighbours where a shadow ends.
@@ -56,6 +71,9 @@ pub(super) struct Binariser {
     relative: Vec<u8>,
     /// The least of these that counts in this image.
     least_relative: u8,
+    /// Shares of the tiles that are above the gate and have less than that, and that have the contrast of clear air.
+    dim_share: f32,
+    clear_share: f32,
     thresholds: Vec<u8>,
     tiles: (usize, usize),
     /// Mean of the local maxima of each block of tiles.
@@ -68,11 +86,19 @@ pub(super) enum Where {
     Everywhere,
     /// Where light and shade are near each other.
     LightChanges,
+    /// Where there is any contrast above the gate.
+    AboveNoise,
+    /// Where something is as light as a pixel can be: what is lit more than that spreads over what is beside it.
+    Saturated,
 }
 
+/// Lightest pixel of a neighbourhood from which it counts as saturated.
+const SATURATED: u8 = 250;
+
 impl Binariser {
-    /// Measures the range around every tile of an image. Only ranges of at least `gate` count.
-    pub fn measure(&mut self, image: ImageView<'_>, gate: u8, simd: Simd) {
+    /// Measures the range around every tile of an image. Only ranges of at least `gate` count. Of a negative, contrast
+    /// is that of the picture it was made from.
+    pub fn measure(&mut self, image: ImageView<'_>, gate: u8, is_negative: bool, simd: Simd) {
         let (across, down) = (image.width.div_ceil(TILE), image.height.div_ceil(TILE));
         self.tiles = (across, down);
         let Self { low, high, wide_low, wide_high, relative, .. } = self;
@@ -90,25 +116,45 @@ impl Binariser {
         }
         widen(&self.low, &mut self.wide_low, &mut self.scratch, across, u8::min);
         widen(&self.high, &mut self.wide_high, &mut self.scratch, across, u8::max);
-        self.weigh(gate);
+        self.weigh(gate, is_negative);
     }
 
     /// Fills in `relative` and `least_relative`: see `BUSY_SHARE`.
-    fn weigh(&mut self, gate: u8) {
+    fn weigh(&mut self, gate: u8, is_negative: bool) {
         let mut tiles = [0u32; 256];
         for ((r, &low), &high) in self.relative.iter_mut().zip(&self.wide_low).zip(&self.wide_high) {
             let range = high - low;
-            *r = if range >= gate { relative(range, high) } else { 0 };
+            let lightest = if is_negative { !low } else { high };
+            *r = if range >= gate { relative(range, lightest).max(1) } else { 0 };
             tiles[usize::from(*r)] += 1;
         }
         let budget = (BUSY_SHARE * self.wide_low.len() as f32) as u32;
         let from = |r: u8| tiles[usize::from(r)];
         let (mut least, mut passed) = (ENOUGH_RELATIVE, (ENOUGH_RELATIVE..=u8::MAX).map(from).sum::<u32>());
-        while least > LEAST_RELATIVE && passed + from(least - 1) <= budget {
+        while least > CLEAR_RELATIVE && passed + from(least - 1) <= budget {
             least -= 1;
             passed += from(least);
         }
+        let dim = tiles[1..usize::from(least)].iter().sum::<u32>();
+        let clear = tiles[usize::from(CLEAR_RELATIVE)..].iter().sum::<u32>();
+        [self.dim_share, self.clear_share] =
+            [dim, clear].map(|count| count as f32 / self.wide_low.len() as f32);
         self.least_relative = least;
+    }
+
+    /// Share of the image with contrast above the gate that is not looked at everywhere.
+    pub fn dim_share(&self) -> f32 {
+        self.dim_share
+    }
+
+    /// Whether hardly any of the image has the contrast of clear air.
+    pub fn is_hazy(&self) -> bool {
+        self.clear_share < HAZY_SHARE
+    }
+
+    /// Whether a tile that is looked at has saturated pixels near.
+    pub fn is_saturated(&self) -> bool {
+        self.wide_high.iter().zip(&self.relative).any(|(&h, &r)| h >= SATURATED && r >= self.least_relative)
     }
 
     /// Whether more of the image has all the contrast a tag has than can be looked at cheaply.
@@ -121,11 +167,12 @@ impl Binariser {
     pub fn mark(&mut self, image: ImageView<'_>, fraction: u16, at: Where, out: &mut Bitmap, simd: Simd) {
         let (across, down) = self.tiles;
         self.thresholds.resize(across * down, 0);
-        let least = self.least_relative;
+        let least = if at == Where::AboveNoise { 1 } else { self.least_relative };
+        let lightest = if at == Where::Saturated { SATURATED } else { 0 };
         let measured = self.wide_low.iter().zip(&self.wide_high).zip(&self.relative);
         for (t, ((&low, &high), &relative)) in self.thresholds.iter_mut().zip(measured) {
             let above = (u16::from(high - low) * fraction + 128) >> 8;
-            *t = if relative >= least { low + above as u8 } else { 0 };
+            *t = if relative >= least && high >= lightest { low + above as u8 } else { 0 };
         }
         if at == Where::LightChanges {
             self.clear_even_light();
@@ -216,7 +263,7 @@ mod tests {
             (12..22).for_each(|u| image.data[v * 40 + u] = 20);
         }
         let (mut binariser, mut bits) = (Binariser::default(), Bitmap::default());
-        binariser.measure(image.view(), 30, Simd::best());
+        binariser.measure(image.view(), 30, false, Simd::best());
         binariser.mark(image.view(), 128, Where::Everywhere, &mut bits, Simd::best());
         for v in 0..30 {
             for u in 0..40 {
@@ -224,7 +271,7 @@ mod tests {
                 assert_eq!(dark, image.data[v * 40 + u] == 20, "({u}, {v})");
             }
         }
-        binariser.measure(image.view(), 190, Simd::best());
+        binariser.measure(image.view(), 190, false, Simd::best());
         binariser.mark(image.view(), 128, Where::Everywhere, &mut bits, Simd::best());
         assert!((0..30).all(|v| bits.row(v)[0] == 0), "a gate above the contrast leaves nothing");
     }
@@ -240,7 +287,7 @@ mod tests {
         let pixels = (0..320 * 128).map(|i| light(i % 320, i / 320)).collect();
         let image = GrayImage::from_vec(320, 128, pixels).expect("size");
         let (mut binariser, mut bits) = (Binariser::default(), Bitmap::default());
-        binariser.measure(image.view(), 30, Simd::best());
+        binariser.measure(image.view(), 30, false, Simd::best());
         assert!(binariser.is_busy());
         let marked = |bits: &Bitmap| -> Vec<bool> {
             (0..5).map(|word| (0..128).any(|v| bits.row(v)[word] != 0)).collect()

@@ -48,13 +48,15 @@ struct Sums {
     bottom: u16,
     /// Area in the lower half, runs in the upper.
     counts: u64,
+    /// Whether it was joined with others by corners.
+    has_grown: bool,
 }
 
 impl Sums {
     /// No pixel as yet, from row `v` on.
     #[inline(always)]
     fn from_row(v: u16) -> Self {
-        Self { left: u16::MAX, right: 0, top: v, bottom: v, counts: 0 }
+        Self { left: u16::MAX, right: 0, top: v, bottom: v, counts: 0, has_grown: false }
     }
 
     /// Adds a run of a row that is not above any before.
@@ -75,7 +77,7 @@ impl Sums {
     }
 
     fn component(&self) -> Component {
-        let &Self { left, right, top, bottom, counts } = self;
+        let &Self { left, right, top, bottom, counts, .. } = self;
         let (area, runs) = (counts as u32, (counts >> 32) as u32);
         Component { left, right: right - 1, top, bottom, area, runs }
     }
@@ -94,6 +96,20 @@ struct Marks {
 }
 
 impl Marks {
+    /// Runs that end at column `u` or before.
+    #[inline(always)]
+    fn ended_by(row: &[Self], u: u16) -> usize {
+        let m = &row[usize::from(u >> 6)];
+        m.ended as usize + (m.ends & (u64::MAX >> (63 - (u & 63)))).count_ones() as usize
+    }
+
+    /// Runs that start before column `u`.
+    #[inline(always)]
+    fn started_before(row: &[Self], u: u16) -> usize {
+        let m = &row[usize::from(u >> 6)];
+        m.started as usize + (m.starts & ((1 << (u & 63)) - 1)).count_ones() as usize
+    }
+
     /// Runs that end before column `u`.
     #[inline(always)]
     fn ended_before(row: &[Self], u: u16) -> usize {
@@ -125,19 +141,32 @@ pub(super) struct Labeller {
     /// Labels found to be of one component, and how many pairs there are.
     joins: Vec<(u32, u32)>,
     joined: usize,
+    /// Labels whose pixels touch by a corner, and how many pairs there are.
+    corners: Vec<(u32, u32)>,
+    cornered: usize,
     sums: Vec<Sums>,
+    /// Labels that are roots when sides alone join.
+    roots: Vec<u32>,
     /// Components kept and the labels of their roots.
     kept: Vec<(Component, u32)>,
     outlines: Vec<(u16, u16)>,
 }
 
 impl Labeller {
-    /// Finds the components of a bitmap (pixels that touch by a side or a corner) and outlines those that
-    /// `keep` accepts. Bitmaps are less than 65 000 pixels wide and high.
+    /// Finds the components of a bitmap and outlines those that `keep` accepts: those of pixels that touch by their
+    /// sides, and where some of these touch by corners, what they are together. A thin border seen aslant holds
+    /// together by corners alone; two squares that touch by a corner are two. Bitmaps are less than 65 000 pixels
+    /// wide and high.
     pub fn label(&mut self, bits: &Bitmap, simd: Simd, keep: impl Fn(&Component) -> bool) {
+        self.kept.clear();
+        self.outlines.clear();
         simd.run(FindRuns { labeller: self, bits });
-        self.gather(keep);
-        simd.run(FindOutlines { labeller: self, words: bits.width.div_ceil(64) });
+        self.gather(&keep);
+        let words = bits.width.div_ceil(64);
+        simd.run(FindOutlines { labeller: self, words, from: 0 });
+        let from = self.kept.len();
+        self.gather_cornered(&keep);
+        simd.run(FindOutlines { labeller: self, words, from });
     }
 
     /// The kept components with their outlines.
@@ -159,7 +188,7 @@ impl Labeller {
         self.marks.resize((bits.height + 1) * marks, Marks::default());
         self.marks[..marks].fill(Marks::default());
         let (mut above, mut first) = (0, 0);
-        (self.count, self.joined) = (0, 0);
+        (self.count, self.joined, self.cornered) = (0, 0, 0);
         for v in 0..bits.height {
             self.rows.push(first as u32);
             let after = first + self.split_row(bits.row(v), first, (v + 1) * marks);
@@ -226,15 +255,15 @@ impl Labeller {
             self.parents.resize(most, 0);
             self.sums.resize(most, Sums::from_row(0));
             self.joins.resize(most, (0, 0));
+            self.corners.resize(2 * most, (0, 0));
         }
-        let (mut count, mut joined) = (self.count, self.joined);
+        let (mut count, mut joined, mut cornered) = (self.count, self.joined, self.cornered);
         let (runs, labels) = (&self.runs[row.clone()], &mut self.labels[above..most]);
         let (parents, sums) = (&mut self.parents[..most], &mut self.sums[..most]);
-        let joins = &mut self.joins[..most];
+        let (joins, corners) = (&mut self.joins[..most], &mut self.corners[..2 * most]);
         for (run, k) in runs.iter().zip(row.start - above..) {
-            // Runs touch by corners too: one above may end where this starts, or start where it ends.
-            let from = Marks::ended_before(marks, run.start);
-            let to = Marks::started_by(marks, run.end);
+            let from = Marks::ended_by(marks, run.start);
+            let to = Marks::started_before(marks, run.end);
             let is_new = from >= to;
             parents[count] = count as u32;
             sums[count] = Sums::from_row(v);
@@ -242,6 +271,11 @@ impl Labeller {
             count += usize::from(is_new);
             labels[k] = own;
             sums[own as usize].add(run, v);
+            // By a corner touch one that ends where this starts, and one that starts where it ends.
+            corners[cornered] = (own, labels[from.max(1) - 1]);
+            cornered += usize::from(Marks::ended_before(marks, run.start) < from);
+            corners[cornered] = (own, labels[to]);
+            cornered += usize::from(Marks::started_by(marks, run.end) > to);
             let other = labels[from + 1];
             joins[joined] = (own, other);
             joined += usize::from((to > from + 1) & (own != other));
@@ -251,11 +285,11 @@ impl Labeller {
                 }
             }
         }
-        (self.count, self.joined) = (count, joined);
+        (self.count, self.joined, self.cornered) = (count, joined, cornered);
     }
 
     /// Sums labels up into components and finds which are kept.
-    fn gather(&mut self, keep: impl Fn(&Component) -> bool) {
+    fn gather(&mut self, keep: &impl Fn(&Component) -> bool) {
         for label in 0..self.count {
             let parent = self.parents[label] as usize;
             if parent != label {
@@ -266,9 +300,10 @@ impl Labeller {
                 self.sums[root as usize].merge(&part);
             }
         }
-        self.kept.clear();
+        self.roots.clear();
         for (label, &parent) in self.parents[..self.count].iter().enumerate() {
             if parent as usize == label {
+                self.roots.push(parent);
                 let component = self.sums[label].component();
                 if keep(&component) {
                     self.kept.push((component, parent));
@@ -277,13 +312,37 @@ impl Labeller {
         }
     }
 
-    /// Finds the leftmost and the rightmost run of each row of the components kept.
+    /// Joins components that touch by corners and finds which of the new ones are kept.
+    fn gather_cornered(&mut self, keep: &impl Fn(&Component) -> bool) {
+        for &(a, b) in &self.corners[..self.cornered] {
+            union(&mut self.parents, a, b);
+        }
+        for &label in &self.roots {
+            let parent = self.parents[label as usize];
+            if parent != label {
+                // A parent comes before its children, so it is a root by now.
+                let root = self.parents[parent as usize];
+                self.parents[label as usize] = root;
+                let part = self.sums[label as usize];
+                self.sums[root as usize].merge(&part);
+                self.sums[root as usize].has_grown = true;
+            }
+        }
+        for &label in &self.roots {
+            let sums = self.sums[label as usize];
+            if self.parents[label as usize] == label && sums.has_grown && keep(&sums.component()) {
+                self.kept.push((sums.component(), label));
+            }
+        }
+    }
+
+    /// Finds the leftmost and the rightmost run of each row of the components kept, those from `from` on.
     #[inline(always)]
-    fn outline(&mut self, words: usize) {
+    fn outline(&mut self, words: usize, from: usize) {
         let Self { runs, labels, rows, marks, parents, kept, outlines, .. } = self;
-        outlines.clear();
-        for (component, root) in kept {
-            let is_own = |k: &usize| parents[labels[*k] as usize] == *root;
+        for (component, root) in &kept[from..] {
+            // Joined by corners, a root is the child of another.
+            let is_own = |k: &usize| parents[parents[labels[*k] as usize] as usize] == *root;
             for v in usize::from(component.top)..=usize::from(component.bottom) {
                 let (first, marks) = (rows[v] as usize, &marks[(v + 1) * (words + 1)..(v + 2) * (words + 1)]);
                 let mut within = first + Marks::ended_before(marks, component.left)
@@ -314,12 +373,13 @@ impl Kernel for FindRuns<'_> {
 struct FindOutlines<'a> {
     labeller: &'a mut Labeller,
     words: usize,
+    from: usize,
 }
 
 impl Kernel for FindOutlines<'_> {
     #[inline(always)]
     fn run(self) {
-        self.labeller.outline(self.words);
+        self.labeller.outline(self.words, self.from);
     }
 }
 
@@ -329,8 +389,8 @@ mod tests {
 
     use super::*;
 
-    /// Flood fill, the plain way.
-    fn flooded(bits: &Bitmap) -> Vec<Component> {
+    /// Flood fill, the plain way, by sides or by corners too: each component with its first pixel.
+    fn flooded(bits: &Bitmap, by_corners: bool) -> Vec<(Component, usize)> {
         let dark = |u: usize, v: usize| bits.row(v)[u / 64] >> (u % 64) & 1 == 1;
         let mut seen = vec![false; bits.width * bits.height];
         let mut found = Vec::new();
@@ -348,14 +408,15 @@ mod tests {
                 c.merge(&pixel);
                 for nv in v.saturating_sub(1)..(v + 2).min(bits.height) {
                     for nu in u.saturating_sub(1)..(u + 2).min(bits.width) {
-                        if dark(nu, nv) && !seen[nv * bits.width + nu] {
+                        let by_side = nu == u || nv == v;
+                        if (by_side || by_corners) && dark(nu, nv) && !seen[nv * bits.width + nu] {
                             seen[nv * bits.width + nu] = true;
                             stack.push((nu, nv));
                         }
                     }
                 }
             }
-            found.push(Component { runs: 0, ..c.component() });
+            found.push((Component { runs: 0, ..c.component() }, first));
         }
         found
     }
@@ -377,7 +438,9 @@ mod tests {
             let mut labeller = Labeller::default();
             labeller.label(&bits, Simd::best(), |_| true);
             let mut labelled: Vec<Component> = labeller.kept().map(|(c, _)| Component { runs: 0, ..*c }).collect();
-            let mut expected = flooded(&bits);
+            let by_sides = flooded(&bits, false);
+            let wider = flooded(&bits, true).into_iter().filter(|c| !by_sides.contains(c));
+            let mut expected: Vec<Component> = by_sides.iter().copied().chain(wider).map(|c| c.0).collect();
             let key = |c: &Component| (c.top, c.left, c.bottom, c.right, c.area);
             labelled.sort_by_key(key);
             expected.sort_by_key(key);

@@ -4,7 +4,8 @@ use super::binarise::{Binariser, Bitmap, Where};
 use super::components::Labeller;
 use super::detection::TagDetection;
 use super::edges::{EdgeSearch, fit_sides};
-use super::family::{Family, Word};
+use super::evidence::is_there;
+use super::family::{Family, TagLayout, Word};
 use super::noise::noise_sigma;
 use super::payload;
 use super::pyramid::{Base, Level, Pyramid};
@@ -30,6 +31,8 @@ pub struct Detector {
     finder: QuadFinder,
     refiner: Refiner,
     found: Vec<Found>,
+    /// What did not look like a tag when it was read, in the level at hand.
+    tried: Vec<Quad>,
     detections: Vec<TagDetection>,
     negative: GrayImage,
     /// Of a frame pixel, grey levels.
@@ -72,18 +75,42 @@ const FRACTIONS_ONCE: [u16; 1] = [85];
 const FRACTIONS_TWICE: [u16; 2] = [72, 116];
 const FRACTIONS_THRICE: [u16; 3] = [40, 72, 116];
 
+/// And where white is over-exposed: it spreads into the border from both sides and leaves little of it dark.
+const FRACTION_SATURATED: u16 = 195;
+
 /// Smallest edge in a level at which a border can be told from its surroundings, pixels.
 const LEAST_EDGE_IN_LEVEL: f32 = 12.0;
+
+/// Where weak contrast is divided.
+const FRACTION_DIM: u16 = 100;
+
+/// Pixels of a level for each run of dark ones, in the finest level and in the others, from which it is looked at for
+/// contrast that is weaker than that of print in clear air. Where textured ground has more, weak tags are found from
+/// twice the least size on.
+const DIM_AREA_IN_FINEST: usize = 50;
+
+/// The same by the share of a finest level that has such contrast, which is known before pixels are marked.
+const MOST_DIM_IN_FINEST: f32 = 0.4;
+
+/// Least step across a side, as a share of the light outside it, in clear air.
+const CLEAR_STEP: f32 = 0.1;
+
+/// Farthest that corners of two quadrilaterals may be from each other to be read alike, pixels of a level.
+const SAME_QUAD: f32 = 0.3;
+const DIM_AREA: usize = 20;
+
+/// Least contrast that is looked at where an image has hardly any noise, grey levels.
+const LEAST_GATE: f32 = 6.0;
 
 /// Largest image, pixels on a side.
 pub const LARGEST_IMAGE_PX: usize = 32_767;
 
 impl Detector {
-    /// A detector of tags of these families.
-    pub fn new(families: &[TagFamily], limits: Limits) -> Self {
+    /// A detector of tags of these families, or of these families with these borders.
+    pub fn new<L: Into<TagLayout> + Copy>(layouts: &[L], limits: Limits) -> Self {
         let Limits { min_px, max_hamming } = limits;
         Self {
-            families: families.iter().map(|&f| Family::new(f, max_hamming)).collect(),
+            families: layouts.iter().map(|&l| Family::new(l.into(), max_hamming)).collect(),
             min_px: min_px as f32,
             simd: Simd::best(),
             pyramid: Pyramid::default(),
@@ -93,6 +120,7 @@ impl Detector {
             finder: QuadFinder::default(),
             refiner: Refiner::new(Simd::best()),
             found: Vec::new(),
+            tried: Vec::new(),
             detections: Vec::new(),
             negative: GrayImage::default(),
             noise: 0.0,
@@ -161,22 +189,43 @@ impl Detector {
                 (true, _) => &FRACTIONS_TWICE,
                 (false, _) => &FRACTIONS_THRICE,
             };
-            self.search_level(image, n, fractions, inverted);
+            let dim_area = if n == first { DIM_AREA_IN_FINEST } else { DIM_AREA };
+            self.search_level(image, n, fractions, dim_area, inverted);
         }
     }
 
-    fn search_level(&mut self, image: ImageView<'_>, n: usize, fractions: &[u16], inverted: bool) {
+    fn search_level(
+        &mut self,
+        image: ImageView<'_>,
+        n: usize,
+        fractions: &[u16],
+        dim_area: usize,
+        inverted: bool,
+    ) {
         let level = self.pyramid.level(image, n);
         let limits = SizeLimits { least: (self.min_px / level.scale).max(8.0), most: f32::MAX };
         let (width, height) = (level.image.width, level.image.height);
         // Noise alone spans some five sigmas in the 144 pixels of a neighbourhood.
-        let gate = (7.0 * self.noise / level.scale).clamp(12.0, 60.0) as u8;
-        self.binariser.measure(level.image, gate, self.simd);
-        for &fraction in fractions {
-            let is_highest = Some(&fraction) == fractions.last();
-            let at =
-                if self.binariser.is_busy() && !is_highest { Where::LightChanges } else { Where::Everywhere };
+        let gate = (7.0 * self.noise / level.scale).clamp(LEAST_GATE, 60.0) as u8;
+        self.binariser.measure(level.image, gate, inverted, self.simd);
+        let highest = fractions.last().copied();
+        let (is_busy, is_saturated) = (self.binariser.is_busy(), self.binariser.is_saturated());
+        let everywhere = fractions.iter().map(|&fraction| match is_busy && Some(fraction) != highest {
+            true => (fraction, Where::LightChanges),
+            false => (fraction, Where::Everywhere),
+        });
+        let saturated = is_saturated.then_some((FRACTION_SATURATED, Where::Saturated));
+        let most_dim = if dim_area == DIM_AREA_IN_FINEST { MOST_DIM_IN_FINEST } else { 1.0 };
+        let is_hazy = self.binariser.is_hazy();
+        let most_dim = if is_hazy { 1.0 } else { most_dim };
+        let has_dim = (f32::MIN_POSITIVE..=most_dim).contains(&self.binariser.dim_share());
+        let dim = has_dim.then_some((FRACTION_DIM, Where::AboveNoise));
+        self.tried.clear();
+        for (fraction, at) in everywhere.chain(saturated).chain(dim) {
             self.binariser.mark(level.image, fraction, at, &mut self.bits, self.simd);
+            if at == Where::AboveNoise && !is_hazy && self.bits.runs() * dim_area > width * height {
+                continue;
+            }
             self.labeller.label(&self.bits, self.simd, |c| may_be_border(c, limits, width, height));
             for (component, outline) in self.labeller.kept() {
                 let Some(quad) = self.finder.quad(component, outline, limits) else { continue };
@@ -184,7 +233,13 @@ impl Detector {
                 if self.found.iter().any(|f| same_place(&f.corners, &in_frame)) {
                     continue;
                 }
-                let Some(straight) = straighten(level, &quad, gate) else { continue };
+                let is_again = |t: &Quad| (0..4).all(|i| distance(t[i], quad[i]) < SAME_QUAD);
+                if self.tried.iter().any(is_again) {
+                    continue;
+                }
+                let least_share = if at == Where::AboveNoise { 0.0 } else { CLEAR_STEP };
+                let Some(straight) = straighten(level, &quad, gate, least_share) else { continue };
+                self.tried.push(quad);
                 // Of a small tag a side may be drawn to what is beside it: then as it was.
                 let found = [straight, in_frame].iter().find_map(|quad| {
                     let mut families = self.families.iter().filter(|f| f.inverted == inverted);
@@ -198,11 +253,11 @@ impl Detector {
 
 /// A quadrilateral of a level, in frame coordinates, with its sides fitted to the image; `None` where the
 /// image does not step from dark to light along them.
-fn straighten(level: Level<'_>, quad: &Quad, gate: u8) -> Option<Quad> {
+fn straighten(level: Level<'_>, quad: &Quad, gate: u8, least_share: f32) -> Option<Quad> {
     // Seen aslant, a cell is narrower one way than the other.
     let narrow = polygon_area(quad) / longest_edge(quad).max(1.0);
     let least_step = f32::from(gate) / 3.0;
-    if !looks_like_tag(level.image, quad, (narrow / 16.0).clamp(0.8, 4.0), least_step) {
+    if !looks_like_tag(level.image, quad, (narrow / 16.0).clamp(0.8, 4.0), least_step, least_share) {
         return None;
     }
     let search = EdgeSearch { reach: (narrow / 8.0).clamp(1.0, 3.0), least_step };
@@ -231,6 +286,9 @@ fn decode(
     let word = reading.word;
     let corners: Quad = std::array::from_fn(|i| quad[(i + word.turns) % 4]);
     let refined = refiner.refine(image, &corners, family, word.id).unwrap_or_else(|| unrefined(&corners));
+    if !is_there(image, pyramid, &refined.corners, family, &word) {
+        return None;
+    }
     Some(Found { family: family.family, word, margin: reading.margin, corners, refined })
 }
 

@@ -7,6 +7,22 @@
 
 use windhover_base::msg::{FamilySpec, TagFamily};
 
+/// How a tag is printed: its family, and how many cells wide its border is.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub struct TagLayout {
+    /// Family of the code words.
+    pub family: TagFamily,
+    /// Width of the border, cells: 1 as the families' authors print it, 2 as Kalibr does. The corners are those of the
+    /// border's outer square in either case.
+    pub border: u8,
+}
+
+impl From<TagFamily> for TagLayout {
+    fn from(family: TagFamily) -> Self {
+        Self { family, border: 1 }
+    }
+}
+
 /// What a grid of bits was recognised as.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) struct Word {
@@ -23,8 +39,10 @@ pub(super) struct Word {
 pub(super) struct Family {
     /// Which.
     pub family: TagFamily,
-    /// Border cells on a side.
+    /// Cells on a side of the border's outer square.
     pub width: usize,
+    /// How many cells wide the border is.
+    pub border: usize,
     /// Cells sampled around the border: 1, or 2 where data lie outside.
     pub pad: usize,
     /// Whether the border is light inside a dark ring.
@@ -39,15 +57,18 @@ pub(super) struct Family {
 
 impl Family {
     /// The tables of a family; `max_hamming` is cut to what the family allows.
-    pub fn new(family: TagFamily, max_hamming: u8) -> Self {
-        let &FamilySpec { border: width, pad, inverted, correctable: limit, codes, .. } = family.spec();
-        let cells = data_cells(width, pad);
+    pub fn new(layout: TagLayout, max_hamming: u8) -> Self {
+        let TagLayout { family, border } = layout;
+        let &FamilySpec { border: square, pad, inverted, correctable: limit, codes, .. } = family.spec();
+        let border = usize::from(border.max(1));
+        let width = square + 2 * (border - 1);
+        let cells = data_cells(width, pad, border as i32);
         let turned = std::array::from_fn(|turns| {
             cells.iter().map(|&cell| grid_index(turn(cell, width, turns), width, pad)).collect()
         });
         let max_hamming = max_hamming.min(limit);
         let index = ChunkIndex::new(codes, cells.len(), max_hamming);
-        Self { family, width, pad, inverted, cells, codes, turned, index }
+        Self { family, width, border, pad, inverted, cells, codes, turned, index }
     }
 
     /// Cells on a side of the sampled grid.
@@ -69,7 +90,7 @@ impl Family {
         if !inside(-1) {
             return None;
         }
-        if inside(1) {
+        if inside(self.border as i32) {
             let cell = self.cells.iter().position(|&c| c == (x, y))?;
             return Some(self.bit(id, cell));
         }
@@ -93,14 +114,14 @@ impl Family {
     }
 }
 
-/// Data cells row by row: all inside the border ring, and the outermost ring where `pad` is 2.
-fn data_cells(width: usize, pad: usize) -> Vec<(i32, i32)> {
+/// Data cells row by row: all inside the border, and the outermost ring where `pad` is 2.
+fn data_cells(width: usize, pad: usize, border: i32) -> Vec<(i32, i32)> {
     let (w, p) = (width as i32, pad as i32);
     let mut cells = Vec::new();
     for y in -p..w + p {
         for x in -p..w + p {
             let inside = |margin: i32| (margin..w - margin).contains(&x) && (margin..w - margin).contains(&y);
-            if inside(1) || (p == 2 && !inside(-1)) {
+            if inside(border) || (p == 2 && !inside(-1)) {
                 cells.push((x, y));
             }
         }
@@ -197,7 +218,7 @@ mod tests {
     #[test]
     fn every_word_is_found_in_every_turn() {
         for family in TagFamily::ALL {
-            let table = Family::new(family, 3);
+            let table = Family::new(family.into(), 3);
             assert_eq!(table.codes.len(), family.codes());
             for id in 0..family.codes() as u32 {
                 for turns in 0..4 {
@@ -210,7 +231,7 @@ mod tests {
 
     #[test]
     fn wrong_bits_are_corrected_up_to_the_limit() {
-        let table = Family::new(TagFamily::Tag36h11, 2);
+        let table = Family::new(TagFamily::Tag36h11.into(), 2);
         for wrong in [[3usize, 17], [0, 35], [11, 12]] {
             let mut grid = grid_of(&table, 42, 1);
             for w in wrong {
@@ -232,7 +253,7 @@ mod tests {
             (TagFamily::Tag16h5, 5),
             (TagFamily::Tag41h12, 12),
         ] {
-            let codes = Family::new(family, 0).codes;
+            let codes = Family::new(family.into(), 0).codes;
             let nearest = (0..codes.len().min(400))
                 .flat_map(|i| (i + 1..codes.len()).map(move |j| (codes[i] ^ codes[j]).count_ones()))
                 .min();

@@ -12,6 +12,7 @@ mod disjoint_sets;
 mod edge_points;
 mod edges;
 mod equations;
+mod evidence;
 mod family;
 mod features;
 mod flow;
@@ -33,6 +34,7 @@ mod windows;
 
 pub use detection::TagDetection;
 pub use detector::{Detector, LARGEST_IMAGE_PX, Limits};
+pub use family::TagLayout;
 pub use pattern::{TagPattern, tag_pattern};
 pub use pose::{TagPose, TagPoses, tag_poses};
 pub use roi::Roi;

@@ -3,11 +3,11 @@
 use super::family::{Family, Word};
 use super::homography::{Homography, narrow, wide};
 use super::pyramid::Pyramid;
-use super::quad::{Quad, bilinear, distance};
+use super::quad::{Quad, bilinear, distance, polygon_area};
 use windhover_base::msg::ImageView;
 
-/// Largest grid side: tag36h11 with its ring.
-const MOST: usize = 10;
+/// Largest grid side: tag36h11 with a border of two cells and its ring.
+const MOST: usize = 12;
 
 /// A word read from a quadrilateral.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -18,7 +18,7 @@ pub(super) struct Reading {
 }
 
 /// Least step from black border to white ring, grey levels.
-const LEAST_CONTRAST: f32 = 8.0;
+const LEAST_CONTRAST: f32 = 5.0;
 
 /// Share of border and ring cells that may lie on the wrong side of the threshold.
 const MOST_WRONG_BORDER: f32 = 0.2;
@@ -33,9 +33,9 @@ struct Grid {
 impl Grid {
     fn sample(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family: &Family) -> Option<Self> {
         let h = Homography::of_square(family.width as f64, &wide(quad))?;
-        let edge = (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).sum::<f32>() / 4.0;
-        // Averaging over the cell: the level in which a cell is two to four pixels wide.
-        let cell = edge / family.width as f32;
+        let longest = (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).fold(1.0, f32::max);
+        // Averaging over the cell: the level in which a cell is two to four pixels wide, seen aslant the narrow way.
+        let cell = polygon_area(quad) / longest / family.width as f32;
         let level = pyramid.for_size(image, cell, 2.0);
         let (side, pad) = (family.grid_side(), family.pad);
         let mut values = [0.0; MOST * MOST];

@@ -22,7 +22,8 @@ pub(super) struct Refined {
 /// What stays of an edge's error when noise is averaged away: sampling, neighbouring cells, print. Pixels.
 pub(super) const FLOOR_PX: f64 = 0.02;
 
-/// Homography in ξ, η (row by row, last entry 1), the bow, the barrel, the twist and the shifts of edges.
+/// Homography in ξ, η (row by row, last entry 1), the bow, the barrel, the twist, the shifts of edges and
+/// the spread of light.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Model {
     pub theta: Row,
@@ -71,8 +72,8 @@ impl Model {
         let p = Vector2::new(u, v) + (Vector2::new(t[8], t[9]) + q * t[10]) * far + twist;
         #[rustfmt::skip]
         let jacobian = SMatrix::<f64, 2, PARAMETERS>::from_row_slice(&[
-            xi * w, eta * w, w, 0.0, 0.0, 0.0, -u * xi * w, -u * eta * w, far, 0.0, far * q.x, even, -odd, 0.0, 0.0,
-            0.0, 0.0, 0.0, xi * w, eta * w, w, -v * xi * w, -v * eta * w, 0.0, far, far * q.y, -odd, -even, 0.0, 0.0,
+            xi * w, eta * w, w, 0.0, 0.0, 0.0, -u * xi * w, -u * eta * w, far, 0.0, far * q.x, even, -odd, 0.0, 0.0, 0.0,
+            0.0, 0.0, 0.0, xi * w, eta * w, w, -v * xi * w, -v * eta * w, 0.0, far, far * q.y, -odd, -even, 0.0, 0.0, 0.0,
         ]);
         (p, jacobian)
     }
@@ -99,7 +100,7 @@ impl Model {
     /// By how much blur lets edges beside cells that are one wide appear nearer the other cell, of edges crossed along
     /// ξ (0) or η (1), pixels.
     pub fn shift(&self, axis: usize) -> f64 {
-        self.theta[PARAMETERS - 2 + axis]
+        self.theta[13 + axis]
     }
 
     /// Corners and centre with their covariances; `common` are variances that all edges crossed along ξ and all those

@@ -92,7 +92,7 @@ struct Tally {
 impl Tally {
     /// Refines tags 0 to 15 of a family from corners off by up to a fifth of a cell.
     fn of(cell: f64, blur: f64, noise: f64) -> Self {
-        let family = Family::new(TagFamily::Tag36h11, 2);
+        let family = Family::new(TagFamily::Tag36h11.into(), 2);
         let mut refiner = Refiner::new(Simd::best());
         let mut rng = ChaCha8Rng::seed_from_u64((cell * 100.0 + blur * 10_000.0) as u64);
         let mut tally = Self::default();
