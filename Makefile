@@ -6,7 +6,7 @@ VENV  ?= target/venv
 DEMO  ?= demo
 
 .PHONY: help setup setup-python build debug demo test test-python test-web test-real test-zenoh proofs check lint docs configs \
-        licences oldest aarch64 bench load clean deb hil hil-long hil-short hil-tools
+        licences oldest aarch64 bench load misfit-table clean deb hil hil-long hil-short hil-tools
 
 help:
 	@echo "make demo     build, simulate a flight, replay it, compare with the truth, write a report page"
@@ -19,6 +19,7 @@ help:
 	@echo "              advisories, the oldest Rust stated, the detector's NEON kernels under QEMU"
 	@echo "make bench    the benchmarks under benches/"
 	@echo "make load     five minutes of raw frames at full pace: latency, processor time, memory, losses"
+	@echo "make misfit-table  flights that their configuration does not fit, against nominal twins (an hour)"
 	@echo "make deb      a Debian package in target/debian"
 	@echo "make hil      the virtual payload computer: install, boot, fly, compare (as root)"
 	@echo "make hil-long the same with every scenario"
@@ -108,6 +109,14 @@ bench: setup
 load: PARTS = --bin windhover --example daemon_load
 load: build
 	target/release/examples/daemon_load
+
+# What the pipeline makes of flights that their configuration does not fit: the table of docs/estimator.md. An hour and
+# more for all rows and four seeds; `ROWS="two people" SEEDS=1` for some.
+ROWS  ?=
+SEEDS ?= 1,2,3,4
+misfit-table: PARTS = --bin windhover
+misfit-table: build
+	python3 benches/misfit.py target/release/windhover --seeds $(SEEDS) $(if $(ROWS),"$(ROWS)")
 
 # The package: binary, unit, configuration, rules, manual and completions out of the command line.
 deb: build

@@ -1,7 +1,7 @@
 //! Scores the estimator on simulated flights, without pixels or bytes, and prints a table.
 //!
 //! `cargo bench --bench estimator -- [--runs N] [--seconds S] [--no-features] [--marker-px X] [--feature-px X]
-//! [--no-bound] [SCENARIO…]`
+//! [--no-bound] [SCENARIO[+DEVIATION[=FIGURE]]…]…`
 
 use std::sync::Arc;
 
@@ -338,8 +338,8 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
     let rig = &world.scenario().rig;
     let site = Site {
         frame: *world.frame(),
-        ground: Ground::Flat { down_m: 0.0 },
-        declination_rad: scenario.declination_deg.to_radians(),
+        ground: Ground::Flat { down_m: scenario.told_ground_down_m().unwrap_or(0.0) },
+        declination_rad: scenario.rig.compass.declination_deg.unwrap_or(0.0).to_radians(),
     };
     let mut filter = Estimator::new(rig, &EstimatorConfig::default(), &site);
     let mut paper = PaperEstimator::new(rig, &EstimatorConfig::default(), &site);
@@ -392,7 +392,10 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
                 }
                 EstimatorOutput::Smoothed(e) => s.add(&e, &world),
                 EstimatorOutput::Reset { .. } | EstimatorOutput::Anchored { .. } => resets += 1,
-                EstimatorOutput::Ownship(_) | EstimatorOutput::Fusion(_) => {}
+                EstimatorOutput::Ownship(_)
+                | EstimatorOutput::Fusion(_)
+                | EstimatorOutput::TiltFelt { .. }
+                | EstimatorOutput::Misfit(_) => {}
             }
         }
         for estimate in paper_out.drain(..) {
@@ -451,7 +454,7 @@ fn main() {
         "cover"
     );
     for name in names {
-        let mut scenario = Scenario::named(&name).unwrap_or_else(|| panic!("no scenario {name}"));
+        let mut scenario = Scenario::described(&name).unwrap_or_else(|e| panic!("{name}: {e}"));
         scenario.duration_s = seconds.unwrap_or(scenario.duration_s);
         scenario.camera.features = features.unwrap_or(scenario.camera.features);
         scenario.camera.marker_noise_px = marker_px.unwrap_or(scenario.camera.marker_noise_px);

@@ -31,6 +31,12 @@ def run(*command):
     return done.stdout
 
 
+def fitting(listed):
+    """The scenarios of a list that their configuration fits: what is otherwise is said of the others."""
+    lines = [line.split(maxsplit=1) for line in listed.splitlines()]
+    return [name for name, about in lines if not about.startswith(("misfit: ", "absorbed: ", "condition: "))]
+
+
 def rows(path):
     with open(path, newline="") as file:
         return list(csv.DictReader(file))
@@ -156,7 +162,7 @@ def main():
     parser.add_argument("--folder", type=pathlib.Path, default=pathlib.Path("target/rendered"))
     parser.add_argument("--set", action="append", default=[])
     options = parser.parse_intermixed_args()
-    listed = options.scenarios or [line.split()[0] for line in run(options.binary, "simulate", "--list").splitlines()]
+    listed = options.scenarios or fitting(run(options.binary, "simulate", "--list"))
     line = lambda name, figures: print(f"| {name} | " + " | ".join(map(format, figures, FORMATS)) + " |", flush=True)
     print("| flight | " + " | ".join(COLUMNS) + " |\n|" + "---|" * (len(COLUMNS) + 1))
     for scenario in listed:

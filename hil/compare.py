@@ -69,7 +69,7 @@ def against_truth(args, flight, work):
     truth = {int(r["frame"]): r for r in rows(args.truth)}
     true_own = {int(r["frame"]): r for r in rows(args.truth.replace(".csv", "_ownship.csv"))}
     tables = exported(args, flight, work)
-    own = {int(r["frame"]): r for r in rows(tables / "ownship.csv")}
+    own = {int(r["frame"]): r for r in rows(tables / "ownship.csv") if r["frame"]}
     estimates = [r for r in rows(tables / "estimates.csv") if r["status"] == "tracking" and r["lat_deg"]]
     distance, absolute, heading = [], [], []
     for row in estimates:

@@ -11,7 +11,7 @@ use tracing::{Level, Metadata, Span};
 
 use crate::io::device::{Fault, NoteKind};
 use crate::io::store::StoreNotice;
-use windhover_base::msg::{Notice, NoticeKind, Source};
+use windhover_base::msg::{MisfitWords, Notice, NoticeKind, Source};
 use windhover_base::time::{self, MonoTime, NS_PER_S, UtcTime};
 
 use super::latencies::OfFlight;
@@ -99,10 +99,16 @@ table! {
     BytesRefused: "bytes_refused", WARN, every 5 s;
     /// A frame could not be read, or has the wrong size.
     FrameUnusable: "frame_unusable", WARN, every 5 s;
+    /// Parts of a frame are lost; the others are used.
+    FrameDamaged: "frame_damaged", WARN, every 5 s;
     /// Frames or bytes were lost before they could be recorded.
     Dropped: "dropped", WARN, every 5 s;
     /// The origin of the NED frame was settled.
     DatumSet: "datum_set", INFO, every 0 s;
+    /// Positions of the receiver cannot be used, and why.
+    PositionsUnused: "positions_unused", WARN, every 0 s;
+    /// The receiver's pulses come and are not used, and why.
+    PulseUnused: "pulse_unused", WARN, every 60 s;
     /// The terrain tile of the configuration cannot be used here: the ground is level instead.
     TerrainMissing: "terrain_missing", WARN, every 0 s;
     /// Declination was taken from the World Magnetic Model, or could not be.
@@ -117,6 +123,12 @@ table! {
     FilterReset: "filter_reset", WARN, every 0 s;
     /// A stamp went back or leapt ahead.
     ClockJump: "clock_jump", WARN, every 5 s;
+    /// Something measured does not fit the configuration, or the filter's model. The pipeline paces it.
+    ModelMisfit: "model_misfit", WARN, every 0 s;
+    /// The same marker was seen at two places of a frame. The pipeline paces it.
+    MarkerSeenTwice: "marker_seen_twice", WARN, every 0 s;
+    /// What the compass's tilt sensor feels was found out.
+    TiltFelt: "tilt_felt", INFO, every 0 s;
     /// A flight was closed because power is going.
     FlightClosed: "flight_closed", WARN, every 0 s;
     /// A flight began on the card.
@@ -255,8 +267,11 @@ impl From<NoticeKind> for OperatorEvent {
             NoticeKind::SourceBack => Self::SourceBack,
             NoticeKind::BytesRefused => Self::BytesRefused,
             NoticeKind::FrameUnusable => Self::FrameUnusable,
+            NoticeKind::FrameDamaged => Self::FrameDamaged,
             NoticeKind::Dropped => Self::Dropped,
             NoticeKind::DatumSet => Self::DatumSet,
+            NoticeKind::PositionsUnused => Self::PositionsUnused,
+            NoticeKind::PulseUnused => Self::PulseUnused,
             NoticeKind::TerrainMissing => Self::TerrainMissing,
             NoticeKind::Declination => Self::Declination,
             NoticeKind::TargetTracking => Self::TargetTracking,
@@ -264,6 +279,9 @@ impl From<NoticeKind> for OperatorEvent {
             NoticeKind::TargetLost => Self::TargetLost,
             NoticeKind::FilterReset => Self::FilterReset,
             NoticeKind::ClockJump => Self::ClockJump,
+            NoticeKind::ModelMisfit => Self::ModelMisfit,
+            NoticeKind::MarkerSeenTwice => Self::MarkerSeenTwice,
+            NoticeKind::TiltFelt => Self::TiltFelt,
         }
     }
 }
@@ -288,8 +306,16 @@ impl From<&StoreNotice> for OperatorEvent {
 
 /// Emits the pipeline's notice, at its own time; replay and daemon show it alike.
 pub fn notice(notice: &Notice) {
+    if let Some(misfit) = &notice.misfit {
+        return model_misfit(notice.t, misfit);
+    }
     let about = notice.source.map(Source::name).or(notice.target.as_deref()).unwrap_or("");
     OperatorEvent::from(notice.kind).send(Some(notice.t), about, &notice.detail);
+}
+
+fn model_misfit(t: MonoTime, misfit: &MisfitWords) {
+    let MisfitWords { source, figure, cause, advice, .. } = misfit;
+    emit!(ModelMisfit, { t_ns = t.ns(), source, figure, cause }, "{advice}");
 }
 
 /// Emits that the daemon has begun.
@@ -345,6 +371,24 @@ pub fn decimals(field: &str) -> Option<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::app::log::tests::lines_of;
+
+    #[test]
+    fn a_misfit_has_its_parts_as_fields() {
+        let misfit = MisfitWords {
+            source: "ugv tag 1".into(),
+            kind: "marker_size",
+            figure: "-5.0 %".into(),
+            cause: "tag 1 is 5.0 % smaller than configured".into(),
+            advice: "measure it".into(),
+        };
+        let (t, kind, detail) = (MonoTime::from_ns(NS_PER_S), NoticeKind::ModelMisfit, misfit.to_string());
+        let told = Notice { t, kind, source: None, target: None, detail, misfit: Some(misfit) };
+        let text = lines_of(|| notice(&told));
+        let fields = "level=warn event=model_misfit msg=\"measure it\" source=\"ugv tag 1\" figure=\"-5.0 %\" \
+                      cause=\"tag 1 is 5.0 % smaller than configured\"";
+        assert!(text.contains(fields) && text.starts_with("time=1970-01-01T00:00:01"), "{text}");
+    }
 
     #[test]
     fn names_are_unique_and_searchable() {

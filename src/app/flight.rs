@@ -58,7 +58,7 @@ pub struct Flight {
     pub datum: Option<Geodetic>,
     /// Targets by name.
     pub targets: BTreeMap<String, Track>,
-    /// The helicopter's own state, one a frame.
+    /// The helicopter's own state, at frames and between them, in order of time.
     pub ownship: Vec<wh::Ownship>,
     /// GPS epochs.
     pub epochs: Vec<wh::GnssEpoch>,
@@ -105,6 +105,7 @@ impl Flight {
             }
         }
         flight.warnings = reader.take_warnings();
+        flight.ownship.sort_by_key(|own| host_time(own.timestamp.as_ref()));
         flight.utc = flight.epochs.iter().find_map(|e| e.utc_ns).map(UtcTime::from_unix_ns);
         Ok(flight)
     }
@@ -143,6 +144,11 @@ impl Flight {
             "smoothed" => keep(&mut track.smoothed, raw),
             _ => keep(&mut track.paper, raw),
         }
+    }
+
+    /// Whether a frame came, be it kept or not.
+    pub fn had_frames(&self) -> bool {
+        !self.frames.is_empty() || !self.detections.is_empty()
     }
 
     /// Seconds from the beginning.

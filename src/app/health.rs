@@ -4,7 +4,7 @@ use tracing::Level;
 
 use crate::config::Config;
 use crate::io::records::DaemonFigures;
-use windhover_base::msg::{FixKind, Health, Source, SourceHealth, TargetHealth, TrackStatus};
+use windhover_base::msg::{Health, Source, SourceHealth, TargetHealth, TrackStatus};
 use windhover_base::time::Span;
 
 use super::callsite::RuntimeCallsite;
@@ -179,9 +179,10 @@ impl HealthLine {
     }
 
     /// Emits it, at its own time; `figures` where a daemon runs, none in replay. Normal flight is information; a
-    /// silent source or a failing card is a warning.
+    /// silent source, a misfit or a failing card is a warning.
     pub fn emit(&self, health: &Health, figures: Option<&Figures>) {
-        let troubled = health.sources.iter().any(|source| source.rate_hz <= 0.0);
+        let silent = health.sources.iter().any(|source| source.rate_hz <= 0.0);
+        let troubled = silent || !health.misfits.is_empty();
         let callsite = if troubled || figures.is_some_and(|f| f.warn) { self.warn } else { self.info };
         let fields = fields(health, &self.targets, figures).0;
         let values: Vec<_> = fields.iter().map(|(_, value)| value.as_ref().map(Value::as_tracing)).collect();
@@ -191,23 +192,20 @@ impl HealthLine {
 
 /// The fields and their values; the fields are the same whatever the health is.
 fn fields(health: &Health, targets: &[String], figures: Option<&Figures>) -> Fields {
-    let fix = match health.fix {
-        FixKind::None => "none",
-        FixKind::TwoD => "2d",
-        FixKind::ThreeD => "3d",
-    };
     let mut fields = Fields::default();
     fields.0.push(("t_ns".into(), Some(Value::Time(health.t.ns()))));
     for &source in Source::ALL {
         fields.source(&health.source(source));
         if source == Source::Gps {
-            fields.text("fix", Some(fix));
+            fields.text("fix", Some(health.fix.name()));
             fields.count("sats", health.sats.map(u64::from));
         }
     }
     for (number, name) in targets.iter().enumerate() {
         fields.target(name, health.targets.get(number));
     }
+    let misfits: Vec<&str> = health.misfits.iter().map(|misfit| misfit.source.as_str()).collect();
+    fields.text("misfit", (!misfits.is_empty()).then(|| misfits.join(", ")).as_deref());
     fields.count("dropped", Some(health.sources.iter().map(|s| s.dropped).sum()));
     if let Some(figures) = figures {
         fields.daemon(figures);
@@ -219,7 +217,7 @@ fn fields(health: &Health, targets: &[String], figures: Option<&Figures>) -> Fie
 mod tests {
     use super::*;
     use crate::app::log::tests::lines_of;
-    use windhover_base::msg::{TargetEstimate, TargetState};
+    use windhover_base::msg::{MisfitWords, TargetEstimate, TargetState};
 
     #[test]
     fn the_flight_gets_what_the_line_tells() {
@@ -250,6 +248,21 @@ mod tests {
         let figures = Figures { link: "off".into(), temperature_c: Some(41.3), ..Figures::default() };
         let text = lines_of(|| line.emit(&health, Some(&figures)));
         assert!(text.contains("level=warn") && text.contains("link=off temp_c=41.3"), "{text}");
+    }
+
+    #[test]
+    fn what_does_not_fit_is_named_and_a_warning() {
+        let misfit = |source: &str| MisfitWords {
+            source: source.into(),
+            kind: "noise",
+            figure: "3.0 times".into(),
+            cause: "it scatters".into(),
+            advice: "look".into(),
+        };
+        let misfits = vec![misfit("gps_velocity"), misfit("ugv tag 1")];
+        let health = Health { misfits, ..Health::default() };
+        let text = lines_of(|| HealthLine::new(&config()).emit(&health, None));
+        assert!(text.contains("level=warn") && text.contains("misfit=\"gps_velocity, ugv tag 1\""), "{text}");
     }
 
     #[test]

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::config::Config;
-use crate::pipeline::{Pipeline, next_tick};
+use crate::pipeline::Pipeline;
 use windhover_base::geo::Tile;
 use windhover_base::msg::{EstimatorOutput, Event, EventBody, Health, Output, TargetEstimate, TimedOutput};
 use windhover_base::time::{MonoTime, Span};
@@ -65,7 +65,7 @@ pub fn run(parts: Parts) {
         if context.stop.is_cancelled() && now - *end.get_or_insert(now) > LAST_CALL {
             break;
         }
-        match context.events.take(until_tick(now)) {
+        match context.events.take(task.until_tick(now)) {
             Some(event) => task.handle(&event),
             None if context.stop.is_cancelled() => break,
             None => task.pass_time(),
@@ -77,12 +77,6 @@ pub fn run(parts: Parts) {
 
 /// An event that was stamped before a tick may be queued this much after it and still comes first.
 const QUEUED_LATE: Span = Span::from_ns(5_000_000);
-
-/// Time from `now` until the next tick is due: so long the task may wait for an event.
-fn until_tick(now: MonoTime) -> Duration {
-    let due = next_tick(now - QUEUED_LATE) + QUEUED_LATE;
-    Duration::from_nanos((due - now).ns().unsigned_abs())
-}
 
 struct PipelineTask<'a> {
     config: &'a Config,
@@ -119,6 +113,12 @@ impl PipelineTask<'_> {
             )),
             Earlier::Nothing => {}
         }
+    }
+
+    /// Time from `now` until the next tick is due: so long the task may wait for an event.
+    fn until_tick(&self, now: MonoTime) -> Duration {
+        let due = self.pipeline.next_tick(now - QUEUED_LATE) + QUEUED_LATE;
+        Duration::from_nanos((due - now).ns().unsigned_abs())
     }
 
     fn pass_time(&mut self) {

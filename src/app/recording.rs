@@ -29,9 +29,11 @@ fn stamped<T>(t: &Option<Timestamp>, heard: &Option<Timestamp>, value: T) -> Sta
 }
 
 fn epoch(e: &wh::GnssEpoch) -> GnssEpoch {
-    let fix = match e.fix {
-        2 => FixKind::TwoD,
-        3 => FixKind::ThreeD,
+    let fix = match (e.fix, e.rtk()) {
+        (2, _) => FixKind::TwoD,
+        (3, wh::Rtk::None) => FixKind::ThreeD,
+        (3, wh::Rtk::Float) => FixKind::RtkFloat,
+        (3, wh::Rtk::Fixed) => FixKind::RtkFixed,
         _ => FixKind::None,
     };
     let velocity = match e.vel_ned_mps[..] {
@@ -89,4 +91,27 @@ fn marker(m: &wh::Marker) -> Option<MarkerDetection> {
         margin: m.margin,
         size_px: m.size_px,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use prost::Message as _;
+
+    use super::*;
+    use crate::io::records::OutputEncoder;
+    use windhover_base::msg::{Output, SensorReading};
+    use windhover_base::time::MonoTime;
+
+    #[test]
+    fn every_kind_of_fix_comes_back_from_the_flight() {
+        for fix in [FixKind::None, FixKind::TwoD, FixKind::ThreeD, FixKind::RtkFloat, FixKind::RtkFixed] {
+            let t = MonoTime::from_ns(5);
+            let value = GnssEpoch { fix, ..GnssEpoch::default() };
+            let reading = SensorReading::Gnss(Stamped { t_valid: t, t_recv: t, seq: 0, value });
+            let mut records = Vec::new();
+            OutputEncoder::new(&[]).output(&Output::Reading(reading), t, &mut records);
+            let message = wh::GnssEpoch::decode(&records[0].data[..]).expect("just encoded");
+            assert_eq!(epoch(&message).fix, fix);
+        }
+    }
 }

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::{CliError, CliResult};
-use windhover_base::msg::{FixKind, GnssEpoch};
+use windhover_base::msg::GnssEpoch;
 use windhover_base::settings::CompassFormat;
 use windhover_base::time::{MonoTime, NS_PER_S, UtcTime};
 use windhover_decode::{
@@ -134,7 +134,7 @@ impl EpochJson {
     fn of(epoch: &GnssEpoch) -> Self {
         Self {
             utc: utc_text(epoch),
-            fix: fix_name(epoch.fix),
+            fix: epoch.fix.name(),
             lat_deg: epoch.lat_deg,
             lon_deg: epoch.lon_deg,
             alt_msl_m: epoch.alt_msl_m,
@@ -147,14 +147,6 @@ impl EpochJson {
             sats: epoch.sats,
             hdop: epoch.hdop,
         }
-    }
-}
-
-const fn fix_name(fix: FixKind) -> &'static str {
-    match fix {
-        FixKind::None => "none",
-        FixKind::TwoD => "2d",
-        FixKind::ThreeD => "3d",
     }
 }
 
@@ -212,7 +204,7 @@ fn epoch_row(epoch: &GnssEpoch, out: &mut impl Write) -> std::io::Result<()> {
         out,
         "{:<24} {:>4} {:>13} {:>14} {:>9} {:>8} {:>7} {:>6} {:>23} {:>6} {:>6} {:>4} {:>5}",
         or_dash(utc_text(epoch)),
-        fix_name(epoch.fix),
+        epoch.fix.name(),
         or_dash(fixed(epoch.lat_deg, 8)),
         or_dash(fixed(epoch.lon_deg, 8)),
         or_dash(fixed(epoch.alt_msl_m, 2)),
@@ -277,6 +269,7 @@ fn decode_compass(
 fn decode_as(bytes: &[u8], format: CompassFormat) -> (Vec<HeardAttitude>, DecodeCounts) {
     let (mut decoder, mut heard) = (CompassDecoder::new(format), Vec::new());
     decoder.push(bytes, MonoTime::default(), &mut heard);
+    decoder.flush(&mut heard);
     (heard, decoder.counts().clone())
 }
 

@@ -6,6 +6,7 @@ use serde_json::{Value, json};
 
 use super::{CliError, CliResult};
 use crate::io::clock::HostClock;
+use crate::pixels;
 use windhover_base::msg::{GrayImage, TagFamily};
 use windhover_detect::{Detector, LARGEST_IMAGE_PX, Limits, TagDetection, TagLayout};
 
@@ -79,20 +80,18 @@ pub(super) fn run(args: &Args) -> CliResult {
 }
 
 fn read(path: &Path) -> Result<GrayImage, String> {
-    let image = image::ImageReader::open(path)
-        .map_err(|e| e.to_string())?
-        .with_guessed_format()
-        .map_err(|e| e.to_string())?
-        .decode()
-        .map_err(|e| e.to_string())?
-        .into_luma8();
-    let (width, height) = (image.width() as usize, image.height() as usize);
-    if width.max(height) > LARGEST_IMAGE_PX {
+    let bytes = std::fs::read(path).map_err(|e| e.to_string())?;
+    let (image, missing) = pixels::picture(&bytes)?;
+    if image.width.max(image.height) > LARGEST_IMAGE_PX {
         return Err(format!(
-            "{width}×{height} is larger than {LARGEST_IMAGE_PX} pixels on a side; scale it down"
+            "{}×{} is larger than {LARGEST_IMAGE_PX} pixels on a side; scale it down",
+            image.width, image.height
         ));
     }
-    GrayImage::from_vec(width, height, image.into_raw()).ok_or_else(|| "no pixels".to_owned())
+    if !missing.is_empty() {
+        eprintln!("windhover: {}: damaged: {} parts of it are missing", path.display(), missing.len());
+    }
+    Ok(image)
 }
 
 fn as_json(path: &Path, ms: f64, found: &[TagDetection]) -> Value {

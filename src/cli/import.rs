@@ -10,8 +10,8 @@ use windhover_base::time::MonoTime;
 /// Make a capture of recordings you already have: serial logs with a time a line, and a video.
 #[derive(clap::Args, Debug)]
 #[command(
-    after_help = "Serial logs: each line starts with a time (seconds since any epoch, or ISO 8601) and one
-space, then what came over the line. Video: a folder of images with times.csv (time_s,file), Motion
+    after_help = "Serial logs: each line starts with a time (seconds since any epoch, ISO 8601 with T or a blank, or
+as gpspipe -t writes it) and a blank or tab, then what came over the line. Video: a folder of images with times.csv (time_s,file), Motion
 JPEG in AVI, Y4M, or whatever an installed ffmpeg reads. All times are on one clock.
 
 Example:
@@ -40,7 +40,7 @@ pub(super) struct Args {
 }
 
 fn time(text: &str) -> Result<MonoTime, String> {
-    parse_time(text).ok_or_else(|| format!("{text:?} is no time: give seconds or ISO 8601"))
+    parse_time(text).ok_or_else(|| format!("{text:?} is no time: give seconds or a date and time (ISO 8601)"))
 }
 
 pub(super) fn run(args: &Args) -> CliResult {

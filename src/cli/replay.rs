@@ -73,6 +73,9 @@ pub(super) fn run(args: &Args) -> CliResult {
         summary.took.s(),
         summary.recorded.s() / summary.took.s().max(1e-3)
     );
+    if summary.frames == 0 {
+        eprintln!("no frame came from the camera: the helicopter's own state is all that was estimated");
+    }
     if let Some(out) = &args.out {
         eprintln!("wrote {}", out.display());
     }

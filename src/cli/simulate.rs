@@ -10,7 +10,7 @@ use crate::config::Config;
 use crate::io::capture::CaptureWriter;
 use crate::jpeg;
 use windhover_base::msg::{EventBody, GrayImage};
-use windhover_simulate::{Flight, FrameStorage, FrameTruth, Scenario, World, truth};
+use windhover_simulate::{Deviation, Flight, FrameStorage, FrameTruth, Scenario, World, truth};
 
 /// Make a capture of a simulated flight, with the truth beside it.
 ///
@@ -19,13 +19,17 @@ use windhover_simulate::{Flight, FrameStorage, FrameTruth, Scenario, World, trut
 /// vehicle really was at each frame (OUT.truth_NAME.csv for each further vehicle) and
 /// OUT.truth_ownship.csv where the helicopter was. The same scenario and seed always make the same
 /// flight.
+///
+/// With --with the flight differs from the configuration that OUT.mcap holds: tags larger than it says, people who walk
+/// about, stamps that jitter. Each such deviation is a scenario too, under its own name.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "\
 Examples:
   windhover simulate flight.mcap                          a minute of following a vehicle at 15 m
   windhover simulate a.mcap --scenario hover10 --seed 7   another draw of every error
   windhover simulate b.mcap --duration 10 --scale 0.5     short, at half the resolution: a small file
-  windhover simulate --list                               what scenarios there are
+  windhover simulate --list                               what scenarios and deviations there are
+  windhover simulate c.mcap --with people=3 --with readout=15   a flight that its configuration does not fit
 
 Then:
   windhover replay flight.mcap --out result.mcap          run the pipeline over it
@@ -49,22 +53,23 @@ pub(super) struct Args {
     /// Frames a second [default: the scenario's own, 15]
     #[arg(long, value_name = "FPS")]
     fps: Option<f64>,
+    /// Let the flight differ from its configuration (see --list); again for more
+    #[arg(long, value_name = "NAME[=FIGURE]")]
+    with: Vec<String>,
     /// JPEG quality of the frames, 1 to 100
     #[arg(long, default_value_t = 90, value_name = "Q", value_parser = clap::value_parser!(u8).range(1..=100))]
     quality: u8,
     /// Store frames as raw grey pixels instead of JPEG (large)
     #[arg(long, conflicts_with = "quality")]
     lossless: bool,
-    /// List the scenarios and exit
+    /// List scenarios and deviations and exit
     #[arg(long)]
     list: bool,
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
     if args.list {
-        for (name, about) in Scenario::names() {
-            println!("{name:18} {about}");
-        }
+        list();
         return Ok(());
     }
     let out = args.out.as_deref().ok_or_else(|| CliError::usage("say which capture to write"))?;
@@ -73,6 +78,21 @@ pub(super) fn run(args: &Args) -> CliResult {
     let encode = move |image: &GrayImage| jpeg::encode_grey(image, quality).map_err(|e| e.to_string());
     let storage = if args.lossless { FrameStorage::Raw } else { FrameStorage::Jpeg(Arc::new(encode)) };
     write_flight(scenario, args.seed, storage, out)
+}
+
+/// A line each, which begins with a name that `--scenario` takes.
+fn list() {
+    for (name, about) in Scenario::names().iter().copied().chain(Scenario::composed()) {
+        println!("{name:18} {about}");
+    }
+    for d in Deviation::all() {
+        let (name, effect, (low, high)) = (d.name, d.effect.name(), d.limits);
+        print!("{name:18} {effect}: {}", d.about);
+        match low < high {
+            true => println!("; --with {name}[={}] {}, {low} to {high}", d.usual, d.unit),
+            false => println!("; --with {name}"),
+        }
+    }
 }
 
 fn scenario(args: &Args) -> Result<Scenario, CliError> {
@@ -97,6 +117,11 @@ fn scenario(args: &Args) -> Result<Scenario, CliError> {
     }
     if let Some(fps) = args.fps {
         scenario.rig.camera.fps = fps;
+    }
+    for text in &args.with {
+        let refused =
+            |e| CliError::usage(format!("--with {text}: {e}; `windhover simulate --list` names them"));
+        scenario.deviate_as(text).map_err(refused)?;
     }
     config_of(&scenario)
         .check()
@@ -200,7 +225,9 @@ mod tests {
 
     #[test]
     fn every_named_scenario_can_be_flown() {
-        for (name, _) in Scenario::names() {
+        let deviations = Deviation::all().iter().map(|d| d.name);
+        let scenarios = Scenario::names().iter().copied().chain(Scenario::composed()).map(|(name, _)| name);
+        for name in scenarios.chain(deviations) {
             let scenario = Scenario::named(name).expect("it is listed");
             config_of(&scenario).check().unwrap_or_else(|e| panic!("{name}: {e}"));
         }

@@ -1,6 +1,8 @@
 //! What a configuration must satisfy beyond its syntax.
 
-use windhover_base::settings::{GroundConfig, MarkerConfig, MarkerKind, TargetConfig, TargetModel};
+use windhover_base::settings::{
+    AttitudeConfig, GroundConfig, ImuConfig, MarkerConfig, MarkerKind, TargetConfig, TargetModel,
+};
 
 use super::Config;
 
@@ -155,6 +157,7 @@ impl Config {
 
     fn check_estimator(&self) -> Result<(), ConfigError> {
         let e = &self.estimator;
+        within("estimator.ownship_hz", e.ownship_hz, 0.1, 100.0)?;
         within("estimator.history_ms", e.history_ms, 500.0, 10_000.0)?;
         within("estimator.smoother_lag_ms", e.smoother_lag_ms, 0.0, 2_000.0)?;
         within("estimator.lost_after_s", e.lost_after_s, 0.1, 600.0)?;
@@ -218,7 +221,9 @@ impl Config {
         within("compass.roll_offset_deg", compass.roll_offset_deg, -45.0, 45.0)?;
         within("compass.heading_bias_sigma_deg", compass.heading_bias_sigma_deg, 0.0, 180.0)?;
         within("compass.heading_noise_deg", compass.heading_noise_deg, 1e-3, 90.0)?;
-        within("compass.tilt_noise_deg", compass.tilt_noise_deg, 1e-3, 90.0)
+        within("compass.tilt_noise_deg", compass.tilt_noise_deg, 1e-3, 90.0)?;
+        self.imu.as_ref().map_or(Ok(()), check_imu)?;
+        self.attitude.as_ref().map_or(Ok(()), check_attitude)
     }
 
     fn check_camera(&self) -> Result<(), ConfigError> {
@@ -275,6 +280,24 @@ impl Config {
         }
         Ok(())
     }
+}
+
+fn check_imu(imu: &ImuConfig) -> Result<(), ConfigError> {
+    within("imu.latency_ms", imu.latency_ms, -200.0, 2_000.0)?;
+    within("imu.yaw_deg", imu.yaw_deg, -180.0, 180.0)?;
+    within("imu.pitch_deg", imu.pitch_deg, -90.0, 90.0)?;
+    within("imu.roll_deg", imu.roll_deg, -180.0, 180.0)?;
+    within("imu.rate_noise_dps", imu.rate_noise_dps, 1e-3, 1_000.0)?;
+    within("imu.rate_bias_dps", imu.rate_bias_dps, 0.0, 1_000.0)?;
+    within("imu.force_noise_mps2", imu.force_noise_mps2, 1e-3, 100.0)?;
+    within("imu.force_bias_mps2", imu.force_bias_mps2, 0.0, 100.0)
+}
+
+fn check_attitude(attitude: &AttitudeConfig) -> Result<(), ConfigError> {
+    within("attitude.latency_ms", attitude.latency_ms, -200.0, 2_000.0)?;
+    within("attitude.heading_bias_sigma_deg", attitude.heading_bias_sigma_deg, 0.0, 180.0)?;
+    within("attitude.heading_noise_deg", attitude.heading_noise_deg, 1e-3, 90.0)?;
+    within("attitude.tilt_noise_deg", attitude.tilt_noise_deg, 1e-3, 90.0)
 }
 
 fn check_ground(ground: &GroundConfig) -> Result<(), ConfigError> {

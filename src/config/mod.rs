@@ -17,8 +17,8 @@ pub use store::{FramePolicy, StoreConfig};
 
 use serde::{Deserialize, Serialize};
 use windhover_base::settings::{
-    CameraConfig, CompassConfig, Datum, DetectorConfig, EstimatorConfig, GpsConfig, GroundConfig,
-    MonteCarloConfig, Rig, TargetConfig,
+    AttitudeConfig, CameraConfig, CompassConfig, Datum, DetectorConfig, EstimatorConfig, GpsConfig,
+    GroundConfig, ImuConfig, MonteCarloConfig, Rig, TargetConfig,
 };
 
 /// The whole configuration. Unknown keys are errors everywhere.
@@ -29,6 +29,12 @@ pub struct Config {
     pub gps: GpsConfig,
     /// The digital compass.
     pub compass: CompassConfig,
+    /// Gyros and accelerometers, where there are any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub imu: Option<ImuConfig>,
+    /// A second source of attitude, where there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub attitude: Option<AttitudeConfig>,
     /// The camera, its lens and its mount.
     pub camera: CameraConfig,
     /// The ground the vehicle drives on.
@@ -70,10 +76,12 @@ pub struct Config {
 impl Config {
     /// The configuration of a rig over known ground, with every other section at its default.
     pub fn of_rig(rig: Rig, ground: GroundConfig) -> Self {
-        let Rig { gps, compass, camera, target } = rig;
+        let Rig { gps, compass, imu, attitude, camera, target } = rig;
         Self {
             gps,
             compass,
+            imu,
+            attitude,
             camera,
             ground,
             datum: None,
@@ -102,6 +110,8 @@ impl Config {
         Rig {
             gps: self.gps.clone(),
             compass: self.compass.clone(),
+            imu: self.imu,
+            attitude: self.attitude,
             camera: self.camera.clone(),
             target: self.target.clone(),
         }

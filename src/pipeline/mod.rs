@@ -5,31 +5,43 @@
 //! looked at, so a replay of the same events gives the same outputs to the last bit.
 
 mod lines;
+mod misfit_words;
+mod misfits;
 mod monitor;
+mod seen;
 mod settings;
 mod site;
 mod ticks;
 
 pub use settings::PipelineSettings;
-pub use ticks::next_tick;
 
 use std::sync::Arc;
 
+use nalgebra::Vector2;
+
 use crate::pixels::{self, DecodedFrame, FrameFault};
 use lines::SourceLines;
+use misfit_words::felt_words;
 use monitor::{Monitor, notice};
+use seen::SeenMarkers;
 use site::SiteFinder;
-use ticks::Ticks;
+use ticks::{Due, Schedule};
 use windhover_base::geo::{Geodetic, Tile};
 use windhover_base::msg::{
     AttitudeSample, Delivery, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload,
-    FramePrediction, GnssEpoch, MarkerDetection, MarkerId, NoticeKind, Output, SensorReading, Source,
-    Stamped, TargetEstimate, TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
+    FramePrediction, GnssEpoch, NoticeKind, Output, SensorReading, Source, Stamped, TargetEstimate,
+    TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
 };
 use windhover_base::settings::{MarkerKind, TargetConfig};
 use windhover_base::time::{MonoTime, Span};
 use windhover_detect::tracking::FrameDetector;
 use windhover_estimate::{Estimator, PaperEstimator};
+
+/// What is seen so near to a lost part of a frame is not used: the neighbourhood a feature is known by.
+const LOST_MARGIN_PX: f64 = 12.0;
+
+/// Most readings held until the datum is settled: some seconds of both lines.
+const HELD_MAX: usize = 512;
 
 /// Events in, outputs out.
 pub struct Pipeline {
@@ -41,10 +53,13 @@ pub struct Pipeline {
     prediction: FramePrediction,
     finder: SiteFinder,
     estimators: Option<Estimators>,
+    /// What was measured since the first of the fixes that agree: the filter begins with it.
+    held: Vec<SensorReading>,
     /// An earlier run's filter, until there is one to continue it.
     warm: Option<WarmFilter>,
     monitor: Monitor,
-    ticks: Ticks,
+    seen: SeenMarkers,
+    schedule: Schedule,
     /// Time of the last event or tick.
     now: MonoTime,
     last_exposure: Option<MonoTime>,
@@ -73,7 +88,6 @@ impl Pipeline {
         let mut lines = SourceLines::new(rig);
         let there = |source: &Source| source.delivers() == Delivery::Frames || lines.of(*source).is_some();
         let watched = Source::ALL.iter().copied().filter(there).collect();
-        let names = rig.target.iter().map(|target| target.name.clone()).collect();
         Self {
             want_rgb: wants_rgb(&rig.target),
             lines,
@@ -82,9 +96,11 @@ impl Pipeline {
             prediction: FramePrediction::default(),
             finder: SiteFinder::new(&settings, terrain),
             estimators: None,
+            held: Vec::new(),
             warm: None,
-            monitor: Monitor::new(watched, names),
-            ticks: Ticks::default(),
+            monitor: Monitor::new(watched, rig),
+            seen: SeenMarkers::new(rig),
+            schedule: Schedule::new(settings.filter.ownship_hz),
             now: MonoTime::default(),
             last_exposure: None,
             outputs: Vec::new(),
@@ -113,7 +129,12 @@ impl Pipeline {
     /// The latest tick that is due at `now`; `None` where it was made already. Where nothing arrives, an
     /// [`EventBody::Tick`] of this time lets time pass.
     pub fn tick_due(&mut self, now: MonoTime) -> Option<MonoTime> {
-        self.ticks.due(now)
+        self.schedule.due(now)
+    }
+
+    /// The first tick after `now`: so long whoever feeds the pipeline may wait for an event.
+    pub fn next_tick(&self, now: MonoTime) -> MonoTime {
+        self.schedule.next(now)
     }
 
     /// As [`Self::handle`], with the event's frame already decoded elsewhere.
@@ -124,8 +145,11 @@ impl Pipeline {
         out: &mut Vec<TimedOutput>,
     ) {
         let mut outputs = std::mem::take(&mut self.outputs);
-        for t in self.ticks.until(event.t_recv) {
-            self.tick(t, event.seq, &mut outputs);
+        for (t, due) in self.schedule.until(event.t_recv) {
+            match due {
+                Due::TimeOuts => self.time_outs(t, event.seq, &mut outputs),
+                Due::Ownship => self.ownship(t, &mut outputs),
+            }
             self.pass_on(t, &mut outputs, out);
         }
         if !matches!(event.body, EventBody::Tick) {
@@ -141,7 +165,7 @@ impl Pipeline {
         out.extend(outputs.drain(..).map(|output| TimedOutput { t_cause: t, output }));
     }
 
-    fn tick(&mut self, t: MonoTime, seq: u64, out: &mut Vec<Output>) {
+    fn time_outs(&mut self, t: MonoTime, seq: u64, out: &mut Vec<Output>) {
         self.monitor.advance(t, out);
         for &source in Source::ALL {
             if let Some(line) = self.lines.of(source) {
@@ -153,6 +177,12 @@ impl Pipeline {
             estimators.joint.tick(t, &mut self.estimated);
         }
         self.take_estimated(t, out);
+    }
+
+    /// The helicopter's own state, whether there are frames or not.
+    fn ownship(&mut self, t: MonoTime, out: &mut Vec<Output>) {
+        let told = self.estimators.as_mut().and_then(|estimators| estimators.joint.ownship(t));
+        out.extend(told.map(|own| Output::Estimator(EstimatorOutput::Ownship(own))));
     }
 
     fn event(
@@ -230,9 +260,12 @@ impl Pipeline {
 
     fn gnss(&mut self, epoch: &Stamped<GnssEpoch>, t: MonoTime, out: &mut Vec<Output>) {
         self.monitor.fix(t, epoch.value.fix, epoch.value.sats, self.lines.gps.clock_sigma(), out);
+        self.monitor.pulses(t, self.lines.gps.pulse_trouble(), out);
         out.push(Output::Reading(SensorReading::Gnss(*epoch)));
+        let agreed = self.finder.agreeing();
+        self.settle(&epoch.value, t, out);
         if self.estimators.is_none() {
-            self.settle(&epoch.value, t, out);
+            self.hold_fix(epoch, agreed);
         }
         if let Some(estimators) = &mut self.estimators {
             estimators.joint.gnss(epoch, &mut self.estimated);
@@ -245,11 +278,36 @@ impl Pipeline {
         if let Some(estimators) = &mut self.estimators {
             estimators.joint.attitude(sample, &mut self.estimated);
             estimators.paper.attitude(sample, &mut self.papered);
+        } else if !self.held.is_empty() && self.held.len() < HELD_MAX {
+            self.held.push(SensorReading::Attitude(*sample));
+        }
+    }
+
+    /// Holds a fix that agrees with `agreed` before it; one that does not begins anew.
+    fn hold_fix(&mut self, epoch: &Stamped<GnssEpoch>, agreed: usize) {
+        let agreeing = self.finder.agreeing();
+        if agreeing == 1 {
+            self.held.clear();
+        }
+        if (agreeing == 1 || agreeing > agreed) && self.held.len() < HELD_MAX {
+            self.held.push(SensorReading::Gnss(*epoch));
         }
     }
 
     fn settle(&mut self, epoch: &GnssEpoch, t: MonoTime, out: &mut Vec<Output>) {
-        let Some(settled) = self.finder.offer(epoch) else { return };
+        let settled = match &self.estimators {
+            None => self.finder.offer(epoch),
+            Some(estimators) => {
+                let [lat_deg, lon_deg, height_m] = estimators.site.datum;
+                let datum = Geodetic { lat_deg, lon_deg, height_m };
+                self.finder.offer_again(epoch, datum, self.monitor.has_tracked())
+            }
+        };
+        if let Some(why) = self.finder.unused_word() {
+            let words = format!("the receiver's positions are not used: {why}");
+            out.push(notice(t, NoticeKind::PositionsUnused, Some(Source::Gps), words));
+        }
+        let Some(settled) = settled else { return };
         if let Some(words) = settled.declination_notice {
             out.push(notice(t, NoticeKind::Declination, Some(Source::Compass), words));
         }
@@ -268,7 +326,19 @@ impl Pipeline {
         if let Some(warm) = self.warm.take().filter(|_| settled.continued) {
             joint.resume(warm);
         }
-        let paper = PaperEstimator::new(rig, filter, &settled.site);
+        let mut paper = PaperEstimator::new(rig, filter, &settled.site);
+        for reading in self.held.drain(..) {
+            match reading {
+                SensorReading::Gnss(epoch) => {
+                    joint.gnss(&epoch, &mut self.estimated);
+                    paper.gnss(&epoch, &mut self.papered);
+                }
+                SensorReading::Attitude(sample) => {
+                    joint.attitude(&sample, &mut self.estimated);
+                    paper.attitude(&sample, &mut self.papered);
+                }
+            }
+        }
         self.estimators = Some(Estimators { joint, paper, site: settled.warm });
     }
 
@@ -299,7 +369,14 @@ impl Pipeline {
                 });
                 let rgb = decoded.rgb.as_ref();
                 self.detector.process(decoded.gray.view(), rgb, prediction, &mut self.observations);
-                self.note_seen();
+                if !decoded.missing.is_empty() {
+                    self.keep_whole(&decoded);
+                    let lost = decoded.missing.len();
+                    let words =
+                        format!("frame {}: {lost} parts of it are lost, the rest is used", payload.index);
+                    out.push(notice(t, NoticeKind::FrameDamaged, Some(Source::Camera), words));
+                }
+                self.note_seen(t, out);
                 out.push(Output::Detections {
                     frame: payload.index,
                     t_valid,
@@ -315,17 +392,30 @@ impl Pipeline {
         self.estimate(t_valid, event, out);
     }
 
-    fn note_seen(&mut self) {
-        for (index, target) in self.settings.rig.target.iter().enumerate() {
-            let of_target = |seen: &MarkerDetection| match seen.marker {
-                MarkerId::Disc { target, .. } => target == index,
-                MarkerId::Tag { family, id } => {
-                    target.marker.iter().any(|m| m.family == Some(family) && m.id == Some(id))
-                }
-            };
-            if self.observations.markers.iter().any(of_target) {
-                self.monitor.seen(index);
+    /// Leaves out what was seen where parts of the frame are lost.
+    fn keep_whole(&mut self, frame: &DecodedFrame) {
+        self.observations
+            .features
+            .retain(|f| frame.is_whole((f.px.x, f.px.y), (f.px.x, f.px.y), LOST_MARGIN_PX));
+        self.observations.markers.retain(|marker| {
+            let radius = 0.5 * marker.size_px;
+            let center = marker.center_px;
+            let around = [(-radius, -radius), (radius, radius)].map(|(u, v)| center + Vector2::new(u, v));
+            let corners = marker.corners_px.unwrap_or([around[0], around[0], around[1], around[1]]);
+            let from = corners.iter().fold(center, |low, c| low.inf(c));
+            let to = corners.iter().fold(center, |high, c| high.sup(c));
+            frame.is_whole((from.x, from.y), (to.x, to.y), LOST_MARGIN_PX)
+        });
+    }
+
+    fn note_seen(&mut self, t: MonoTime, out: &mut Vec<Output>) {
+        for target in 0..self.settings.rig.target.len() {
+            if self.observations.markers.iter().any(|seen| self.seen.target_of(seen) == Some(target)) {
+                self.monitor.seen(target);
             }
+        }
+        for words in self.seen.twice(&self.observations, t) {
+            out.push(notice(t, NoticeKind::MarkerSeenTwice, Some(Source::Camera), words));
         }
     }
 
@@ -364,6 +454,12 @@ impl Pipeline {
                 EstimatorOutput::Reset { reason } => {
                     out.push(notice(t, NoticeKind::FilterReset, None, (*reason).to_owned()));
                 }
+                EstimatorOutput::TiltFelt { felt, slope } => {
+                    let detail =
+                        format!("the compass's tilt sensor {} (slope {slope:.2})", felt_words(*felt));
+                    out.push(notice(t, NoticeKind::TiltFelt, Some(Source::Compass), detail));
+                }
+                EstimatorOutput::Misfit(misfit) => self.monitor.misfit(misfit, t, out),
                 EstimatorOutput::Smoothed(_) | EstimatorOutput::Ownship(_) => {}
             }
             out.push(Output::Estimator(estimated));

@@ -3,10 +3,13 @@
 use std::collections::BTreeMap;
 
 use windhover_base::msg::{
-    Disposition, FixKind, Health, Notice, NoticeKind, Output, PerSource, Source, SourceHealth,
+    Disposition, FixKind, Health, Misfit, Notice, NoticeKind, Output, PerSource, Source, SourceHealth,
     TargetEstimate, TargetHealth, TrackStatus,
 };
-use windhover_base::time::{MonoTime, Span};
+use windhover_base::settings::Rig;
+use windhover_base::time::{MonoTime, PulseTrouble, Span};
+
+use super::misfits::Misfits;
 
 /// Health is told this often.
 const HEALTH_PERIOD: Span = Span::from_ns(1_000_000_000);
@@ -26,6 +29,7 @@ struct SourceCount {
 /// Watches what flows and says what an operator should know.
 pub(super) struct Monitor {
     names: Vec<String>,
+    misfits: Misfits,
     watched: Vec<Source>,
     sources: PerSource<SourceCount>,
     fix: FixKind,
@@ -35,11 +39,14 @@ pub(super) struct Monitor {
     dispositions: BTreeMap<Disposition, u64>,
     began: Option<MonoTime>,
     next_health: Option<MonoTime>,
+    tracked: bool,
+    pulses_unused: Option<PulseTrouble>,
 }
 
 impl Monitor {
-    /// Watches these sources and targets of these names.
-    pub(super) fn new(watched: Vec<Source>, names: Vec<String>) -> Self {
+    /// Watches these sources, and the targets of the rig.
+    pub(super) fn new(watched: Vec<Source>, rig: &Rig) -> Self {
+        let names: Vec<String> = rig.target.iter().map(|target| target.name.clone()).collect();
         let lost = |target| TargetEstimate {
             t_valid: MonoTime::default(),
             frame: 0,
@@ -55,10 +62,18 @@ impl Monitor {
             clock_sigma: None,
             targets: (0..names.len()).map(|i| TargetHealth { frames_seen: 0, last: lost(i) }).collect(),
             names,
+            misfits: Misfits::new(rig),
             dispositions: BTreeMap::new(),
             began: None,
             next_health: None,
+            tracked: false,
+            pulses_unused: None,
         }
+    }
+
+    /// Whether any target was tracked so far.
+    pub(super) fn has_tracked(&self) -> bool {
+        self.tracked
     }
 
     /// Time has come to `t`: health that is due, silences that have lasted long enough. Both fall on
@@ -113,6 +128,7 @@ impl Monitor {
             clock_sigma: self.clock_sigma,
             targets: self.targets.clone(),
             dispositions: self.dispositions.clone(),
+            misfits: self.misfits.now(t),
         };
         self.targets.iter_mut().for_each(|target| target.frames_seen = 0);
         health
@@ -171,18 +187,25 @@ impl Monitor {
         clock_sigma: Option<Span>,
         out: &mut Vec<Output>,
     ) {
-        let had = self.fix != FixKind::None;
-        let has = fix != FixKind::None;
+        let had = self.fix.has_position();
+        let has = fix.has_position();
         if has && !had {
             let satellites = sats.map_or(String::new(), |n| format!(", {n} satellites"));
-            let kind = if fix == FixKind::ThreeD { "3d" } else { "2d" };
-            let detail = format!("the receiver has a {kind} fix{satellites}");
+            let detail = format!("the receiver has a {} fix{satellites}", fix.name());
             out.push(notice(t, NoticeKind::FixAcquired, Some(Source::Gps), detail));
         } else if had && !has {
             let detail = "the receiver has no fix".to_owned();
             out.push(notice(t, NoticeKind::FixLost, Some(Source::Gps), detail));
         }
         (self.fix, self.sats, self.clock_sigma) = (fix, sats, clock_sigma);
+    }
+
+    /// Why the receiver's pulses are not used, if they are not.
+    pub(super) fn pulses(&mut self, t: MonoTime, trouble: Option<PulseTrouble>, out: &mut Vec<Output>) {
+        if let Some(trouble) = trouble.filter(|trouble| self.pulses_unused != Some(*trouble)) {
+            out.push(notice(t, NoticeKind::PulseUnused, Some(Source::Gps), trouble.words().to_owned()));
+        }
+        self.pulses_unused = trouble;
     }
 
     /// A frame in which a marker of the target was seen.
@@ -197,6 +220,7 @@ impl Monitor {
         let Some(target) = self.targets.get_mut(estimate.target) else { return };
         let before = target.last.status;
         target.last = *estimate;
+        self.tracked |= estimate.status == TrackStatus::Tracking;
         let name = &self.names[estimate.target];
         let (kind, detail) = match (before, estimate.status) {
             (TrackStatus::Lost | TrackStatus::Acquiring, TrackStatus::Tracking) => {
@@ -214,7 +238,15 @@ impl Monitor {
             _ => return,
         };
         let target = Some(name.clone());
-        out.push(Output::Notice(Notice { t, kind, source: None, target, detail }));
+        out.push(Output::Notice(Notice { t, kind, source: None, target, detail, misfit: None }));
+    }
+
+    /// Something does not fit.
+    pub(super) fn misfit(&mut self, misfit: &Misfit, t: MonoTime, out: &mut Vec<Output>) {
+        let Some(words) = self.misfits.take(misfit, t) else { return };
+        let (kind, detail) = (NoticeKind::ModelMisfit, words.to_string());
+        let misfit = Some(words);
+        out.push(Output::Notice(Notice { t, kind, source: None, target: None, detail, misfit }));
     }
 
     /// What became of a measurement.
@@ -225,17 +257,19 @@ impl Monitor {
 
 /// A notice as an output.
 pub(super) fn notice(t: MonoTime, kind: NoticeKind, source: Option<Source>, detail: String) -> Output {
-    Output::Notice(Notice { t, kind, source, target: None, detail })
+    Output::Notice(Notice { t, kind, source, target: None, detail, misfit: None })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Config;
 
     #[test]
     fn only_the_sources_there_are_can_be_silent() {
         // Given a pipeline that has a receiver and a camera.
-        let mut monitor = Monitor::new(vec![Source::Gps, Source::Camera], vec!["ugv".into()]);
+        let config = Config::parse(include_str!("../../config/windhover.toml")).expect("valid");
+        let mut monitor = Monitor::new(vec![Source::Gps, Source::Camera], &config.rig());
         let mut out = Vec::new();
         let at = |s: f64| MonoTime::from_ns(0) + Span::from_s(s);
         monitor.advance(at(0.0), &mut out);

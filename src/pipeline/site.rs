@@ -1,13 +1,26 @@
-//! Where the flight is: the NED origin, the ground, the declination, settled by the first fixes.
+//! Where the flight is: the NED origin, the ground, the declination, settled by the first fixes that agree.
 
 use std::sync::Arc;
 
 use super::settings::PipelineSettings;
 use windhover_base::geo::{self, Geodetic, Ground, LocalFrame, Terrain, Tile};
-use windhover_base::msg::{FixKind, GnssEpoch, WarmSite};
+use windhover_base::msg::{GnssEpoch, WarmSite};
 use windhover_base::settings::{Datum, Declination, GroundConfig, GroundSource};
 use windhover_estimate::Site;
 
+/// Fixes in a row that agree before one of them is the datum.
+const AGREE_FIRST: usize = 3;
+/// The same before a datum moves that others agreed on.
+const AGREE_MOVE: usize = 5;
+/// How far fixes that agree lie from the first of them, horizontally and vertically, metres: a fast helicopter
+/// on a slow receiver.
+const AGREE_M: (f64, f64) = (500.0, 200.0);
+/// Farther from the datum than this the flight is elsewhere, metres.
+const ELSEWHERE_M: f64 = 50_000.0;
+/// No receiver stands nearer to latitude 0, longitude 0 than this, degrees; what says so has no position.
+const NULL_ISLAND_DEG: f64 = 0.001;
+/// Fixes in a row that are of no use before a word is due, and between words.
+const UNUSED_WORD: (usize, usize) = (25, 250);
 /// Fixes whose median height is the ground where the ground is where the aircraft took off.
 const TAKEOFF_FIXES: usize = 5;
 /// Fixes to wait for a date before the World Magnetic Model is given up.
@@ -15,15 +28,47 @@ const DATE_PATIENCE: usize = 50;
 
 /// Collects first fixes until the site is settled.
 pub(super) struct SiteFinder {
+    /// The first of the fixes in a row that agree, and how many there are.
     first: Option<Geodetic>,
+    agreeing: usize,
     heights_m: Vec<f64>,
     seen: usize,
+    unused: Unused,
     ground: GroundConfig,
     datum: Option<Datum>,
     declination_deg: Option<f64>,
     declination: Option<Declination>,
     terrain: Option<Arc<Tile>>,
     warm: Option<WarmSite>,
+}
+
+/// Fixes in a row that were of no use, and why the last was.
+#[derive(Default)]
+struct Unused {
+    count: usize,
+    told: usize,
+    why: Option<&'static str>,
+}
+
+impl Unused {
+    /// One more, for this reason.
+    fn note(&mut self, why: &'static str) {
+        if self.why != Some(why) {
+            *self = Self { why: Some(why), ..Self::default() };
+        }
+        self.count += 1;
+    }
+
+    /// The word that is due now, once.
+    fn word(&mut self) -> Option<&'static str> {
+        let (first, then) = UNUSED_WORD;
+        let due = self.count != self.told
+            && self.count.checked_sub(first).is_some_and(|more| more.is_multiple_of(then));
+        if due {
+            self.told = self.count;
+        }
+        self.why.filter(|_| due)
+    }
 }
 
 /// A settled site, and what an operator should know of its declination.
@@ -42,8 +87,10 @@ impl SiteFinder {
         let compass = &settings.rig.compass;
         Self {
             first: None,
+            agreeing: 0,
             heights_m: Vec::with_capacity(TAKEOFF_FIXES),
             seen: 0,
+            unused: Unused::default(),
             ground: settings.ground.clone(),
             datum: settings.datum,
             declination_deg: compass.declination_deg,
@@ -60,11 +107,78 @@ impl SiteFinder {
 
     /// Takes a fix; the site when it is settled.
     pub(super) fn offer(&mut self, epoch: &GnssEpoch) -> Option<SettledSite> {
-        let at = position(epoch)?;
-        let first = *self.first.get_or_insert(at);
+        let at = match position(epoch)? {
+            Ok(at) => at,
+            Err(why) => {
+                self.unused.note(why);
+                return None;
+            }
+        };
+        let first = self.first_agreeing(at);
         if let Some(warm) = self.warm.take().filter(|warm| self.agrees(warm, &at)) {
             return Some(SettledSite { continued: true, ..self.settled(warm, None) });
         }
+        self.settle(epoch, at, first, AGREE_FIRST)
+    }
+
+    /// Takes a fix of a settled flight; a new site where several fixes agree that the flight is elsewhere. The
+    /// datum moves only where it is not configured, and as long as nothing was tracked.
+    pub(super) fn offer_again(
+        &mut self,
+        epoch: &GnssEpoch,
+        datum: Geodetic,
+        tracked: bool,
+    ) -> Option<SettledSite> {
+        let at = position(epoch)?.ok()?;
+        if distance_m(datum, at).0 < ELSEWHERE_M {
+            self.first = None;
+            self.unused = Unused::default();
+            return None;
+        }
+        let first = self.first_agreeing(at);
+        if tracked || self.datum.is_some() {
+            self.unused.note(if tracked { FAR_TRACKED } else { FAR_CONFIGURED });
+            return None;
+        }
+        self.settle(epoch, at, first, AGREE_MOVE)
+    }
+
+    /// How many fixes in a row agree so far.
+    pub(super) fn agreeing(&self) -> usize {
+        self.agreeing
+    }
+
+    /// Why fixes in a row were of no use, when that is worth a word.
+    pub(super) fn unused_word(&mut self) -> Option<&'static str> {
+        self.unused.word()
+    }
+
+    /// The first of the fixes in a row that agree with this one.
+    fn first_agreeing(&mut self, at: Geodetic) -> Geodetic {
+        let agrees = |first: Geodetic| {
+            let (across, up) = distance_m(first, at);
+            across <= AGREE_M.0 && up <= AGREE_M.1
+        };
+        if let Some(first) = self.first.filter(|first| agrees(*first)) {
+            self.agreeing += 1;
+            return first;
+        }
+        if self.first.is_some() {
+            self.unused.note(SCATTERED);
+        }
+        self.first = Some(at);
+        self.agreeing = 1;
+        self.heights_m.clear();
+        at
+    }
+
+    fn settle(
+        &mut self,
+        epoch: &GnssEpoch,
+        at: Geodetic,
+        first: Geodetic,
+        agree: usize,
+    ) -> Option<SettledSite> {
         self.seen += 1;
         let geoid_m = epoch.geoid_m.unwrap_or(0.0);
         let elevation_msl_m = self
@@ -83,6 +197,10 @@ impl SiteFinder {
             (None, None) => first.height_m,
         };
         let (declination_rad, declination_notice) = self.declination(epoch, at)?;
+        if self.agreeing < agree {
+            return None;
+        }
+        self.unused = Unused::default();
         let datum = self
             .datum
             .map_or([first.lat_deg, first.lon_deg, ground_height_m], |d| [d.lat_deg, d.lon_deg, d.height_m]);
@@ -157,13 +275,35 @@ impl SiteFinder {
 /// Farthest from an earlier run's datum that a flight is still the same one, degrees (some 10 km).
 const SAME_FLIGHT_DEG: f64 = 0.1;
 
-/// A three-dimensional position above the ellipsoid.
-fn position(epoch: &GnssEpoch) -> Option<Geodetic> {
-    if epoch.fix != FixKind::ThreeD {
-        return None;
-    }
-    let height_m = epoch.alt_msl_m? + epoch.geoid_m.unwrap_or(0.0);
-    Some(Geodetic { lat_deg: epoch.lat_deg?, lon_deg: epoch.lon_deg?, height_m })
+/// What is said of positions that are not used.
+const NO_HEIGHT: &str = "its fixes are two-dimensional by its own word (GSA or PGRMF): without a height there is no \
+                         datum, and nothing is estimated until a fix has one";
+const NO_ALTITUDE: &str = "its sentences tell no altitude (is GGA or GNS on?): without a height there is no datum, and \
+                           nothing is estimated";
+const NULL_ISLAND: &str = "it says latitude 0, longitude 0, which is no position";
+const SCATTERED: &str = "its fixes lie too far apart to tell where the flight is";
+const FAR_TRACKED: &str = "its positions are more than 50 km from the datum, which stays because a target was tracked \
+                           from it: restart to fly here";
+const FAR_CONFIGURED: &str = "its positions are more than 50 km from the datum of the configuration";
+
+/// A three-dimensional position above the ellipsoid, or why what is said is none; `None` without a fix.
+fn position(epoch: &GnssEpoch) -> Option<Result<Geodetic, &'static str>> {
+    let (lat_deg, lon_deg) = epoch.lat_deg.zip(epoch.lon_deg).filter(|_| epoch.fix.has_position())?;
+    Some(match epoch.alt_msl_m {
+        _ if lat_deg.abs().max(lon_deg.abs()) < NULL_ISLAND_DEG => Err(NULL_ISLAND),
+        None => Err(NO_ALTITUDE),
+        Some(_) if !epoch.fix.has_height() => Err(NO_HEIGHT),
+        Some(alt_msl_m) => {
+            Ok(Geodetic { lat_deg, lon_deg, height_m: alt_msl_m + epoch.geoid_m.unwrap_or(0.0) })
+        }
+    })
+}
+
+/// Distance between two places, across and up, metres.
+fn distance_m(from: Geodetic, to: Geodetic) -> (f64, f64) {
+    let ned = LocalFrame::new(from).ned(Geodetic { height_m: from.height_m, ..to });
+    // Beyond some kilometres the second leaves the plane of the first.
+    (ned.norm(), (to.height_m - from.height_m).abs())
 }
 
 fn median(values: &mut [f64]) -> f64 {
@@ -175,30 +315,112 @@ fn median(values: &mut [f64]) -> f64 {
 mod tests {
     use super::*;
     use crate::config::Config;
+    use windhover_base::msg::FixKind;
+
+    fn finder(change: impl FnOnce(&mut Config)) -> SiteFinder {
+        let text = include_str!("../../config/windhover.toml");
+        let mut config = Config::parse(text).expect("the shipped configuration");
+        config.datum = None;
+        config.ground = GroundConfig { elevation_msl_m: Some(33.0), ..config.ground };
+        change(&mut config);
+        SiteFinder::new(&(&config).into(), None)
+    }
+
+    fn fix(lat_deg: f64, lon_deg: f64) -> GnssEpoch {
+        GnssEpoch {
+            fix: FixKind::ThreeD,
+            lat_deg: Some(lat_deg),
+            lon_deg: Some(lon_deg),
+            alt_msl_m: Some(43.0),
+            geoid_m: Some(-27.0),
+            ..GnssEpoch::default()
+        }
+    }
+
+    /// The datum that these fixes settle on, and after how many.
+    fn datum_of(finder: &mut SiteFinder, fixes: &[GnssEpoch]) -> Option<(usize, f64, f64)> {
+        fixes.iter().enumerate().find_map(|(index, epoch)| {
+            let datum = finder.offer(epoch)?.site.frame.datum();
+            Some((index + 1, datum.lat_deg, datum.lon_deg))
+        })
+    }
 
     #[test]
     fn level_ground_lies_under_the_first_fix_however_far_the_datum_is() {
         // Given a datum 10 km away, where the tangent plane stands 8 m above the ground.
-        let text = include_str!("../../config/windhover.toml");
-        let mut config = Config::parse(text).expect("the shipped configuration");
-        config.datum =
-            Some(windhover_base::settings::Datum { lat_deg: 30.0, lon_deg: -85.5, height_m: 20.0 });
-        config.ground =
-            windhover_base::settings::GroundConfig { elevation_msl_m: Some(33.0), ..config.ground };
-        let epoch = GnssEpoch {
-            fix: FixKind::ThreeD,
-            lat_deg: Some(30.07),
-            lon_deg: Some(-85.57),
-            alt_msl_m: Some(43.0),
-            geoid_m: Some(-27.0),
-            ..GnssEpoch::default()
-        };
-        // When the site is settled by the first fix.
-        let settled = SiteFinder::new(&(&config).into(), None).offer(&epoch).expect("a declination is given");
+        let mut finder = finder(|config| {
+            config.datum = Some(Datum { lat_deg: 30.0, lon_deg: -85.5, height_m: 20.0 });
+        });
+        // When the site is settled by the first fixes.
+        let settled = (0..AGREE_FIRST).find_map(|_| finder.offer(&fix(30.07, -85.57)));
+        let settled = settled.expect("a declination is given");
         // Then the ground under it is at its elevation.
         let (frame, at) = (settled.site.frame, Geodetic { lat_deg: 30.07, lon_deg: -85.57, height_m: 6.0 });
         let ned = frame.ned(at);
         assert!((settled.site.ground.down_m(ned.x, ned.y) - ned.z).abs() < 1e-6);
         assert!(ned.z > 20.0, "the plane of the datum would be {:.1} m off", ned.z - 14.0);
+    }
+
+    #[test]
+    fn the_datum_is_the_first_of_several_fixes_that_agree() {
+        let good = fix(38.7, -9.2);
+        for bad in [fix(0.0, 0.0), fix(1e-5, -2e-4), fix(-33.0, 151.0), fix(38.7, 9.2)] {
+            for wild in 1..AGREE_FIRST {
+                let fixes = [vec![bad; wild], vec![good; 10]].concat();
+                let (after, lat_deg, lon_deg) = datum_of(&mut finder(|_| {}), &fixes).expect("a datum");
+                assert_eq!((after, lat_deg, lon_deg), (wild + AGREE_FIRST, 38.7, -9.2));
+            }
+        }
+        let island = vec![fix(0.0, 0.0); 100];
+        let mut lost = finder(|_| {});
+        assert_eq!(datum_of(&mut lost, &island), None);
+        // On the equator and on the meridian there are places.
+        assert!(datum_of(&mut finder(|_| {}), &[fix(0.0, -9.2); 5]).is_some());
+        assert!(datum_of(&mut finder(|_| {}), &[fix(51.5, 0.0); 5]).is_some());
+    }
+
+    #[test]
+    fn the_datum_moves_while_nothing_is_tracked() {
+        let (wrong, right) = (fix(-33.0, 151.0), fix(38.7, -9.2));
+        let again = |finder: &mut SiteFinder, tracked| {
+            let datum = datum_of(finder, &[wrong; 3]).map(|(_, lat_deg, lon_deg)| (lat_deg, lon_deg));
+            let (lat_deg, lon_deg) = datum.expect("three fixes agree");
+            let datum = Geodetic { lat_deg, lon_deg, height_m: 6.0 };
+            let settled = (1..=30).find_map(|n| Some((n, finder.offer_again(&right, datum, tracked)?)));
+            settled.map(|(n, settled)| (n, settled.site.frame.datum().lat_deg))
+        };
+        assert_eq!(again(&mut finder(|_| {}), false), Some((AGREE_MOVE, 38.7)));
+        let mut tracking = finder(|_| {});
+        assert_eq!(again(&mut tracking, true), None);
+        assert_eq!(tracking.unused.why, Some(FAR_TRACKED));
+        let configured = Datum { lat_deg: -33.0, lon_deg: 151.0, height_m: 20.0 };
+        let mut fixed = finder(|config| config.datum = Some(configured));
+        assert_eq!(again(&mut fixed, false), None);
+        assert_eq!(fixed.unused.why, Some(FAR_CONFIGURED));
+        // One fix elsewhere moves nothing, and neither do several that do not agree.
+        let mut finder = finder(|_| {});
+        datum_of(&mut finder, &[right; 3]).expect("a datum");
+        let datum = Geodetic { lat_deg: 38.7, lon_deg: -9.2, height_m: 6.0 };
+        for n in 0..40 {
+            let there = if n % 5 == 4 { right } else { wrong };
+            assert!(finder.offer_again(&there, datum, false).is_none());
+        }
+    }
+
+    #[test]
+    fn why_there_is_no_datum_is_told() {
+        for (epoch, why) in [
+            (GnssEpoch { fix: FixKind::TwoD, ..fix(38.7, -9.2) }, NO_HEIGHT),
+            (GnssEpoch { fix: FixKind::TwoD, alt_msl_m: None, ..fix(38.7, -9.2) }, NO_ALTITUDE),
+            (fix(0.0, 0.0), NULL_ISLAND),
+        ] {
+            let mut finder = finder(|_| {});
+            let offer = |_| {
+                assert!(finder.offer(&epoch).is_none());
+                finder.unused_word()
+            };
+            let words: Vec<_> = (0..300).filter_map(offer).collect();
+            assert_eq!(words, [why, why], "after 25 fixes, and 250 later");
+        }
     }
 }

@@ -1,54 +1,108 @@
-//! When time passes: the instants at which the pipeline looks at time-outs, live and in replay alike.
+//! When time passes: the instants at which the pipeline does something by itself, live and in replay alike.
 
 use windhover_base::time::{MonoTime, Span};
 
-/// Time between two ticks.
-const TICK: Span = Span::from_ns(100_000_000);
+/// Time between two looks at time-outs.
+const TIME_OUTS: Span = Span::from_ns(100_000_000);
 
-/// Ticks at whole multiples of [`TICK`] of host time, between one event and the next. They follow from
+/// In a gap between two events, all that time alone brings about has come about after so long: the filter gives up
+/// after a minute.
+const EVENTFUL: Span = Span::from_ns(120_000_000_000);
+
+/// What is due at an instant; at the same one in this order.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
+pub(super) enum Due {
+    /// Time-outs are looked at.
+    TimeOuts,
+    /// The helicopter's own state is told.
+    Ownship,
+}
+
+/// Instants at whole multiples of a period of host time, between one event and the next. They follow from
 /// the events' times alone, so a replay has the same ones at the same places.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Ticks {
+#[derive(Clone, Copy, Debug)]
+struct Ticks {
+    period: Span,
     last: Option<MonoTime>,
 }
 
 impl Ticks {
-    /// Instants after the last call's `t` and not after this one's, in order. A gap of more than ten
-    /// seconds gets its last hundred ticks only.
-    pub(super) fn until(&mut self, t: MonoTime) -> impl Iterator<Item = MonoTime> + use<> {
-        const MOST: i64 = 100;
-        let from = self.last.map_or_else(|| grid(t), grid);
-        let to = grid(t).max(from);
+    fn every(period: Span) -> Self {
+        Self { period, last: None }
+    }
+
+    /// Instants after the last call's `t` and not after this one's, in order. A longer gap gets those of its first
+    /// [`EVENTFUL`] only.
+    fn until(&mut self, t: MonoTime) -> impl Iterator<Item = MonoTime> + use<> {
+        let (most, period) = (EVENTFUL.ns() / self.period.ns(), self.period);
+        let from = self.last.map_or_else(|| self.grid(t), |last| self.grid(last));
+        let to = self.grid(t).max(from);
         self.last = Some(self.last.map_or(t, |last| last.max(t)));
-        (from.max(to - MOST) + 1..=to).map(|n| MonoTime::from_ns(n * TICK.ns()))
+        (from + 1..=to.min(from + most)).map(move |n| MonoTime::from_ns(n * period.ns()))
     }
 
     /// The latest instant that is due at `now` and was not passed yet. The first call begins the count.
-    pub(super) fn due(&mut self, now: MonoTime) -> Option<MonoTime> {
-        let passed = grid(*self.last.get_or_insert(now));
-        (grid(now) > passed).then(|| MonoTime::from_ns(grid(now) * TICK.ns()))
+    fn due(&mut self, now: MonoTime) -> Option<MonoTime> {
+        let passed = *self.last.get_or_insert(now);
+        let due = self.grid(now);
+        (due > self.grid(passed)).then(|| MonoTime::from_ns(due * self.period.ns()))
+    }
+
+    /// The first instant after `now`.
+    fn next(&self, now: MonoTime) -> MonoTime {
+        MonoTime::from_ns((self.grid(now) + 1) * self.period.ns())
+    }
+
+    /// Periods from zero to `t`.
+    fn grid(&self, t: MonoTime) -> i64 {
+        t.ns().div_euclid(self.period.ns())
     }
 }
 
-/// The first tick after `now`: so long whoever feeds the pipeline may wait for an event.
-pub fn next_tick(now: MonoTime) -> MonoTime {
-    MonoTime::from_ns((grid(now) + 1) * TICK.ns())
+/// Everything that is due by itself.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Schedule {
+    time_outs: Ticks,
+    ownship: Ticks,
 }
 
-/// Ticks from zero to `t`.
-fn grid(t: MonoTime) -> i64 {
-    t.ns().div_euclid(TICK.ns())
+impl Schedule {
+    /// With the helicopter's own state so many times a second.
+    pub(super) fn new(ownship_hz: f64) -> Self {
+        Self { time_outs: Ticks::every(TIME_OUTS), ownship: Ticks::every(Span::from_s(1.0 / ownship_hz)) }
+    }
+
+    /// What came due after the last call's `t` and not after this one's, in order.
+    pub(super) fn until(&mut self, t: MonoTime) -> Vec<(MonoTime, Due)> {
+        let time_outs = self.time_outs.until(t).map(|t| (t, Due::TimeOuts));
+        let mut due: Vec<_> = time_outs.chain(self.ownship.until(t).map(|t| (t, Due::Ownship))).collect();
+        due.sort_unstable();
+        due
+    }
+
+    /// The latest instant at which something is due at `now` that did not pass yet. The first call begins the count.
+    pub(super) fn due(&mut self, now: MonoTime) -> Option<MonoTime> {
+        self.time_outs.due(now).max(self.ownship.due(now))
+    }
+
+    /// The first instant after `now` at which something is due.
+    pub(super) fn next(&self, now: MonoTime) -> MonoTime {
+        self.time_outs.next(now).min(self.ownship.next(now))
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn at(ms: i64) -> MonoTime {
+        MonoTime::from_ns(ms * 1_000_000)
+    }
+
     #[test]
     fn ticks_follow_from_the_times_of_events() {
-        let at = |ms: i64| MonoTime::from_ns(ms * 1_000_000);
         let run = |events: &[i64]| {
-            let mut ticks = Ticks::default();
+            let mut ticks = Ticks::every(TIME_OUTS);
             events.iter().flat_map(|&ms| ticks.until(at(ms))).map(|t| t.ns() / 1_000_000).collect::<Vec<_>>()
         };
         assert_eq!(run(&[1_250, 1_260, 1_400, 1_650]), [1_300, 1_400, 1_500, 1_600]);
@@ -56,19 +110,30 @@ mod tests {
         let often: Vec<i64> = (1_250..=1_650).step_by(7).chain([1_650]).collect();
         assert_eq!(run(&often), [1_300, 1_400, 1_500, 1_600]);
         assert_eq!(run(&[1_000, 900, 1_050]), Vec::<i64>::new());
-        assert_eq!(run(&[0, 3_600_000]).len(), 100);
+        assert_eq!(run(&[0, 3_600_000]).len(), 1_200);
     }
 
     #[test]
     fn a_tick_is_due_once() {
-        let at = |ms: i64| MonoTime::from_ns(ms * 1_000_000);
-        let mut ticks = Ticks::default();
+        let mut ticks = Ticks::every(TIME_OUTS);
         assert_eq!(ticks.due(at(1_250)), None, "time begins to count");
         assert_eq!(ticks.due(at(1_290)), None);
         let due = ticks.due(at(1_530)).expect("two are");
         assert_eq!(due, at(1_500));
         assert_eq!(ticks.until(due).collect::<Vec<_>>(), [at(1_300), at(1_400), at(1_500)]);
-        assert_eq!((ticks.due(at(1_590)), next_tick(at(1_590))), (None, at(1_600)));
+        assert_eq!((ticks.due(at(1_590)), ticks.next(at(1_590))), (None, at(1_600)));
         assert_eq!(ticks.due(at(1_600)), Some(at(1_600)));
+    }
+
+    #[test]
+    fn two_rhythms_are_one_row_of_instants() {
+        let mut schedule = Schedule::new(20.0);
+        assert_eq!(schedule.until(at(1_010)), []);
+        let (time_outs, ownship) = (Due::TimeOuts, Due::Ownship);
+        let want = [(1_050, ownship), (1_100, time_outs), (1_100, ownship), (1_150, ownship)];
+        assert_eq!(schedule.next(at(1_010)), at(1_050));
+        assert_eq!(schedule.due(at(1_160)), Some(at(1_150)));
+        assert_eq!(schedule.until(at(1_160)), want.map(|(ms, due)| (at(ms), due)));
+        assert_eq!((schedule.due(at(1_199)), schedule.next(at(1_160))), (None, at(1_200)));
     }
 }

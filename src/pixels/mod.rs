@@ -1,5 +1,12 @@
 //! Pixels out of the bytes of a frame, as cameras and captures give it.
 
+mod huffman;
+mod scan;
+#[cfg(test)]
+mod scan_tests;
+
+pub use scan::MissingPart;
+
 use std::io::Cursor;
 
 use zune_core::bytestream::ZCursor;
@@ -16,6 +23,21 @@ pub struct DecodedFrame {
     pub gray: GrayImage,
     /// Colours, where they were asked for and the format has them.
     pub rgb: Option<RgbImage>,
+    /// Parts that were lost on the way: grey stands there. The rest is as the camera took it.
+    pub missing: Vec<MissingPart>,
+}
+
+impl DecodedFrame {
+    /// Whether what lies between these columns and rows, `margin_px` wider, is the camera's.
+    pub fn is_whole(&self, from: (f64, f64), to: (f64, f64), margin_px: f64) -> bool {
+        !self.missing.iter().any(|part| {
+            let (part_from, part_to) = (part.from, part.to);
+            let apart = |low: f64, high: f64, part_low: usize, part_high: usize| {
+                high + margin_px < part_low as f64 || low - margin_px > part_high as f64 - 1.0
+            };
+            !apart(from.0, to.0, part_from.0, part_to.0) && !apart(from.1, to.1, part_from.1, part_to.1)
+        })
+    }
 }
 
 /// Why a frame cannot be used.
@@ -87,11 +109,27 @@ fn damaged(encoding: FrameEncoding, reason: impl std::fmt::Display) -> FrameFaul
     FrameFault::Damaged { encoding, reason: reason.to_string() }
 }
 
+/// Grey levels of a picture in a file, whatever its name says it is, and the parts of it that are lost.
+pub fn picture(bytes: &[u8]) -> Result<(GrayImage, Vec<MissingPart>), String> {
+    let format = image::guess_format(bytes).map_err(|e| e.to_string())?;
+    let checked = match format {
+        image::ImageFormat::Jpeg => scan::checked(bytes)?,
+        _ => scan::Checked { bytes: bytes.into(), missing: Vec::new() },
+    };
+    let decoded = image::load_from_memory_with_format(&checked.bytes, format).map_err(|e| e.to_string())?;
+    let luma = decoded.into_luma8();
+    let (width, height) = (luma.width() as usize, luma.height() as usize);
+    let gray = GrayImage::from_vec(width, height, luma.into_raw()).ok_or("it has no pixels")?;
+    Ok((gray, checked.missing))
+}
+
 /// Decodes once: to luma alone, or where colours are wanted and there are any to luma and chroma.
 fn jpeg(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault> {
     let fault = |e: zune_jpeg::errors::DecodeErrors| damaged(FrameEncoding::Jpeg, format!("{e:?}"));
     let options = DecoderOptions::default().set_max_width(LARGEST_SIDE).set_max_height(LARGEST_SIDE);
-    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&frame.data[..]), options);
+    let scan::Checked { bytes, missing } =
+        scan::checked(&frame.data).map_err(|reason| damaged(FrameEncoding::Jpeg, reason))?;
+    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&bytes[..]), options);
     decoder.decode_headers().map_err(fault)?;
     let with_chroma = want_rgb && decoder.input_colorspace() == Some(ColorSpace::YCbCr);
     let space = if with_chroma { ColorSpace::YCbCr } else { ColorSpace::Luma };
@@ -102,7 +140,7 @@ fn jpeg(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault
     let short = || damaged(FrameEncoding::Jpeg, "it has fewer pixels than its header says");
     if !with_chroma {
         let gray = GrayImage::from_vec(width, height, pixels).ok_or_else(short)?;
-        return Ok(DecodedFrame { gray, rgb: None });
+        return Ok(DecodedFrame { gray, rgb: None, missing });
     }
     if pixels.len() != 3 * width * height {
         return Err(short());
@@ -110,7 +148,7 @@ fn jpeg(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault
     let luma = pixels.chunks_exact(3).map(|p| p[0]).collect();
     let gray = GrayImage::from_vec(width, height, luma).ok_or_else(short)?;
     pixels.chunks_exact_mut(3).for_each(|p| p.copy_from_slice(&yuv(p[0], p[1], p[2])));
-    Ok(DecodedFrame { gray, rgb: Some(RgbImage { width, height, data: pixels }) })
+    Ok(DecodedFrame { gray, rgb: Some(RgbImage { width, height, data: pixels }), missing })
 }
 
 fn png(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault> {
@@ -129,7 +167,7 @@ fn png(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault>
     let (width, height) = (luma.width() as usize, luma.height() as usize);
     let gray = GrayImage::from_vec(width, height, luma.into_raw())
         .ok_or_else(|| damaged(FrameEncoding::Png, "it has fewer pixels than its header says"))?;
-    Ok(DecodedFrame { gray, rgb })
+    Ok(DecodedFrame { gray, rgb, missing: Vec::new() })
 }
 
 /// Bytes a row of pixels takes, and rows of bytes for `height` rows of pixels.
@@ -172,7 +210,7 @@ fn raw(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault>
         }
         RgbImage { width, height, data }
     });
-    Ok(DecodedFrame { gray, rgb })
+    Ok(DecodedFrame { gray, rgb, missing: Vec::new() })
 }
 
 fn luma_row(encoding: FrameEncoding, row: &[u8], out: &mut [u8]) {

@@ -63,7 +63,8 @@ fn tilt_error_deg(capture: &Path, angles: TiltConvention, truth: &[Vector3<f64>]
     let mut squares = Vec::new();
     for line in table.lines().skip(1) {
         let fields: Vec<&str> = line.split(',').collect();
-        let frame: usize = fields[place("frame")].parse().unwrap();
+        // Between frames there is no number.
+        let Ok(frame) = fields[place("frame")].parse::<usize>() else { continue };
         let [w, x, y, z] = ["qw", "qx", "qy", "qz"].map(|name| fields[place(name)].parse::<f64>());
         if let (Ok(w), Ok(x), Ok(y), Ok(z), 16..) = (w, x, y, z, frame) {
             let ned_from_body = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));

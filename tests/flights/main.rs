@@ -4,5 +4,6 @@ mod calibration_doc;
 mod compass_conventions;
 mod contract;
 mod import;
+mod no_camera;
 mod simulated_lines;
 mod warm_start;

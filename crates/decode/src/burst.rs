@@ -1,8 +1,7 @@
-//! The order of sentences in a receiver's burst, learnt from the stream: which sentence ends a
+//! The order of sentences in a device's burst, learnt from the stream: which sentence ends a
 //! cycle, and which ones lead it although they carry no time.
 
 use super::lines::LineSpan;
-use super::report::Kind;
 use windhover_base::time::Span;
 
 /// Bytes of an address that tell sentences apart.
@@ -61,18 +60,29 @@ impl BurstOrder {
         self.since.clear();
     }
 
-    /// The sentence just heard opens an epoch; gives where its burst began.
-    pub(super) fn new_burst(&mut self) -> LineSpan {
+    /// The sentence just heard opens an epoch; gives where its burst began. `earlier`: a sentence heard
+    /// before that is known to be of the same burst.
+    pub(super) fn new_burst(&mut self, earlier: Option<LineSpan>) -> LineSpan {
         self.vote();
-        let count = self.since.len();
-        let leaders = self.since[..count.saturating_sub(1)]
+        let known = earlier.and_then(|span| self.since.iter().position(|heard| heard.span == span));
+        let first_known = known.unwrap_or(self.since.len().saturating_sub(1));
+        let leaders = self.since[..first_known]
             .iter()
             .rev()
             .take_while(|heard| self.votes_of(heard.address) >= VOTES_LEADING)
             .count();
-        let first = self.since.get(count.saturating_sub(1 + leaders)).map(|heard| heard.span);
+        let first = self.since.get(first_known - leaders).map(|heard| heard.span);
         self.since.clear();
         first.or(self.last).unwrap_or_default()
+    }
+
+    /// Whether a sentence heard before is nearer to the one just heard than to what came before it.
+    pub(super) fn is_of_this_burst(&self, span: LineSpan) -> bool {
+        let Some(at) = self.since.iter().position(|heard| heard.span == span) else {
+            return false;
+        };
+        let after = self.since[at + 1..].iter().map(|heard| heard.silence_before).max();
+        after.is_none_or(|after| after <= self.since[at].silence_before)
     }
 
     /// Whether this sentence comes before the one that tells its time.
@@ -111,24 +121,24 @@ const CYCLES_FIRST: u32 = 3;
 /// Most cycles asked for where the belief was wrong before.
 const CYCLES_MAX: u32 = 64;
 
-/// The sentences of a cycle, learnt, so that an epoch can be given out with its last sentence and
-/// not only when the next one begins.
+/// The sentences of a cycle, learnt, so that an epoch (or a compass's reading) can be given out with its last
+/// sentence and not only when the next one begins.
 #[derive(Clone, Debug)]
-pub(super) struct Cycle {
-    expected: Vec<Kind>,
+pub(super) struct Cycle<K> {
+    expected: Vec<K>,
     seen: u32,
     needed: u32,
 }
 
-impl Default for Cycle {
+impl<K> Default for Cycle<K> {
     fn default() -> Self {
         Self { expected: Vec::new(), seen: 0, needed: CYCLES_FIRST }
     }
 }
 
-impl Cycle {
+impl<K: PartialEq + Clone> Cycle<K> {
     /// An epoch ended because the next began: these were its sentences.
-    pub(super) fn ended(&mut self, kinds: &[Kind]) {
+    pub(super) fn ended(&mut self, kinds: &[K]) {
         if kinds == self.expected {
             self.seen = self.seen.saturating_add(1);
         } else if !is_subsequence(kinds, &self.expected) {
@@ -145,11 +155,11 @@ impl Cycle {
     }
 
     /// Whether these are all the sentences to be expected (some may have been lost before the last).
-    pub(super) fn is_complete(&self, kinds: &[Kind]) -> bool {
+    pub(super) fn is_complete(&self, kinds: &[K]) -> bool {
         let Some(last) = self.expected.last() else {
             return false;
         };
-        let count = |list: &[Kind]| list.iter().filter(|kind| *kind == last).count();
+        let count = |list: &[K]| list.iter().filter(|kind| *kind == last).count();
         self.seen >= self.needed
             && kinds.last() == Some(last)
             && count(kinds) == count(&self.expected)
@@ -157,7 +167,7 @@ impl Cycle {
     }
 }
 
-fn is_subsequence(part: &[Kind], whole: &[Kind]) -> bool {
+fn is_subsequence<K: PartialEq>(part: &[K], whole: &[K]) -> bool {
     let mut whole = whole.iter();
     part.iter().all(|kind| whole.any(|other| other == kind))
 }
@@ -165,6 +175,7 @@ fn is_subsequence(part: &[Kind], whole: &[Kind]) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::report::Kind;
     use windhover_base::time::MonoTime;
 
     fn span(ms: i64) -> LineSpan {
@@ -181,7 +192,7 @@ mod tests {
             let t = burst * 200;
             order.heard("GPVTG", span(t));
             order.heard("GPRMC", span(t + 10));
-            begins.push(order.new_burst().t_first.ns() / 1_000_000);
+            begins.push(order.new_burst(None).t_first.ns() / 1_000_000);
             order.heard("GPGSV", span(t + 20));
         }
         // Then VTG is known to lead after two silences, and the burst begins with it
@@ -196,7 +207,7 @@ mod tests {
             let t = burst * 200;
             let stall = if burst == 4 { 170 } else { 0 };
             order.heard("GPRMC", span(t));
-            order.new_burst();
+            order.new_burst(None);
             order.heard("PGRMV", span(t + 10 + stall));
         }
         assert!(!order.leads("PGRMV"));

@@ -1,5 +1,6 @@
 //! What a decoder made of the bytes it was given, counted.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
 
@@ -55,7 +56,7 @@ pub struct DecodeCounts {
     /// Sound readings of which the device itself said that something is not valid.
     pub flagged: u64,
     refused: BTreeMap<Refusal, u64>,
-    left_out: BTreeMap<&'static str, u64>,
+    left_out: BTreeMap<Cow<'static, str>, u64>,
 }
 
 impl DecodeCounts {
@@ -63,13 +64,13 @@ impl DecodeCounts {
         *self.refused.entry(why).or_insert(0) += 1;
     }
 
-    pub(super) fn leave_out(&mut self, field: &'static str) {
-        *self.left_out.entry(field).or_insert(0) += 1;
+    pub(super) fn leave_out(&mut self, field: impl Into<Cow<'static, str>>) {
+        *self.left_out.entry(field.into()).or_insert(0) += 1;
     }
 
     /// Fields left out of sentences that were used otherwise, by name, with how often.
-    pub fn left_out(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
-        self.left_out.iter().map(|(field, count)| (*field, *count))
+    pub fn left_out(&self) -> impl Iterator<Item = (&str, u64)> + '_ {
+        self.left_out.iter().map(|(field, count)| (field.as_ref(), *count))
     }
 
     /// Whether nothing at all was a sound sentence or packet: bytes of another device, another speed

@@ -1,10 +1,10 @@
 //! An epoch put together of sentences of one time.
 
+use super::calendar::Calendar;
 use super::lines::LineSpan;
-use super::report::{Date, Kind, Report};
+use super::report::{Date, Kind, Report, Solution};
 use nalgebra::Vector3;
 use windhover_base::msg::{FixKind, GnssEpoch};
-use windhover_base::time::{Civil, MonoTime, NS_PER_S, Span, UtcTime};
 
 /// Most sentences one epoch is made of; more are not kept in its order.
 const KINDS_MAX: usize = 24;
@@ -26,6 +26,7 @@ pub(super) struct Draft {
     confirmed: bool,
     epoch: GnssEpoch,
     fix_told: Option<FixKind>,
+    solution: Option<Solution>,
     sats_listed: Option<u32>,
     ranks: Ranks,
 }
@@ -34,6 +35,7 @@ pub(super) struct Draft {
 #[derive(Clone, Copy, Debug)]
 struct Ranks {
     position: u8,
+    solution: u8,
     motion: u8,
     hdop: u8,
 }
@@ -51,8 +53,9 @@ impl Draft {
             confirmed: false,
             epoch: GnssEpoch::default(),
             fix_told: None,
+            solution: None,
             sats_listed: None,
-            ranks: Ranks { position: u8::MAX, motion: u8::MAX, hdop: u8::MAX },
+            ranks: Ranks { position: u8::MAX, solution: u8::MAX, motion: u8::MAX, hdop: u8::MAX },
         }
     }
 
@@ -97,6 +100,10 @@ impl Draft {
             self.epoch.lat_deg = Some(lat);
             self.epoch.lon_deg = Some(lon);
         }
+        if report.solution.is_some() && rank < self.ranks.solution {
+            self.ranks.solution = rank;
+            self.solution = report.solution;
+        }
         self.epoch.alt_msl_m = self.epoch.alt_msl_m.or(report.alt_msl_m);
         self.epoch.geoid_m = self.epoch.geoid_m.or(report.geoid_m);
     }
@@ -118,9 +125,9 @@ impl Draft {
     pub(super) fn finish(&self, calendar: &mut Calendar) -> GnssEpoch {
         let mut epoch = self.epoch;
         epoch.time_of_day_ns = self.time_of_day_ns;
-        epoch.utc = calendar.utc_of(self.time_of_day_ns, self.date, self.begin.t_first);
-        epoch.sats = epoch.sats.or(self.sats_listed);
         epoch.fix = self.fix_kind();
+        epoch.utc = calendar.utc_of(self.time_of_day_ns, self.date, self.has_fix(), self.begin.t_first);
+        epoch.sats = epoch.sats.or(self.sats_listed);
         if epoch.fix == FixKind::None {
             return GnssEpoch {
                 lat_deg: None,
@@ -140,15 +147,25 @@ impl Draft {
         epoch
     }
 
+    /// Whether what it holds so far is a fix.
+    pub(super) fn has_fix(&self) -> bool {
+        self.fix_kind() != FixKind::None
+    }
+
     /// What all sentences agree on: one that calls the fix void is believed.
     fn fix_kind(&self) -> FixKind {
         if self.void || !self.confirmed || self.epoch.lat_deg.is_none() {
             return FixKind::None;
         }
-        match self.fix_told {
-            Some(told) => told,
-            None if self.epoch.alt_msl_m.is_some() => FixKind::ThreeD,
+        let told = self.fix_told;
+        let flat_or_not = told.unwrap_or(match self.epoch.alt_msl_m {
+            Some(_) => FixKind::ThreeD,
             None => FixKind::TwoD,
+        });
+        match (flat_or_not, self.solution) {
+            (FixKind::ThreeD, Some(Solution::RtkFixed)) => FixKind::RtkFixed,
+            (FixKind::ThreeD, Some(Solution::RtkFloat)) => FixKind::RtkFloat,
+            _ => flat_or_not,
         }
     }
 }
@@ -190,116 +207,5 @@ const fn hdop_rank(kind: Kind) -> u8 {
         Kind::Gga => 0,
         Kind::Gns => 1,
         _ => 2,
-    }
-}
-
-/// A day, in nanoseconds.
-const DAY_NS: i64 = 86_400 * NS_PER_S;
-/// The span after which GPS's ten-bit week number repeats.
-const ERA_NS: i64 = 1_024 * 7 * DAY_NS;
-
-/// Puts dates to times of day.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Calendar {
-    last: Option<(UtcTime, MonoTime)>,
-    date_alone: Option<Date>,
-}
-
-impl Calendar {
-    /// UTC of an epoch heard at `t_recv`: with its own date, else with the day that makes it nearest
-    /// to where the last dated epoch and the time since lead. `None` until a date was told.
-    pub(super) fn utc_of(
-        &mut self,
-        time_of_day_ns: Option<i64>,
-        date: Option<Date>,
-        t_recv: MonoTime,
-    ) -> Option<UtcTime> {
-        let Some(time_of_day_ns) = time_of_day_ns else {
-            self.date_alone = date.or(self.date_alone);
-            return None;
-        };
-        let utc = match (date, self.last) {
-            (Some(date), _) => in_this_era(utc_on(date, time_of_day_ns)?, t_recv),
-            (None, Some((last, heard))) => {
-                let expected = last.unix_ns().saturating_add((t_recv - heard).ns());
-                let midnight = expected.div_euclid(DAY_NS) * DAY_NS;
-                let days = [-1, 0, 1].map(|day| midnight + day * DAY_NS + time_of_day_ns);
-                let nearest = days.into_iter().min_by_key(|ns| (ns - expected).abs());
-                UtcTime::from_unix_ns(nearest.unwrap_or(expected))
-            }
-            (None, None) => in_this_era(utc_on(self.date_alone?, time_of_day_ns)?, t_recv),
-        };
-        self.last = Some((utc, t_recv));
-        Some(utc)
-    }
-}
-
-fn utc_on(date: Date, time_of_day_ns: i64) -> Option<UtcTime> {
-    let midnight = Civil {
-        year: date.year,
-        month: date.month,
-        day: date.day,
-        hour: 0,
-        minute: 0,
-        second: 0,
-        nanosecond: 0,
-    };
-    Some(UtcTime::from_unix_ns(UtcTime::from_civil(midnight)?.unix_ns() + time_of_day_ns))
-}
-
-/// A receiver whose week number has rolled over is whole eras of 1024 weeks behind. Host time is
-/// close to UTC; where the date is such a number of eras before it, to two days, it is put right.
-fn in_this_era(utc: UtcTime, t_recv: MonoTime) -> UtcTime {
-    let behind = Span::from_ns(t_recv.ns().saturating_sub(utc.unix_ns()));
-    let eras = (behind.ns() + ERA_NS / 2).div_euclid(ERA_NS);
-    if eras >= 1 && (behind.ns() - eras * ERA_NS).abs() <= 2 * DAY_NS {
-        return UtcTime::from_unix_ns(utc.unix_ns() + eras * ERA_NS);
-    }
-    utc
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn at(text: &str, calendar: &mut Calendar, date: Option<Date>, t_s: i64) -> String {
-        let tod = super::super::report::time_of_day_ns(text).expect("a sound time");
-        let t = MonoTime::from_ns(t_s * NS_PER_S);
-        calendar.utc_of(tod, date, t).map_or_else(|| "none".to_owned(), |utc| utc.to_string())
-    }
-
-    #[test]
-    fn midnight_without_a_date_in_the_sentence() {
-        let mut calendar = Calendar::default();
-        assert_eq!(at("235959.8", &mut calendar, None, 0), "none");
-        assert_eq!(at("235959.8", &mut calendar, Date::new(2026, 2, 28), 0), "2026-02-28T23:59:59.800Z");
-        assert_eq!(at("000000.0", &mut calendar, None, 0), "2026-03-01T00:00:00.000Z");
-        assert_eq!(at("235959.8", &mut calendar, None, 0), "2026-02-28T23:59:59.800Z");
-    }
-
-    #[test]
-    fn days_of_silence_are_counted() {
-        let mut calendar = Calendar::default();
-        at("120000", &mut calendar, Date::new(2026, 2, 1), 1_000);
-        assert_eq!(at("130000", &mut calendar, None, 1_000 + 3 * 86_400), "2026-02-04T13:00:00.000Z");
-    }
-
-    #[test]
-    fn a_rolled_over_week_is_put_right_only_by_a_clock_that_knows() {
-        // 2026-11-18 less 1024 weeks is 2007-04-04
-        let host_s = 1_795_014_245;
-        let old = Date::new(2007, 4, 4);
-        assert_eq!(at("150405", &mut Calendar::default(), old, host_s), "2026-11-18T15:04:05.000Z");
-        assert_eq!(at("150405", &mut Calendar::default(), old, 0), "2007-04-04T15:04:05.000Z");
-        assert_eq!(
-            at("150405", &mut Calendar::default(), Date::new(2007, 4, 9), host_s),
-            "2007-04-09T15:04:05.000Z"
-        );
-    }
-
-    #[test]
-    fn a_leap_second_is_the_second_after() {
-        let utc = at("235960.5", &mut Calendar::default(), Date::new(2016, 12, 31), 0);
-        assert_eq!(utc, "2017-01-01T00:00:00.500Z");
     }
 }

@@ -1,8 +1,9 @@
 //! GPS bytes to epochs: every epoch of one UTC time only, given out as soon as it is safe.
 
 use super::burst::{BurstOrder, Cycle};
+use super::calendar::Calendar;
 use super::counts::{DecodeCounts, Refusal};
-use super::epoch::{Calendar, Draft};
+use super::epoch::Draft;
 use super::lines::{Line, LineFramer, LineSpan, LineStart};
 use super::report::{Kind, Report};
 use super::sentence::Sentence;
@@ -46,20 +47,38 @@ pub struct GnssDecoder {
     assembler: Assembler,
 }
 
+/// A ZDA of another time than the open epoch: it leads the burst to come, or tells the date only.
+#[derive(Clone, Debug, Default)]
+struct DateAhead {
+    heard: Option<(Report, LineSpan)>,
+    /// Whether the last one led its burst.
+    leads: bool,
+}
+
+/// What is remembered of an epoch that was given out.
+#[derive(Clone, Debug)]
+struct Done {
+    time_of_day_ns: Option<i64>,
+    kinds: Vec<Kind>,
+    /// When its last sentence was heard.
+    t_last: MonoTime,
+}
+
 #[derive(Clone, Debug)]
 struct Assembler {
     /// Wait for the next epoch's begin instead of the learnt end of the cycle.
     patient: bool,
     order: BurstOrder,
-    cycle: Cycle,
+    cycle: Cycle<Kind>,
     calendar: Calendar,
     draft: Option<Draft>,
     /// A GLL of another time than the burst it came in.
     aside: Option<Draft>,
     /// Sentences without time that lead the burst to come.
     leading: Vec<(Report, LineSpan)>,
+    date: DateAhead,
     /// The epoch just given out.
-    done: Option<(Option<i64>, Vec<Kind>)>,
+    done: Option<Done>,
     last_begin: Option<MonoTime>,
     period: Option<Span>,
 }
@@ -90,10 +109,11 @@ impl GnssDecoder {
                 patient,
                 order: BurstOrder::default(),
                 cycle: Cycle::default(),
-                calendar: Calendar::default(),
+                calendar: Calendar::new(!patient),
                 draft: None,
                 aside: None,
                 leading: Vec::new(),
+                date: DateAhead::default(),
                 done: None,
                 last_begin: None,
                 period: None,
@@ -107,17 +127,26 @@ impl GnssDecoder {
         self.framer.push(bytes, t_recv, &mut self.counts, |line, counts| {
             assembler.line(&line, counts, out);
         });
+        self.note_dates();
     }
 
     /// Time passed: gives out an open epoch the receiver has fallen silent after.
     pub fn tick(&mut self, now: MonoTime, out: &mut Vec<HeardEpoch>) {
         self.assembler.tick(now, out);
+        self.note_dates();
     }
 
     /// The stream has ended: gives out what is open.
     pub fn flush(&mut self, out: &mut Vec<HeardEpoch>) {
         self.assembler.close(out);
         self.assembler.close_aside(None, out);
+        self.note_dates();
+    }
+
+    fn note_dates(&mut self) {
+        for _ in 0..self.assembler.calendar.take_refused() {
+            self.counts.leave_out("date that can be");
+        }
     }
 
     /// What was made of the bytes so far.
@@ -142,7 +171,7 @@ impl Assembler {
             Ok(None) => return counts.ignored += 1,
             Err(why) => Err(why),
             Ok(Some(report)) => {
-                report.left_out.iter().for_each(|field| counts.leave_out(field));
+                report.left_out.iter().for_each(|field| counts.leave_out(*field));
                 self.place(report, sentence.address(), line.span, out)
             }
         };
@@ -159,11 +188,14 @@ impl Assembler {
         span: LineSpan,
         out: &mut Vec<HeardEpoch>,
     ) -> Result<(), Refusal> {
-        if let Some(time) = report.time_of_day_ns {
+        if report.kind == Kind::Zda {
+            self.place_date(report, span, out);
+            Ok(())
+        } else if let Some(time) = report.time_of_day_ns {
             self.place_timed(&report, time, span, out)
         } else if report.kind.tells_time() {
             self.place_time_missing(&report, span, out)
-        } else if self.order.leads(address) {
+        } else if self.order.leads(address) || (self.date.leads && self.date.heard.is_some()) {
             self.leading.retain(|(other, _)| other.kind != report.kind);
             if self.leading.len() < LEADING_MAX {
                 self.leading.push((report, span));
@@ -172,6 +204,34 @@ impl Assembler {
         } else {
             self.place_untimed(&report, span, out)
         }
+    }
+
+    /// A ZDA dates and never opens an epoch: some receivers tell it of another second.
+    fn place_date(&mut self, report: Report, span: LineSpan, out: &mut Vec<HeardEpoch>) {
+        let Some(time) = report.time_of_day_ns else { return };
+        if self.draft.as_ref().is_some_and(|draft| draft.time_of_day_ns == Some(time)) {
+            self.order.same_burst();
+            return self.merge(&report, span, out);
+        }
+        if let Some(date) = report.date {
+            let has_fix = self.draft.as_ref().map(Draft::has_fix);
+            self.calendar.told(time, date, has_fix, span.t_first);
+        }
+        if self.is_done(time) {
+            self.order.same_burst();
+            return self.cycle.was_longer();
+        }
+        if self.date.leads {
+            self.close(out);
+        }
+        self.date.heard = Some((report, span));
+    }
+
+    /// The ZDA that led the burst of this time, if one did.
+    fn date_of_burst(&mut self, time: i64) -> Option<(Report, LineSpan)> {
+        let (report, span) = self.date.heard.take()?;
+        self.date.leads = report.time_of_day_ns == Some(time) && self.order.is_of_this_burst(span);
+        self.date.leads.then_some((report, span))
     }
 
     /// A sentence with its time.
@@ -183,15 +243,17 @@ impl Assembler {
         out: &mut Vec<HeardEpoch>,
     ) -> Result<(), Refusal> {
         let open = self.draft.as_ref();
-        if open.is_some_and(|draft| draft.time_of_day_ns == Some(time) || draft.awaits(report.kind)) {
-            self.order.same_burst();
-            self.merge(report, span, out);
-            return Ok(());
-        }
-        if self.draft.is_none() && self.done.as_ref().is_some_and(|(done, _)| *done == Some(time)) {
-            self.order.same_burst();
-            self.cycle.was_longer();
-            return Err(Refusal::AfterItsEpoch);
+        if !self.is_told_again(report.kind, span) {
+            if open.is_some_and(|draft| draft.time_of_day_ns == Some(time) || draft.awaits(report.kind)) {
+                self.order.same_burst();
+                self.merge(report, span, out);
+                return Ok(());
+            }
+            if self.is_done(time) {
+                self.order.same_burst();
+                self.cycle.was_longer();
+                return Err(Refusal::AfterItsEpoch);
+            }
         }
         let main_before = open.is_some_and(Draft::has_main) || self.done_has_main();
         if report.kind == Kind::Gll && main_before {
@@ -216,14 +278,14 @@ impl Assembler {
     ) -> Result<(), Refusal> {
         match (&self.draft, &self.done) {
             (Some(draft), _) if !draft.kinds.contains(&report.kind) => {}
-            (None, Some((_, kinds))) if !kinds.contains(&report.kind) => {
+            (None, Some(done)) if !done.kinds.contains(&report.kind) => {
                 self.cycle.was_longer();
                 return Err(Refusal::AfterItsEpoch);
             }
             _ => {
                 self.close(out);
                 self.close_aside(None, out);
-                let begin = self.order.new_burst();
+                let begin = self.order.new_burst(None);
                 self.draft = Some(Draft::new(begin, true));
             }
         }
@@ -250,7 +312,7 @@ impl Assembler {
             return Ok(());
         }
         match self.done.take() {
-            Some((_, kinds)) if kinds.contains(&report.kind) => Err(Refusal::NoTime),
+            Some(done) if done.kinds.contains(&report.kind) => Err(Refusal::NoTime),
             Some(done) => {
                 self.done = Some(done);
                 self.cycle.was_longer();
@@ -273,7 +335,8 @@ impl Assembler {
     /// Opens the epoch of a new time, with the GLL that came before it and what led its burst.
     fn open(&mut self, time: i64, out: &mut Vec<HeardEpoch>) {
         self.close_aside(Some(time), out);
-        let begin = self.order.new_burst();
+        let date = self.date_of_burst(time);
+        let begin = self.order.new_burst(date.as_ref().map(|(_, span)| *span));
         if let Some(last) = self.last_begin.replace(begin.t_first) {
             let period = begin.t_first - last;
             let smoothed = |known: Span| Span::from_ns(known.ns() + (period.ns() - known.ns()) / 8);
@@ -285,7 +348,7 @@ impl Assembler {
             draft.begin = begin;
             draft.opens_burst = true;
         }
-        for (report, span) in self.leading.drain(..) {
+        for (report, span) in date.into_iter().chain(self.leading.drain(..)) {
             draft.merge(&report, span);
         }
         self.draft = Some(draft);
@@ -309,7 +372,8 @@ impl Assembler {
     fn give_out(&mut self, out: &mut Vec<HeardEpoch>) {
         if let Some(draft) = self.draft.take() {
             out.push(heard(&draft, &mut self.calendar));
-            self.done = Some((draft.time_of_day_ns, draft.kinds));
+            let (time_of_day_ns, t_last) = (draft.time_of_day_ns, draft.end.t_last);
+            self.done = Some(Done { time_of_day_ns, kinds: draft.kinds, t_last });
         }
     }
 
@@ -323,7 +387,23 @@ impl Assembler {
 
     fn done_has_main(&self) -> bool {
         let main = |kind: &Kind| matches!(kind, Kind::Rmc | Kind::Gga | Kind::Gns);
-        self.draft.is_none() && self.done.as_ref().is_some_and(|(_, kinds)| kinds.iter().any(main))
+        self.draft.is_none() && self.done.as_ref().is_some_and(|done| done.kinds.iter().any(main))
+    }
+
+    /// Whether the epoch of this time was given out last.
+    fn is_done(&self, time: i64) -> bool {
+        self.draft.is_none() && self.done.as_ref().is_some_and(|done| done.time_of_day_ns == Some(time))
+    }
+
+    /// Whether a sentence the last epoch has comes after a silence: a burst of its own, whatever its
+    /// time. A receiver that learns of a leap second tells a second twice.
+    fn is_told_again(&self, kind: Kind, span: LineSpan) -> bool {
+        let last = match (&self.draft, &self.done) {
+            (Some(draft), _) => Some((&draft.kinds, draft.end.t_last)),
+            (None, Some(done)) => Some((&done.kinds, done.t_last)),
+            (None, None) => None,
+        };
+        last.is_some_and(|(kinds, t_last)| kinds.contains(&kind) && span.t_first - t_last >= QUIET_FIRST)
     }
 }
 

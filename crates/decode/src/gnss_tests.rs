@@ -167,6 +167,100 @@ fn midnight_leap_second_and_missing_date() {
     assert_eq!(epochs[2].epoch.time_of_day_ns, Some(86_400_000_000_000));
 }
 
+fn zda(time: &str) -> String {
+    line(&format!("GPZDA,{time},01,02,2026,00,00"))
+}
+
+/// Pushes each line of the text when it is sent, bursts 1 s apart, lines 20 ms, and ticks between.
+fn live(bursts: &[String]) -> (Vec<HeardEpoch>, DecodeCounts) {
+    let (mut decoder, mut out) = (GnssDecoder::new(), Vec::new());
+    for (second, burst) in bursts.iter().enumerate() {
+        let begin = MonoTime::from_ns(HOST_NS) + Span::from_s(second as f64);
+        let lines: Vec<&str> = burst.split_inclusive('\n').collect();
+        for (index, line) in lines.iter().enumerate() {
+            decoder.push(line.as_bytes(), begin + Span::from_ms(20.0 * index as f64), &mut out);
+        }
+        for tick in 1..10 {
+            decoder.tick(begin + Span::from_ms(100.0 * f64::from(tick)), &mut out);
+        }
+    }
+    decoder.flush(&mut out);
+    (out, decoder.counts().clone())
+}
+
+/// 2026-02-01T10:11:00Z.
+const HOST_NS: i64 = 1_769_940_660_000_000_000;
+
+/// The order of sentences in a burst, and whether its ZDA is of the same second, so many later, or leads.
+fn dated(second: u32, ahead: i64, leads: bool) -> String {
+    let time = format!("1011{second:02}");
+    let told = format!("1011{:02}", i64::from(second) + ahead);
+    let fix = gga(&time, "3030.00000", "43.0") + &line("GPGSA,A,3,02,04,05,09,,,,,,,,,1.6,0.9,1.3");
+    if leads { zda(&told) + &fix } else { fix + &zda(&told) }
+}
+
+#[test]
+fn a_zda_dates_and_never_opens_an_epoch() {
+    for (ahead, leads) in [(0, false), (0, true), (2, false), (2, true), (-1, false), (-3, true), (1, false)]
+    {
+        let bursts: Vec<String> = (10..30).map(|second| dated(second, ahead, leads)).collect();
+        let ways = [live(&bursts), decode(GnssDecoder::patient(), &bursts.concat())];
+        for (which, (epochs, counts)) in ways.iter().enumerate() {
+            let what = format!("ahead {ahead}, leads {leads}, way {which}: {counts}");
+            assert_eq!((epochs.len(), counts.refused_total()), (20, 0), "{what}");
+            assert!(epochs.iter().all(|heard| heard.epoch.fix == FixKind::ThreeD), "{what}");
+            assert!(epochs.iter().all(|heard| heard.epoch.hdop == Some(0.9)), "{what}");
+            let dated = epochs.iter().skip(2).enumerate();
+            for (index, heard) in dated {
+                let utc = heard.epoch.utc.map(|utc| utc.to_string());
+                assert_eq!(utc, Some(format!("2026-02-01T10:11:{}.000Z", index + 12)), "{what}");
+            }
+        }
+        // Its burst begins with the ZDA only where that leads it.
+        let begins = |heard: &HeardEpoch| (heard.t_first_byte.ns() - HOST_NS) % 1_000_000_000 / 1_000_000;
+        let late = if leads && ahead != 0 { 20 } else { 0 };
+        let settled = live(&bursts).0;
+        assert!(
+            settled[5..].iter().all(|heard| begins(heard) == late || begins(heard) == 0),
+            "ahead {ahead}"
+        );
+        if ahead == 0 || !leads {
+            // Before the first burst nothing tells what its first sentence belongs to.
+            assert!(settled[1..].iter().all(|heard| begins(heard) == 0), "ahead {ahead}, leads {leads}");
+        }
+    }
+}
+
+#[test]
+fn a_date_without_a_fix_is_none() {
+    let cold = |date: &str| {
+        line(&format!("GPRMC,235955.800,V,,,,,0.00,0.00,{date},,,N"))
+            + &line("GPGGA,235955.800,,,,,0,00,,,M,,M,,")
+            + &line("GPZDA,235955.800,06,01,1980,,")
+    };
+    for date in ["050180", "060180", "220899", "181126"] {
+        let text = cold(date);
+        for (epochs, _) in [live(std::slice::from_ref(&text)), decode(GnssDecoder::patient(), &text)] {
+            assert!(!epochs.is_empty() && epochs.iter().all(|heard| heard.epoch.utc.is_none()), "{date}");
+        }
+    }
+    // With the fix comes the date, and the zeros before it are forgotten.
+    let bursts = [cold("060180"), cold("060180"), garmin(20), garmin(21)];
+    let (epochs, _) = live(&bursts);
+    let utc: Vec<_> = epochs.iter().map(|heard| heard.epoch.utc.map(|utc| utc.to_string())).collect();
+    assert_eq!(
+        utc[utc.len() - 2..],
+        ["2026-02-01T10:11:20.000Z", "2026-02-01T10:11:21.000Z"].map(|t| Some(t.into()))
+    );
+}
+
+#[test]
+fn a_second_told_twice_is_two_epochs() {
+    let bursts: Vec<String> = [10, 11, 12, 13, 14, 14, 15, 16].map(garmin).to_vec();
+    let (epochs, counts) = live(&bursts);
+    assert_eq!(seconds(&epochs), [10, 11, 12, 13, 14, 14, 15, 16].map(Some), "{counts}");
+}
+
 #[test]
 fn a_receiver_without_time_or_fix_is_heard() {
     let burst =
@@ -187,7 +281,7 @@ fn a_receiver_of_rmc_and_gns_alone_has_altitude() {
     assert_eq!((epochs.len(), counts.refused_total()), (5, 0), "{counts}");
     for heard in epochs {
         let epoch = heard.epoch;
-        assert_eq!((epoch.fix, epoch.alt_msl_m, epoch.sats), (FixKind::ThreeD, Some(50.1), Some(14)));
+        assert_eq!((epoch.fix, epoch.alt_msl_m, epoch.sats), (FixKind::RtkFixed, Some(50.1), Some(14)));
     }
 }
 
@@ -219,6 +313,38 @@ fn a_fix_of_no_satellites_needs_another_witness() {
     let fix = |text: &str| decode(GnssDecoder::patient(), text).0[0].epoch.fix;
     assert_eq!(fix(&empty), FixKind::None);
     assert_eq!(fix(&(rmc("101101", "3030.00000") + &empty)), FixKind::ThreeD);
+}
+
+#[test]
+fn rtk_is_told_by_quality_or_modes() {
+    let gga = |quality: u32| {
+        line(&format!("GNGGA,101101,3030.00000,N,08530.00000,W,{quality},19,0.5,10.0,M,-27.0,M,1.0,0001"))
+    };
+    let rmc = |mode: &str| {
+        line(&format!("GNRMC,101101,A,3030.00000,N,08530.00000,W,010.0,090.0,010226,,,{mode},V"))
+    };
+    let gns =
+        |modes: &str| line(&format!("GNGNS,101101,3030.0,N,08530.0,W,{modes},14,0.6,50.1,48.0,1.0,0000,V"));
+    let gsa = |fix: u32| line(&format!("GNGSA,A,{fix},01,02,03,04,,,,,,,,,1.6,0.9,1.3"));
+    let fix = |text: &str| decode(GnssDecoder::patient(), text).0[0].epoch.fix;
+    for (text, kind) in [
+        (gga(1), FixKind::ThreeD),
+        (gga(2), FixKind::ThreeD),
+        (gga(4), FixKind::RtkFixed),
+        (gga(5), FixKind::RtkFloat),
+        (gga(4) + &gsa(3), FixKind::RtkFixed),
+        (gga(5) + &gsa(2), FixKind::TwoD),
+        (gns("RRNR"), FixKind::RtkFixed),
+        (gns("RF"), FixKind::RtkFloat),
+        (gns("RA"), FixKind::ThreeD),
+        // GGA decides over the others, whatever their order is.
+        (rmc("R") + &gga(5), FixKind::RtkFloat),
+        (gga(4) + &rmc("A"), FixKind::RtkFixed),
+        (gns("FF") + &rmc("R"), FixKind::RtkFloat),
+        (gga(0) + &rmc("R"), FixKind::None),
+    ] {
+        assert_eq!(fix(&text), kind, "{text}");
+    }
 }
 
 #[test]

@@ -2,6 +2,7 @@
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 mod burst;
+mod calendar;
 mod compass;
 mod counts;
 mod epoch;

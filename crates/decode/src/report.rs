@@ -56,6 +56,14 @@ impl Date {
     }
 }
 
+/// How a position was measured: by codes, or by carrier phases with whole cycles unknown or known.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
+pub(super) enum Solution {
+    Code,
+    RtkFloat,
+    RtkFixed,
+}
+
 /// What one sentence says. Positions and motion are left out where the sentence calls them void.
 #[derive(Clone, PartialEq, Debug)]
 pub(super) struct Report {
@@ -68,6 +76,8 @@ pub(super) struct Report {
     pub valid: Option<bool>,
     /// Kind of fix where the sentence tells it.
     pub fix: Option<FixKind>,
+    /// How the position was measured, where the sentence tells it.
+    pub solution: Option<Solution>,
     /// Latitude and longitude, degrees.
     pub position_deg: Option<(f64, f64)>,
     pub alt_msl_m: Option<f64>,
@@ -94,6 +104,7 @@ impl Report {
             date: None,
             valid: None,
             fix: None,
+            solution: None,
             position_deg: None,
             alt_msl_m: None,
             geoid_m: None,

@@ -6,9 +6,9 @@
 //!
 //! | sentence | decide | used where sound | checked only |
 //! |---|---|---|---|
-//! | RMC | time, status, position | speed, course, date, mode | variation |
-//! | GGA | time, position | quality, satellites, HDOP, altitude, geoid | |
-//! | GNS | time, position | modes, satellites, HDOP, altitude, geoid | |
+//! | RMC | time, status, position | speed, course, date, mode (also: RTK) | variation |
+//! | GGA | time, position | quality (also: RTK), satellites, HDOP, altitude, geoid | |
+//! | GNS | time, position | modes (also: RTK), satellites, HDOP, altitude, geoid | |
 //! | GLL | time, status, position | mode | |
 //! | GSA | kind of fix | satellites, HDOP | PDOP, VDOP |
 //! | VTG | | course, speed (knots, else km/h), mode | magnetic course |
@@ -27,7 +27,7 @@ use nmea::ParseResult;
 use nmea::sentences::{FixType, GgaData, GllData, GnsData, GsaData, RmcData, VtgData, ZdaData};
 
 use super::counts::Refusal;
-use super::report::{Date, Kind, Report, angle_deg, time_of_day_ns};
+use super::report::{Date, Kind, Report, Solution, angle_deg, time_of_day_ns};
 use super::sentence::{Sentence, framed, number};
 use windhover_base::msg::FixKind;
 
@@ -276,11 +276,24 @@ fn mode_is_measured(mode: &str) -> bool {
     mode.is_empty() || mode.chars().any(|letter| matches!(letter, 'A' | 'D' | 'F' | 'P' | 'R'))
 }
 
+/// How a measured position came about, by the letters of its modes, a letter a constellation: no better than the
+/// worst of those that took part.
+fn solution_of_modes(modes: &str) -> Option<Solution> {
+    let letters = modes.chars().filter(|letter| *letter != 'N');
+    let solutions = letters.map(|letter| match letter {
+        'R' => Solution::RtkFixed,
+        'F' => Solution::RtkFloat,
+        _ => Solution::Code,
+    });
+    solutions.min()
+}
+
 fn of_rmc(report: &mut Report, data: &RmcData, sentence: &Sentence<'_>) {
     let valid = sentence.field(2) != "V" && mode_is_measured(sentence.field(12));
     report.valid = Some(valid);
     report.date = data.fix_date.and_then(|date| Date::new(date.year(), date.month() as u8, date.day() as u8));
     if valid {
+        report.solution = solution_of_modes(sentence.field(12));
         report.speed_mps = data.speed_over_ground.map(|knots| decimal(knots) * KNOT_MPS);
         report.course_deg = data.true_course.map(decimal);
     }
@@ -294,6 +307,11 @@ fn of_gga(report: &mut Report, data: &GgaData, sentence: &Sentence<'_>) {
     // A fix of no satellites, or of a quality unknown, is one only if another sentence says so.
     let decided = quality_known && (!measured || data.fix_satellites != Some(0));
     report.valid = decided.then_some(measured);
+    report.solution = decided.then_some(match data.fix_type {
+        Some(FixType::Rtk) => Solution::RtkFixed,
+        Some(FixType::FloatRtk) => Solution::RtkFloat,
+        _ => Solution::Code,
+    });
     report.sats = data.fix_satellites;
     report.hdop = data.hdop.map(decimal);
     if report.valid != Some(false) {
@@ -306,6 +324,7 @@ fn of_gns(report: &mut Report, data: &GnsData, sentence: &Sentence<'_>) {
     let mode = sentence.field(6);
     let measured = !mode.is_empty() && mode_is_measured(mode);
     report.valid = Some(measured);
+    report.solution = solution_of_modes(mode).filter(|_| measured);
     let count_given = !sentence.field(7).is_empty() && !report.left_out.contains(&"GNS satellites");
     report.sats = count_given.then_some(u32::from(data.nsattelites));
     report.hdop = data.hdop.map(decimal);

@@ -6,7 +6,7 @@ use crate::align::{History, Stamp};
 use windhover_base::geo::wrap_angle;
 use windhover_base::msg::{
     AttitudeSample, Disposition, EstimatorOutput, FrameObservations, FramePrediction, FusionResult,
-    FusionSource, GnssEpoch, Stamped, WarmFilter,
+    FusionSource, GnssEpoch, Ownship, Stamped, WarmFilter,
 };
 use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::{MonoTime, Span};
@@ -27,6 +27,10 @@ pub struct Estimator {
     compass: VecDeque<Stamped<AttitudeSample>>,
     /// Room to look ahead in.
     ahead: State,
+    /// The state as it was last told between frames.
+    carried: State,
+    /// Time of the state in the history from which it was carried on; `None` where a measurement came since.
+    carried_from: Option<MonoTime>,
     lag: Span,
     /// What the next start continues from.
     warm: Option<WarmFilter>,
@@ -40,6 +44,8 @@ pub struct Estimator {
 const SILENCE: Span = Span::from_ns(60_000_000_000);
 /// Farther ahead than this a frame is not foreseen, s.
 const FORESIGHT_S: f64 = 2.0;
+/// Without any measurement for longer the helicopter's own state is not told, s.
+const GUESS_S: f64 = 10.0;
 /// Compass readings this old still start the filter, if there are enough of them.
 const COMPASS_AGE: Span = Span::from_ns(3_000_000_000);
 /// Readings kept to start from, and the fewest that outvote a wrong one.
@@ -57,6 +63,8 @@ impl Estimator {
         let span = Span::from_ms(estimator.history_ms);
         Self {
             ahead: State::default(),
+            carried: State::default(),
+            carried_from: None,
             history: History::new(span, CAPACITY, core.state.clone(), MonoTime::default()),
             core,
             compass: VecDeque::with_capacity(READINGS + 1),
@@ -140,7 +148,7 @@ impl Estimator {
             out.push(EstimatorOutput::Estimate(state.estimate(&self.core.models, target, number, t)));
         }
         if taken.is_some() {
-            out.push(EstimatorOutput::Ownship(state.ownship(&self.core.models, number, t)));
+            out.push(EstimatorOutput::Ownship(state.ownship(&self.core.models, Some(number), t)));
         }
         self.emit_smoothed(out);
     }
@@ -169,6 +177,23 @@ impl Estimator {
             self.ahead.propagate(t, &self.core.models);
             self.ahead.expect(&self.core.models, expected);
         }
+    }
+
+    /// The helicopter's own state at `t`, from what was taken so far; `None` where it is not known or nothing was
+    /// measured for [`GUESS_S`] before.
+    pub fn ownship(&mut self, t: MonoTime) -> Option<Ownship> {
+        let state = self.history.at(t);
+        let ahead = t - state.t;
+        if !(self.core.state.alive && state.alive && (0.0..=GUESS_S).contains(&ahead.s())) {
+            return None;
+        }
+        // In a silence each goes on from the one before.
+        if self.carried_from != Some(state.t) || self.carried.t > t {
+            self.carried.copy_present(state);
+            self.carried_from = Some(state.t);
+        }
+        self.carried.propagate(t, &self.core.models);
+        Some(self.carried.ownship(&self.core.models, None, t))
     }
 
     /// How much older GPS is than configured, as learnt so far, seconds.
@@ -221,6 +246,7 @@ impl Estimator {
             core.state.resume(&warm, &core.models, &core.learning);
         }
         let state = &self.core.state;
+        self.carried_from = None;
         self.history.restart(epoch.t_valid, |base| base.copy_from(state));
         for reading in std::mem::take(&mut self.compass) {
             if reading.t_valid >= epoch.t_valid {
@@ -242,6 +268,7 @@ impl Estimator {
             self.refused(source, stamp.t_valid, disposition, out);
             return None;
         }
+        self.carried_from = None;
         let at = self.history.insert(stamp, fill);
         if at + 1 < self.history.len() {
             self.core.state.copy_from(self.history.before(at));

@@ -88,7 +88,7 @@ const GPS_DOWN_FACTOR: f64 = 2.0;
 
 impl Models {
     pub(crate) fn new(rig: &Rig, estimator: &EstimatorConfig, site: &Site) -> Self {
-        let Rig { gps, compass, camera, target } = rig;
+        let Rig { gps, compass, camera, target, .. } = rig;
         let mount = &camera.mount;
         let across = gps.bias_sigma_m.powi(2);
         let mut gates = [f64::INFINITY; 9];

@@ -60,11 +60,13 @@ impl State {
         TargetEstimate { t_valid: t, frame, target, status, state }
     }
 
-    /// The helicopter at a frame.
-    pub(crate) fn ownship(&self, models: &Models, frame: u32, t: MonoTime) -> Ownship {
+    /// The helicopter, at a frame where it is one's.
+    pub(crate) fn ownship(&self, models: &Models, frame: Option<u32>, t: MonoTime) -> Ownship {
         let own = &self.own;
         let place = models.frame.geodetic(&own.position);
-        let sigma = |block| Vector3::from_fn(|i, _| self.cov.sigma(block, i));
+        let blocks = [own::POSITION, own::VELOCITY, own::ATTITUDE];
+        let column = |i: usize| blocks[i / 3].column(i % 3);
+        let cov = |i, j| self.cov.at(column(i), column(j));
         Ownship {
             t_valid: t,
             frame,
@@ -74,8 +76,7 @@ impl State {
             lat_deg: place.lat_deg,
             lon_deg: place.lon_deg,
             height_m: place.height_m,
-            position_sigma_m: sigma(own::POSITION),
-            attitude_sigma_rad: sigma(own::ATTITUDE),
+            covariance: SMatrix::from_fn(|i, j| 0.5 * (cov(i, j) + cov(j, i))),
         }
     }
 

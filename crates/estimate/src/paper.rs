@@ -14,7 +14,7 @@ use nalgebra::{Rotation3, Vector2, Vector3};
 
 use windhover_base::geo::{Geodetic, Tilt, locate, wrap_angle};
 use windhover_base::msg::{
-    AttitudeSample, FixKind, FrameObservations, GnssEpoch, Stamped, TargetEstimate, TargetState, TrackStatus,
+    AttitudeSample, FrameObservations, GnssEpoch, Stamped, TargetEstimate, TargetState, TrackStatus,
 };
 use windhover_base::settings::{EstimatorConfig, Rig, TargetModel};
 use windhover_base::time::MonoTime;
@@ -69,7 +69,7 @@ impl PaperEstimator {
         else {
             return;
         };
-        if value.fix == FixKind::None || self.fix.is_some_and(|fix| fix.t > epoch.t_valid) {
+        if !value.fix.has_position() || self.fix.is_some_and(|fix| fix.t > epoch.t_valid) {
             return;
         }
         let place = Geodetic { lat_deg, lon_deg, height_m: alt + value.geoid_m.unwrap_or(0.0) };

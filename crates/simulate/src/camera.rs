@@ -2,13 +2,15 @@
 
 use nalgebra::{Rotation3, Vector2, Vector3};
 
-use super::instant::VehicleTruth;
 use super::markers::corners_in_vehicle;
 use super::random::{Purpose, Stream};
 use super::scenario::{vector, within};
 use super::world::World;
 use windhover_base::geo::ned_from_body_321;
 use windhover_base::time::{MonoTime, Span};
+
+/// Iterations that find the row in which a point is seen: each is closer by its motion over a row's share of a pixel.
+const ROW_ITERATIONS: usize = 3;
 
 /// Where the camera is and where it looks.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -73,6 +75,8 @@ impl Exposures {
             let jitter = Span::from_ms(self.stream.normal() * sim.period_jitter_ms);
             let stamp_noise = Span::from_ms(self.stream.normal() * sim.stamp_noise_ms);
             let transfer_ms = sim.transfer_ms + self.stream.normal() * sim.transfer_jitter_ms;
+            // A stamp that is late because the exposure is over sooner than it says is not heard before it.
+            let late = Span::from_ms(sim.stamp_late_ms.max(0.0));
             let lost = self.stream.chance(sim.dropped) || within(&sim.outages_s, nominal_s);
             if lost {
                 continue;
@@ -83,8 +87,8 @@ impl Exposures {
             return Some(FrameTruth {
                 frame,
                 t_true,
-                t_stamp: t_true - Span::from_ms(config.exposure_offset_ms) + stamp_noise,
-                t_recv: t_true + Span::from_ms(transfer_ms.max(1.0)),
+                t_stamp: t_true - Span::from_ms(config.exposure_offset_ms - sim.stamp_late_ms) + stamp_noise,
+                t_recv: t_true + Span::from_ms(transfer_ms.max(1.0)) + late,
             });
         }
     }
@@ -95,28 +99,51 @@ impl World {
     /// scenario's mounting error.
     pub fn camera_pose(&self, t: MonoTime) -> CameraPose {
         let own = self.ownship(t);
-        let mount = &self.scenario().rig.camera.mount;
+        let mount = &self.rig().camera.mount;
         let [yaw, pitch, roll] = self.scenario().camera.mount_error_deg.map(f64::to_radians);
         CameraPose {
             position_ned_m: own.position_ned_m + own.ned_from_body * vector(mount.position_m),
             ned_from_camera: own.ned_from_body
                 * ned_from_body_321(yaw, pitch, roll)
-                * mount.body_from_camera(),
+                * self.shaken(t, mount.body_from_camera()),
         }
     }
 
-    /// Where marker `marker` of vehicle `target` projects; `None` where it is behind the camera.
-    pub fn marker(
+    /// When the row of a pixel is exposed in a frame whose middle row is exposed at host time `t`.
+    pub(super) fn row_time(&self, t: MonoTime, v: f64) -> MonoTime {
+        let rows = f64::from(self.rig().camera.height.max(2) - 1);
+        t + Span::from_ms((v / rows - 0.5) * self.scenario().camera.readout_ms)
+    }
+
+    /// Pixel of a point, fixed or moving, in a frame whose middle row is exposed at host time `t`: each row sees it when
+    /// it is exposed. `None` where it is not in front of the lens.
+    pub(super) fn seen(&self, t: MonoTime, ned: impl Fn(MonoTime) -> Vector3<f64>) -> Option<Vector2<f64>> {
+        let mut px = self.project(&self.camera_pose(t), &ned(t))?;
+        if self.scenario().camera.readout_ms != 0.0 {
+            for _ in 0..ROW_ITERATIONS {
+                let at = self.row_time(t, px.y);
+                px = self.project(&self.camera_pose(at), &ned(at))?;
+            }
+        }
+        Some(px)
+    }
+
+    /// Where marker `marker` of vehicle `target` projects in a frame exposed at host time `t`; `None` where it is behind
+    /// the camera.
+    pub fn marker(&self, target: usize, marker: usize, t: MonoTime) -> Option<MarkerTruth> {
+        self.marker_on(target, target, marker, t)
+    }
+
+    /// The same on any mover that carries the markers of vehicle `target`.
+    pub(super) fn marker_on(
         &self,
+        mover: usize,
         target: usize,
         marker: usize,
-        vehicle: &VehicleTruth,
-        pose: &CameraPose,
         t: MonoTime,
     ) -> Option<MarkerTruth> {
-        let scenario = self.scenario();
-        let config = &scenario.rig.target[target].marker[marker];
-        let project = |point: &Vector3<f64>| self.project(pose, &vehicle.ned_of(point));
+        let config = &self.rig().target[target].marker[marker];
+        let project = |point: &Vector3<f64>| self.seen(t, |t| self.mover(mover, t).ned_of(point));
         let center_px = project(&vector(config.position_m))?;
         let mut corners_px = [Vector2::zeros(); 4];
         for (px, corner) in corners_px.iter_mut().zip(corners_in_vehicle(config)) {
@@ -138,12 +165,12 @@ impl World {
     /// Pixel of a point in NED; `None` where it is not in front of the lens.
     pub fn project(&self, pose: &CameraPose, ned: &Vector3<f64>) -> Option<Vector2<f64>> {
         let in_camera = pose.ned_from_camera.inverse() * (ned - pose.position_ned_m);
-        Some(self.scenario().rig.camera.intrinsics.project(&in_camera)?.px)
+        Some(self.rig().camera.intrinsics.project(&in_camera)?.px)
     }
 
     /// The ground point seen at a pixel; `None` above the horizon.
     pub(super) fn ground_at(&self, pose: &CameraPose, px: Vector2<f64>) -> Option<Vector3<f64>> {
-        let m = self.scenario().rig.camera.intrinsics.normalised(px)?;
+        let m = self.rig().camera.intrinsics.normalised(px)?;
         let ray = pose.ned_from_camera * Vector3::new(m.x, m.y, 1.0);
         let depth = -pose.position_ned_m.z / ray.z;
         (ray.z > 0.05 && depth > 0.0).then(|| pose.position_ned_m + ray * depth)
@@ -151,7 +178,7 @@ impl World {
 
     /// Whether a pixel lies within the frame, `margin_px` from its border.
     pub(super) fn in_frame(&self, px: &Vector2<f64>, margin_px: f64) -> bool {
-        let camera = &self.scenario().rig.camera;
+        let camera = &self.rig().camera;
         let inside = |x: f64, size: u32| x >= margin_px && x <= f64::from(size) - 1.0 - margin_px;
         inside(px.x, camera.width) && inside(px.y, camera.height)
     }
@@ -159,9 +186,9 @@ impl World {
     /// Whether a vehicle covers this ground point at host time `t` (with the metre around it in
     /// which its shadow and parallax move).
     pub(super) fn covered_by_vehicle(&self, ground: &Vector3<f64>, t: MonoTime) -> bool {
-        (0..self.vehicles()).any(|target| {
-            let vehicle = self.vehicle(target, t);
-            let length = self.scenario().rig.target[target].wheelbase_m.unwrap_or(1.0);
+        (0..self.movers()).any(|index| {
+            let vehicle = self.mover(index, t);
+            let length = self.looks(index).0.wheelbase_m.unwrap_or(1.0);
             let middle = vehicle.reference(0.5 * length);
             (ground.xy() - middle).norm() < 0.5 * length + 1.0
         })

@@ -54,6 +54,12 @@ pub(super) fn write_reading(sample: &AttitudeSample, context: &WireContext, line
             let quality = u8::from(valid);
             format!("PASHR,{time},{t:.2},T,{roll:+.2},{pitch:+.2},+0.00,0.300,0.300,0.500,{quality}")
         }
+        // A device without a heading tells no angles.
+        CompassFormat::Vectornav if !valid => "VNYPR,,,".into(),
+        CompassFormat::Vectornav => {
+            let yaw = if heading > 180.0 { heading - 360.0 } else { heading };
+            format!("VNYPR,{yaw:+08.3},{pitch:+08.3},{roll:+08.3}")
+        }
         CompassFormat::Nmea => {
             let (size, letter) =
                 (context.declination_deg.abs(), if context.declination_deg < 0.0 { 'W' } else { 'E' });

@@ -2,6 +2,7 @@
 
 use nalgebra::Vector3;
 
+use super::lag::filtered;
 use super::random::{Purpose, Stream};
 use super::scenario::{Scenario, vector, within};
 use super::world::World;
@@ -40,6 +41,7 @@ impl GnssReceiver {
         let sim = &scenario.gps;
         let mut stream = Stream::of(world.seed(), Purpose::Gnss);
         let drawn_ms = stream.uniform(-1.0, 1.0) * sim.latency_spread_ms;
+        let drawn_ms = drawn_ms + sim.latency_sigma_ms * Stream::of(world.seed(), Purpose::Latency).normal();
         let latency_ms = scenario.rig.gps.latency_ms + sim.latency_offset_ms + drawn_ms;
         let bias_m = Vector3::from_fn(|axis, _| stream.normal() * bias_sigma(scenario, axis));
         let step_ns = (NS_PER_S as f64 / sim.rate_hz.max(0.01)).round() as i64;
@@ -116,6 +118,14 @@ fn rounded(x: f64, digits: u32) -> f64 {
     (x * scale).round() / scale
 }
 
+/// Position and velocity of the antenna.
+fn antenna_at(world: &World, t: MonoTime) -> (Vector3<f64>, Vector3<f64>) {
+    let own = world.ownship(t);
+    let arm = vector(world.rig().gps.antenna_position_m);
+    let swing = own.ned_from_body * own.body_rate_radps.cross(&arm);
+    (own.position_ned_m + own.ned_from_body * arm, own.velocity_ned_mps + swing)
+}
+
 fn fix(
     world: &World,
     t_true: MonoTime,
@@ -124,11 +134,9 @@ fn fix(
     velocity_error: &Vector3<f64>,
 ) -> GnssEpoch {
     let scenario = world.scenario();
-    let own = world.ownship(t_true);
-    let arm = vector(scenario.rig.gps.antenna_position_m);
-    let antenna = own.position_ned_m + own.ned_from_body * arm;
-    let swing = own.ned_from_body * own.body_rate_radps.cross(&arm);
-    let velocity = own.velocity_ned_mps + swing + velocity_error;
+    let antenna = filtered(scenario.gps.position_filter_s, t_true, |t| antenna_at(world, t).0);
+    let velocity =
+        filtered(scenario.gps.velocity_filter_s, t_true, |t| antenna_at(world, t).1) + velocity_error;
     let position = world.frame().geodetic(&(antenna + error_m));
     // Five digits of a minute, as the 5 Hz units send it: 1.9 cm.
     let minutes = |degrees: f64| rounded(degrees * 60.0, 5) / 60.0;

@@ -12,10 +12,10 @@ use super::ode::Table;
 use super::random::{Purpose, Stream, Wander};
 use super::scenario::{Helicopter, HelicopterPath, Wind};
 use super::vehicle::VehicleMotion;
-use windhover_base::geo::{ned_from_body_321, wrap_angle};
+use windhover_base::geo::{euler_321, ned_from_body_321, wrap_angle};
 
 /// Standard gravity, m/s².
-const GRAVITY: f64 = 9.806_65;
+pub(super) const GRAVITY: f64 = 9.806_65;
 /// Damping of the attitude loop.
 const DAMPING: f64 = 0.8;
 
@@ -29,6 +29,8 @@ pub(super) struct HelicopterMotion {
     air: Air,
     drag_per_s: f64,
     heading: (f64, Wander),
+    /// Takes the body into the frame whose z axis is the rotor's, where they differ.
+    rotor_from_body: Option<Rotation3<f64>>,
 }
 
 #[derive(Clone, Debug)]
@@ -85,7 +87,13 @@ impl HelicopterMotion {
         };
         let start = pilot.start_state(span_s.0);
         let table = Table::integrate(|t, y| pilot.derivative(t, y), start, span_s, STEP_S);
-        Self { table, air: pilot.air.clone(), drag_per_s: plan.drag_per_s, heading: (heading, wander) }
+        Self {
+            table,
+            air: pilot.air.clone(),
+            drag_per_s: plan.drag_per_s,
+            heading: (heading, wander),
+            rotor_from_body: (plan.trim_deg != 0.0).then(|| trim(plan.trim_deg, seed)),
+        }
     }
 
     pub(super) fn at(&self, t_s: f64) -> OwnshipTruth {
@@ -93,12 +101,12 @@ impl HelicopterMotion {
         let part = |k: usize| Vector3::new(y[k], y[k + 1], y[k + 2]);
         let (position, velocity, thrust, thrust_rate) = (part(0), part(3), part(6), part(9));
         let heading = self.heading.0 + self.heading.1.at(t_s);
-        let ned_from_body = attitude(&thrust, heading);
+        let ned_from_body = self.attitude(&thrust, heading);
         let acceleration = thrust + Vector3::z() * GRAVITY + (self.air.at(t_s) - velocity) * self.drag_per_s;
         // The body's rate by a central difference of the attitude over 2 ms.
         let h = 1e-3;
-        let later = attitude(&(thrust + thrust_rate * h), heading + self.heading.1.rate(t_s) * h);
-        let earlier = attitude(&(thrust - thrust_rate * h), heading - self.heading.1.rate(t_s) * h);
+        let later = self.attitude(&(thrust + thrust_rate * h), heading + self.heading.1.rate(t_s) * h);
+        let earlier = self.attitude(&(thrust - thrust_rate * h), heading - self.heading.1.rate(t_s) * h);
         let body_rate_radps = (earlier.inverse() * later).scaled_axis() / (2.0 * h);
         OwnshipTruth {
             position_ned_m: position,
@@ -106,9 +114,23 @@ impl HelicopterMotion {
             acceleration_ned_mps2: acceleration,
             ned_from_body,
             body_rate_radps,
-            heading_rad: wrap_angle(heading),
+            heading_rad: match self.rotor_from_body {
+                Some(_) => euler_321(&ned_from_body).0,
+                None => wrap_angle(heading),
+            },
         }
     }
+
+    fn attitude(&self, thrust: &Vector3<f64>, heading: f64) -> Rotation3<f64> {
+        let ned_from_rotor = attitude(thrust, heading);
+        self.rotor_from_body.map_or(ned_from_rotor, |rotor_from_body| ned_from_rotor * rotor_from_body)
+    }
+}
+
+/// A turn by `angle_deg` about an axis across the rotor's, drawn at random.
+fn trim(angle_deg: f64, seed: u64) -> Rotation3<f64> {
+    let (s, c) = Stream::of(seed, Purpose::Trim).uniform(0.0, std::f64::consts::TAU).sin_cos();
+    Rotation3::new(Vector3::new(c, s, 0.0) * angle_deg.to_radians())
 }
 
 /// The attitude whose −z axis lies along the thrust and whose x axis has this azimuth.
@@ -118,6 +140,18 @@ fn attitude(thrust: &Vector3<f64>, heading: f64) -> Rotation3<f64> {
     // z_body in the frame turned by the heading is Ry(pitch) Rx(roll) e_z = (sθ cφ, −sφ, cθ cφ).
     let w = Matrix3::new(c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0) * z_body;
     ned_from_body_321(heading, w.x.atan2(w.z), (-w.y).clamp(-1.0, 1.0).asin())
+}
+
+/// Position, velocity and acceleration of a swing `reach sin(rate t + phase)` north and another east.
+fn swing(axes: [(f64, f64, f64); 2], down: f64, t: f64) -> (Vector3<f64>, Vector3<f64>, Vector3<f64>) {
+    let along = |order: i32| {
+        let [north, east] = axes.map(|(reach, rate, phase)| {
+            let angle = rate * t + phase + f64::from(order) * std::f64::consts::FRAC_PI_2;
+            reach * rate.powi(order) * angle.sin()
+        });
+        Vector3::new(north, east, 0.0)
+    };
+    (along(0) + Vector3::z() * down, along(1), along(2))
 }
 
 impl Pilot<'_> {
@@ -142,6 +176,13 @@ impl Pilot<'_> {
                 let (s, c) = (self.phase + rate * t).sin_cos();
                 let p = Vector3::new(radius_m * c, radius_m * s, down);
                 (p, Vector3::new(-s, c, 0.0) * speed_mps, Vector3::new(-c, -s, 0.0) * (speed_mps * rate))
+            }
+            HelicopterPath::Weave { reach_m, period_s } => {
+                let rate = std::f64::consts::TAU / period_s;
+                swing([(reach_m, rate, self.phase), (reach_m, 1.37 * rate, 0.0)], down, t)
+            }
+            HelicopterPath::Dash { reach_m, speed_mps } => {
+                swing([(reach_m, speed_mps / reach_m, self.phase), (0.0, 0.0, 0.0)], down, t)
             }
         };
         (p + self.offset, v, a)

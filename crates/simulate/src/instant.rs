@@ -2,6 +2,8 @@
 
 use nalgebra::{Rotation3, Vector2, Vector3};
 
+use windhover_base::geo::ned_from_body_321;
+
 /// Grid of the integrated motions, seconds.
 pub(super) const STEP_S: f64 = 0.005;
 
@@ -35,11 +37,36 @@ pub struct VehicleTruth {
     pub speed_mps: f64,
     /// Yaw rate, rad/s, clockwise from above positive.
     pub yaw_rate_radps: f64,
+    /// Pitch of its body on its springs, radians, nose up positive.
+    pub pitch_rad: f64,
+    /// Roll likewise, right side down positive.
+    pub roll_rad: f64,
+    /// How much higher than at rest its body is, metres.
+    pub lift_m: f64,
 }
 
 impl VehicleTruth {
-    /// A point of the vehicle frame (forward, right, down, metres) in NED.
+    /// Whether its body is not as it stands at rest.
+    pub fn sways(&self) -> bool {
+        self.pitch_rad != 0.0 || self.roll_rad != 0.0 || self.lift_m != 0.0
+    }
+
+    /// Where the origin of its body is, north, east, down, metres.
+    pub fn origin(&self) -> Vector3<f64> {
+        Vector3::new(self.north_m, self.east_m, -self.lift_m)
+    }
+
+    /// Attitude of its body.
+    pub fn ned_from_vehicle(&self) -> Rotation3<f64> {
+        ned_from_body_321(self.heading_rad, self.pitch_rad, self.roll_rad)
+    }
+
+    /// A point of the vehicle's body (forward, right, down, metres) in NED.
     pub fn ned_of(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        if self.sways() { self.origin() + self.ned_from_vehicle() * point } else { self.level_ned_of(point) }
+    }
+
+    fn level_ned_of(&self, point: &Vector3<f64>) -> Vector3<f64> {
         let (s, c) = self.heading_rad.sin_cos();
         Vector3::new(
             self.north_m + c * point.x - s * point.y,
@@ -50,6 +77,6 @@ impl VehicleTruth {
 
     /// North and east of the point `ahead_m` metres ahead of the rear axle.
     pub fn reference(&self, ahead_m: f64) -> Vector2<f64> {
-        self.ned_of(&Vector3::new(ahead_m, 0.0, 0.0)).xy()
+        self.level_ned_of(&Vector3::new(ahead_m, 0.0, 0.0)).xy()
     }
 }

@@ -23,7 +23,14 @@ pub(super) enum Purpose {
     GnssLine = 9,
     CompassLine = 10,
     GnssStamps = 11,
+    Latency = 12,
+    CompassSlow = 13,
+    Trim = 14,
+    Vibration = 15,
+    Riders = 16,
     Vehicle = 100,
+    Rough = 200,
+    Company = 300,
 }
 
 impl Stream {

@@ -2,12 +2,14 @@
 
 use nalgebra::Vector3;
 
+use super::misfit::Misfit;
 use super::sensor_errors::{CameraSim, CompassSim, GpsSim};
 use windhover_base::geo::Geodetic;
-use windhover_base::settings::{GroundConfig, Rig};
+use windhover_base::settings::Rig;
 use windhover_base::time::MonoTime;
 
-/// A flight to simulate. `rig` is what the pipeline is told; the rest is what really happens.
+/// A flight to simulate. `rig` is what the pipeline is told and, but for `misfit`, how things are; the rest is what
+/// really happens.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Scenario {
     /// Its name on the command line.
@@ -43,14 +45,8 @@ pub struct Scenario {
     pub camera: CameraSim,
     /// What the frames look like.
     pub scene: Scene,
-}
-
-impl Scenario {
-    /// The ground's section of a configuration: level, at the height of the origin.
-    pub fn ground(&self) -> GroundConfig {
-        let elevation_msl_m = Some(self.origin.height_m - self.geoid_m);
-        GroundConfig { elevation_msl_m, source: None, terrain: None }
-    }
+    /// In what the flight differs from `rig`.
+    pub misfit: Misfit,
 }
 
 /// The host's clock against UTC: `host = utc + offset + drift · (utc − start)`.
@@ -86,6 +82,8 @@ pub struct Helicopter {
     pub limit_mps2: f64,
     /// Drag, 1/s: acceleration per m/s of air speed.
     pub drag_per_s: f64,
+    /// Angle between the rotor's axis and the body's, degrees, in a direction drawn at random.
+    pub trim_deg: f64,
 }
 
 /// Where the helicopter is sent.
@@ -108,6 +106,20 @@ pub enum HelicopterPath {
         /// Radius, metres.
         radius_m: f64,
         /// Speed, m/s; negative turns left.
+        speed_mps: f64,
+    },
+    /// To and fro about the origin, north and, 1.37 times as often, east.
+    Weave {
+        /// How far to each side, metres.
+        reach_m: f64,
+        /// Time there and back north, seconds.
+        period_s: f64,
+    },
+    /// To and fro along the meridian of the origin.
+    Dash {
+        /// How far to each side, metres.
+        reach_m: f64,
+        /// Highest speed, m/s.
         speed_mps: f64,
     },
 }
@@ -145,6 +157,13 @@ pub enum SpeedPlan {
         mean_mps: f64,
         /// Variation, m/s rms.
         wander_mps: f64,
+    },
+    /// It stands, then goes.
+    FromRest {
+        /// When it goes, seconds.
+        rest_s: f64,
+        /// How fast, m/s.
+        speed_mps: f64,
     },
     /// It goes, stops, and, if asked, reverses and stops.
     StopAndGo {
@@ -225,6 +244,7 @@ impl Default for Helicopter {
             agitation_mps2: 0.25,
             limit_mps2: 4.0,
             drag_per_s: 0.2,
+            trim_deg: 0.0,
         }
     }
 }

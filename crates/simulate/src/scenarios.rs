@@ -1,5 +1,6 @@
 //! The named scenarios.
 
+use super::misfit::Misfit;
 use super::scenario::{
     Clock, Helicopter, HelicopterPath, Route, Scenario, Scene, SpeedPlan, VehiclePlan, Wind,
 };
@@ -141,14 +142,17 @@ const NAMES: [(&str, &str); 29] = [
 ];
 
 impl Scenario {
-    /// Name and purpose of every named scenario.
+    /// Name and purpose of every scenario that its configuration fits but for what the filter's own states take up.
     pub fn names() -> &'static [(&'static str, &'static str)] {
         &NAMES
     }
 
-    /// The scenario of this name.
+    /// The scenario of this name: one of [`Scenario::names`], of [`Scenario::composed`], or a
+    /// [`Deviation`](super::Deviation) by its name, at its usual figure.
     pub fn named(name: &str) -> Option<Self> {
-        let (name, about) = NAMES.iter().find(|(known, _)| *known == name)?;
+        let Some((name, about)) = NAMES.iter().find(|(known, _)| *known == name) else {
+            return Self::deviating(name);
+        };
         let mut scenario = Self::base(name, about);
         scenario.set_motion(name);
         scenario.set_sensors(name);
@@ -179,6 +183,7 @@ impl Scenario {
             compass: CompassSim::default(),
             camera: CameraSim::default(),
             scene: Scene::default(),
+            misfit: Misfit::default(),
         }
     }
 

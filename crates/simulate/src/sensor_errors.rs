@@ -19,6 +19,12 @@ pub struct GpsSim {
     pub latency_spread_ms: f64,
     /// Added to the latency on top, ms.
     pub latency_offset_ms: f64,
+    /// Added to that, ms one-sigma (normal, one draw a flight).
+    pub latency_sigma_ms: f64,
+    /// Time constant of a filter on the position it reports, seconds (first order; 0 for none).
+    pub position_filter_s: f64,
+    /// And on the velocity.
+    pub velocity_filter_s: f64,
     /// Jitter of the arrival, ms one-sigma.
     pub jitter_ms: f64,
     /// What the fit of arrival times leaves of the jitter in a stamp, ms one-sigma (values only:
@@ -48,6 +54,16 @@ pub struct CompassSim {
     /// How much of the true tilt it reads: 1 is perfect, 0.15 what an accelerometer sees on a
     /// rotorcraft (geometry of thrust: see ARCHITECTURE).
     pub tilt_gain: f64,
+    /// Whether it takes the direction of specific force for the vertical, as a fluid or an accelerometer does.
+    pub feels_force: bool,
+    /// Time constant of its tilt, seconds (first order; 0 for none).
+    pub tilt_lag_s: f64,
+    /// Slow error of its tilt, degrees one-sigma an axis (first-order Gauss–Markov), as an AHRS has it.
+    pub slow_tilt_deg: f64,
+    /// Its correlation time, seconds.
+    pub slow_tilt_tau_s: f64,
+    /// Iron: amplitude of a heading error that turns with the heading, degrees.
+    pub iron_deg: f64,
     /// Magnetic dip, degrees: where given, wrong tilt also enters the heading, as in a real
     /// tilt-compensated magnetic compass.
     pub dip_deg: Option<f64>,
@@ -70,6 +86,12 @@ pub struct CameraSim {
     pub period_jitter_ms: f64,
     /// Error of the driver's stamp, ms one-sigma.
     pub stamp_noise_ms: f64,
+    /// The driver's stamp is this much later than the configuration makes of it, ms.
+    pub stamp_late_ms: f64,
+    /// From the exposure of the first row to that of the last, ms. The stamp is the middle row's.
+    pub readout_ms: f64,
+    /// Vibration of the camera on its mount, degrees rms an axis.
+    pub vibration_deg: f64,
     /// From exposure to dequeuing, ms.
     pub transfer_ms: f64,
     /// Jitter of that, ms one-sigma.
@@ -122,6 +144,9 @@ impl Default for GpsSim {
             velocity_noise_mps: 0.05,
             latency_spread_ms: 25.0,
             latency_offset_ms: 0.0,
+            latency_sigma_ms: 0.0,
+            position_filter_s: 0.0,
+            velocity_filter_s: 0.0,
             jitter_ms: 4.0,
             stamp_noise_ms: 1.0,
             dropout: 0.002,
@@ -140,6 +165,11 @@ impl Default for CompassSim {
             heading_noise_deg: 0.5,
             tilt_noise_deg: 0.3,
             tilt_gain: 1.0,
+            feels_force: false,
+            tilt_lag_s: 0.0,
+            slow_tilt_deg: 0.0,
+            slow_tilt_tau_s: 30.0,
+            iron_deg: 0.0,
             dip_deg: None,
             latency_spread_ms: 4.0,
             latency_offset_ms: 0.0,
@@ -155,6 +185,9 @@ impl Default for CameraSim {
         Self {
             period_jitter_ms: 0.5,
             stamp_noise_ms: 0.05,
+            stamp_late_ms: 0.0,
+            readout_ms: 0.0,
+            vibration_deg: 0.0,
             transfer_ms: 45.0,
             transfer_jitter_ms: 3.0,
             dropped: 0.005,

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use nalgebra::{Matrix2, Vector2, Vector3};
 
 use super::camera::{Exposures, FrameTruth, MarkerTruth};
+use super::company::Looks;
 use super::compass::{Compass, CompassSample};
 use super::gnss::{GnssReceiver, GnssSample};
 use super::random::{Purpose, Stream};
@@ -56,11 +57,21 @@ impl Sample {
     }
 }
 
-/// A ground point being followed.
+/// Share of the features that are found on what moves in view, where something does.
+const RIDERS: f64 = 1.0 / 3.0;
+
+/// A point being followed: of the ground, or of the body of a companion.
 #[derive(Clone, Copy, Debug)]
 struct Followed {
     id: u64,
-    ned_m: Vector3<f64>,
+    at_m: Vector3<f64>,
+    on: Option<usize>,
+}
+
+impl Followed {
+    fn ned(&self, world: &World, t: MonoTime) -> Vector3<f64> {
+        self.on.map_or(self.at_m, |mover| world.mover(mover, t).ned_of(&self.at_m))
+    }
 }
 
 /// The sensors of one flight. An iterator of [`Sample`]s in order of arrival; nothing is allocated
@@ -73,6 +84,7 @@ pub struct SensorSuite {
     exposures: (Exposures, Option<FrameTruth>),
     markers: Stream,
     features: Stream,
+    riders: Stream,
     followed: Vec<Option<Followed>>,
     next_id: u64,
     seq: u64,
@@ -95,6 +107,7 @@ impl SensorSuite {
             exposures: (exposures, first.2),
             markers: Stream::of(seed, Purpose::Markers),
             features: Stream::of(seed, Purpose::Features),
+            riders: Stream::of(seed, Purpose::Riders),
             followed: vec![None; features],
             next_id: 0,
             seq: 0,
@@ -164,17 +177,41 @@ impl SensorSuite {
 
     fn see_markers(&mut self, t: MonoTime) {
         let world = Arc::clone(&self.world);
-        let pose = world.camera_pose(t);
-        for target in 0..world.vehicles() {
-            let vehicle = world.vehicle(target, t);
-            for marker in 0..world.scenario().rig.target[target].marker.len() {
-                let Some(truth) = world.marker(target, marker, &vehicle, &pose, t) else { continue };
-                self.truths.push(truth);
+        for mover in 0..world.movers() {
+            let (target, looks) = match world.looks(mover).1 {
+                None => (mover, None),
+                Some(Looks::Double) => (0, Some(Looks::Double)),
+                Some(_) => continue,
+            };
+            for marker in 0..world.rig().target[target].marker.len() {
+                let Some(truth) = world.marker_on(mover, target, marker, t) else { continue };
+                if looks.is_none() {
+                    self.truths.push(truth);
+                }
                 if let Some(seen) = see_marker(&world, &mut self.markers, &truth) {
                     self.observations.markers.push(seen);
                 }
             }
         }
+    }
+
+    /// A point on something that moves along, now and then.
+    fn rider(&mut self) -> Option<Followed> {
+        let first = self.world.vehicles();
+        let companions = self.world.movers() - first;
+        if companions == 0 {
+            return None;
+        }
+        let rides = self.riders.chance(RIDERS);
+        let on = first + self.riders.uniform(0.0, companions as f64) as usize;
+        let place = [self.riders.uniform(-1.0, 1.0), self.riders.uniform(-1.0, 1.0)];
+        // On top of a person or on the roof.
+        let (half, height) = match self.world.looks(on).1 {
+            Some(Looks::Person) => ((0.15, 0.2), 1.6),
+            _ => ((0.5, 0.3), 0.55),
+        };
+        let at_m = Vector3::new(half.0 * place[0], half.1 * place[1], -height);
+        rides.then_some(Followed { id: self.next_id, at_m, on: Some(on) })
     }
 
     /// Follows ground points: those out of view or under a vehicle are given up, others found, each
@@ -186,7 +223,9 @@ impl SensorSuite {
         let gap_s = self.last_frame.map_or(0.0, |last| (t - last).s());
         let columns = (self.followed.len() as f64).sqrt().ceil().max(1.0) as usize;
         let rows = self.followed.len().div_ceil(columns).max(1);
-        for (slot, followed) in self.followed.iter_mut().enumerate() {
+        for slot in 0..self.followed.len() {
+            let rider = self.rider();
+            let followed = &mut self.followed[slot];
             let lost = self.features.chance(1.0 - (-gap_s / sim.feature_life_s.max(1e-3)).exp());
             let place = (self.features.uniform(0.05, 0.95), self.features.uniform(0.05, 0.95));
             let noise = Vector2::new(self.features.normal(), self.features.normal());
@@ -194,19 +233,20 @@ impl SensorSuite {
             if lost || gap_s > 0.5 {
                 *followed = None;
             }
-            let in_view = |point: &Vector3<f64>| -> Option<Vector2<f64>> {
-                let px = world.project(&pose, point)?;
-                (world.in_frame(&px, 8.0) && !world.covered_by_vehicle(point, t)).then_some(px)
+            let in_view = |point: &Followed| -> Option<Vector2<f64>> {
+                let px = world.seen(t, |t| point.ned(&world, t))?;
+                let hidden = point.on.is_none() && world.covered_by_vehicle(&point.at_m, t);
+                (world.in_frame(&px, 8.0) && !hidden).then_some(px)
             };
-            let mut px = followed.as_ref().and_then(|f| in_view(&f.ned_m));
+            let mut px = followed.as_ref().and_then(in_view);
             if px.is_none() {
                 let (column, row) = (slot % columns, slot / columns);
                 let u = (column as f64 + place.0) / columns as f64 * f64::from(camera.width);
                 let v = (row as f64 + place.1) / rows as f64 * f64::from(camera.height);
-                *followed = world
-                    .ground_at(&pose, Vector2::new(u, v))
-                    .map(|ned_m| Followed { id: self.next_id, ned_m });
-                px = followed.as_ref().and_then(|f| in_view(&f.ned_m));
+                let ground = world.ground_at(&pose, Vector2::new(u, v));
+                let ground = ground.map(|at_m| Followed { id: self.next_id, at_m, on: None });
+                *followed = rider.filter(|rider| in_view(rider).is_some()).or(ground);
+                px = followed.as_ref().and_then(in_view);
                 if px.is_some() {
                     self.next_id += 1;
                 } else {
@@ -238,7 +278,7 @@ fn see_marker(world: &World, stream: &mut Stream, truth: &MarkerTruth) -> Option
         true => Vector2::new(bearing.cos(), bearing.sin()) * reach_px,
         false => Vector2::zeros(),
     };
-    let config = &world.scenario().rig.target[truth.target].marker[truth.marker];
+    let config = &world.rig().target[truth.target].marker[truth.marker];
     let edges = [(0, 1), (1, 2), (2, 3), (3, 0)].map(|(a, b)| {
         let (a, b): (usize, usize) = (a, b);
         (truth.corners_px[a] - truth.corners_px[b]).norm()

@@ -37,9 +37,8 @@ pub fn vehicle_row(world: &World, target: usize, frame: &FrameTruth) -> String {
         place.lat_deg,
         place.lon_deg
     );
-    let pose = world.camera_pose(frame.t_true);
     for marker in 0..config.marker.len() {
-        match world.marker(target, marker, &vehicle, &pose, frame.t_true) {
+        match world.marker(target, marker, frame.t_true) {
             Some(seen) => {
                 let (visible, px) = (u8::from(seen.visible), seen.center_px);
                 let _ = write!(row, ",{visible},{:.3},{:.3}", px.x, px.y);

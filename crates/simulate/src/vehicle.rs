@@ -1,8 +1,10 @@
 //! How a ground vehicle moves: a driver, a drive and a steering gear with lag, on level ground.
 
 use super::instant::{STEP_S, VehicleTruth};
+use super::misfit::Driving;
 use super::ode::Table;
 use super::random::{Purpose, Stream, Wander};
+use super::rough::Rough;
 use super::scenario::{Route, SpeedPlan, VehiclePlan};
 use windhover_base::geo::wrap_angle;
 use windhover_base::settings::{TargetConfig, TargetModel};
@@ -16,6 +18,8 @@ const STEERING_S: f64 = 0.25;
 const STEERING_LIMIT: f64 = 0.61;
 /// Largest yaw rate of a vehicle that turns on the spot, rad/s.
 const TURN_LIMIT: f64 = 1.5;
+/// A vehicle that turns on the spot does so every so often, after having driven so long, seconds.
+const SPIN_S: (f64, f64) = (10.0, 5.0);
 /// How far ahead on its route a driver looks, seconds of travel, and at least this many metres.
 const LOOK_AHEAD: (f64, f64) = (0.8, 1.0);
 /// How quickly a driver finds the route's nearest point again, 1/s.
@@ -31,6 +35,7 @@ pub(super) struct VehicleMotion {
     wheelbase_m: f64,
     table: Option<Table<STATES>>,
     parked: (f64, f64, f64),
+    rough: Rough,
 }
 
 struct Driver {
@@ -39,17 +44,21 @@ struct Driver {
     wheelbase_m: f64,
     speed: Wander,
     wheel: Wander,
+    driving: Driving,
+    rough: Rough,
 }
 
 impl VehicleMotion {
     pub(super) fn new(
         plan: &VehiclePlan,
         target: &TargetConfig,
+        driving: &Driving,
         index: usize,
         seed: u64,
         span_s: (f64, f64),
     ) -> Self {
         let mut stream = Stream::new(seed, Purpose::Vehicle as u64 + index as u64);
+        let rough = Rough::new(driving, index, seed);
         let random_heading = stream.uniform(-180.0, 180.0);
         let (north_m, east_m, heading_deg) = plan.start;
         let heading = heading_deg.unwrap_or(random_heading).to_radians();
@@ -57,7 +66,7 @@ impl VehicleMotion {
         let stands = matches!(plan.speed, SpeedPlan::Parked) || target.model == TargetModel::Static;
         if stands {
             let parked = (north_m, east_m, wrap_angle(heading));
-            return Self { model: target.model, wheelbase_m, table: None, parked };
+            return Self { model: target.model, wheelbase_m, table: None, parked, rough };
         }
         let curvature = match plan.route {
             Route::Free { curvature_per_m } => curvature_per_m,
@@ -73,21 +82,32 @@ impl VehicleMotion {
             wheelbase_m,
             speed: Wander::new(wander_mps, 4.0, 20.0, &mut stream),
             wheel: Wander::new(curvature, 4.0, 18.0, &mut stream),
+            driving: *driving,
+            rough: rough.clone(),
         };
         let theta = stream.uniform(0.0, std::f64::consts::TAU);
         let start = driver.start_state((north_m, east_m, heading), theta, span_s.0);
         let table = Table::integrate(|t, y| driver.derivative(t, y), start, span_s, STEP_S);
-        Self { model: target.model, wheelbase_m, table: Some(table), parked: (0.0, 0.0, 0.0) }
+        Self { model: target.model, wheelbase_m, table: Some(table), parked: (0.0, 0.0, 0.0), rough }
     }
 
     pub(super) fn at(&self, t_s: f64) -> VehicleTruth {
         let Some(table) = &self.table else {
             let (north_m, east_m, heading_rad) = self.parked;
-            return VehicleTruth { north_m, east_m, heading_rad, ..VehicleTruth::default() };
+            let vehicle = VehicleTruth { north_m, east_m, heading_rad, ..VehicleTruth::default() };
+            return self.rough.swayed(t_s, vehicle);
         };
         let [north_m, east_m, heading, speed_mps, _, steering, _] = table.at(t_s);
         let yaw_rate_radps = yaw_rate(self.model, self.wheelbase_m, speed_mps, steering);
-        VehicleTruth { north_m, east_m, heading_rad: wrap_angle(heading), speed_mps, yaw_rate_radps }
+        let vehicle = VehicleTruth {
+            north_m,
+            east_m,
+            heading_rad: wrap_angle(heading),
+            speed_mps,
+            yaw_rate_radps,
+            ..VehicleTruth::default()
+        };
+        self.rough.swayed(t_s, vehicle)
     }
 }
 
@@ -131,9 +151,16 @@ impl Driver {
         }
     }
 
+    /// Whether it stands and turns on the spot, or stops to do so.
+    fn spins(&self, t: f64) -> bool {
+        self.driving.spin_radps != 0.0 && t.rem_euclid(SPIN_S.0) >= SPIN_S.1
+    }
+
     fn wanted_speed(&self, t: f64) -> f64 {
         match self.plan.speed {
             SpeedPlan::Parked => 0.0,
+            _ if self.spins(t) => 0.0,
+            SpeedPlan::FromRest { rest_s, speed_mps } => speed_mps * f64::from(u8::from(t >= rest_s)),
             SpeedPlan::Cruise { mean_mps, .. } => mean_mps + self.speed.at(t),
             SpeedPlan::StopAndGo { speed_mps, go_s, stop_s, reverse_mps } => {
                 let legs = if reverse_mps > 0.0 { 2.0 } else { 1.0 };
@@ -169,16 +196,19 @@ impl Driver {
         let mut wanted_mps = self.wanted_speed(t);
         let wanted_steering = match self.model {
             TargetModel::Ackermann => soft_limit((self.wheelbase_m * curvature).atan(), STEERING_LIMIT),
+            _ if self.spins(t) => self.driving.spin_radps,
             _ => {
                 // A vehicle that turns on the spot turns first and drives then.
                 wanted_mps *= bearing.cos().max(0.0).powi(2);
                 soft_limit(curvature * speed.abs().max(0.3), TURN_LIMIT)
             }
         };
-        let jerk = DRIVE_RATE * (DRIVE_RATE * (wanted_mps - speed) - 2.0 * acceleration);
+        let rate = self.driving.drive_rate.unwrap_or(DRIVE_RATE);
+        let jerk = rate * (rate * (wanted_mps - speed) - 2.0 * acceleration);
+        let (north, east) = self.rough.course(t, heading, speed);
         [
-            speed * heading.cos(),
-            speed * heading.sin(),
+            north,
+            east,
             yaw_rate(self.model, self.wheelbase_m, speed, steering),
             acceleration,
             jerk,

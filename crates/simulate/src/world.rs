@@ -1,42 +1,63 @@
 //! The truth: where everything is at any time of the flight.
 
+use nalgebra::Rotation3;
+
+use super::company::{Companion, Looks};
 use super::helicopter::HelicopterMotion;
 use super::instant::{OwnshipTruth, VehicleTruth};
+use super::random::{Purpose, Stream, Wander};
 use super::scenario::Scenario;
 use super::vehicle::VehicleMotion;
-use windhover_base::geo::LocalFrame;
+use windhover_base::geo::{LocalFrame, ned_from_body_321};
+use windhover_base::settings::{Rig, TargetConfig};
 use windhover_base::time::{MonoTime, Span, UtcTime};
 
 /// Motion starts this long before the flight, so that every loop has settled, seconds.
 const SETTLE_S: f64 = 8.0;
 /// And goes on this long after it, seconds.
 const AFTER_S: f64 = 1.0;
+/// Periods of a camera's vibration, seconds.
+const VIBRATION_S: (f64, f64) = (0.02, 0.06);
 
 /// The motion of everything in a scenario. Deterministic in scenario and seed.
 #[derive(Clone, Debug)]
 pub struct World {
     scenario: Scenario,
+    rig: Rig,
     seed: u64,
     frame: LocalFrame,
     vehicles: Vec<VehicleMotion>,
+    companions: Vec<Companion>,
     helicopter: HelicopterMotion,
+    /// Turns of the camera about its axes, radians.
+    vibration: Option<[Wander; 3]>,
 }
 
 impl World {
     /// Integrates the motions of a scenario.
     pub fn new(scenario: Scenario, seed: u64) -> Self {
         let span_s = (-SETTLE_S, scenario.duration_s + AFTER_S);
-        let plans = scenario.vehicles.iter().zip(&scenario.rig.target).enumerate();
+        let rig = scenario.misfit.flown(&scenario.rig);
+        let driving = &scenario.misfit.driving;
+        let plans = scenario.vehicles.iter().zip(&rig.target).enumerate();
         let vehicles: Vec<_> = plans
-            .map(|(index, (plan, target))| VehicleMotion::new(plan, target, index, seed, span_s))
+            .map(|(index, (plan, target))| VehicleMotion::new(plan, target, driving, index, seed, span_s))
             .collect();
+        let companions = Companion::all(&scenario.misfit.company, seed);
         let helicopter = HelicopterMotion::new(&scenario.helicopter, &scenario.wind, &vehicles, seed, span_s);
-        Self { frame: LocalFrame::new(scenario.origin), scenario, seed, vehicles, helicopter }
+        let vibration = vibration(scenario.camera.vibration_deg, seed);
+        let frame = LocalFrame::new(scenario.origin);
+        Self { scenario, rig, seed, frame, vehicles, companions, helicopter, vibration }
     }
 
     /// What it was made of.
     pub fn scenario(&self) -> &Scenario {
         &self.scenario
+    }
+
+    /// The instruments and targets as they really are.
+    pub fn rig(&self) -> &Rig {
+        &self.rig
     }
 
     /// The seed it was made with.
@@ -92,4 +113,38 @@ impl World {
     pub fn vehicle(&self, target: usize, t: MonoTime) -> VehicleTruth {
         self.vehicles[target].at(self.seconds(t))
     }
+
+    /// How many vehicles and other things move in view.
+    pub(super) fn movers(&self) -> usize {
+        self.vehicles.len() + self.companions.len()
+    }
+
+    /// The vehicle, or beyond the vehicles the companion, of this number at host time `t`.
+    pub(super) fn mover(&self, index: usize, t: MonoTime) -> VehicleTruth {
+        match index.checked_sub(self.vehicles.len()) {
+            None => self.vehicle(index, t),
+            Some(companion) => self.companions[companion].at(&self.vehicles[0], self.seconds(t)),
+        }
+    }
+
+    /// The target it is or, of a companion, what it looks like.
+    pub(super) fn looks(&self, index: usize) -> (&TargetConfig, Option<Looks>) {
+        match index.checked_sub(self.vehicles.len()) {
+            None => (&self.rig.target[index], None),
+            Some(companion) => (&self.rig.target[0], Some(self.companions[companion].looks)),
+        }
+    }
+
+    /// A camera's attitude with what its vibration adds at host time `t`.
+    pub(super) fn shaken(&self, t: MonoTime, body_from_camera: Rotation3<f64>) -> Rotation3<f64> {
+        let Some(axes) = &self.vibration else { return body_from_camera };
+        let [yaw, pitch, roll] = axes.each_ref().map(|axis| axis.at(self.seconds(t)));
+        ned_from_body_321(yaw, pitch, roll) * body_from_camera
+    }
+}
+
+fn vibration(rms_deg: f64, seed: u64) -> Option<[Wander; 3]> {
+    let mut stream = Stream::of(seed, Purpose::Vibration);
+    let mut axis = || Wander::new(rms_deg.to_radians(), VIBRATION_S.0, VIBRATION_S.1, &mut stream);
+    (rms_deg != 0.0).then(|| [axis(), axis(), axis()])
 }

@@ -58,6 +58,7 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
     let mut paper = CsvTable::create(out, "paper.csv", ESTIMATE_COLUMNS)?;
     let mut detections = CsvTable::create(out, "detections.csv", DETECTION_COLUMNS)?;
     let mut ownship = CsvTable::create(out, "ownship.csv", OWNSHIP_COLUMNS)?;
+    let mut ownship_rows: Vec<(i64, String)> = Vec::new();
     let mut datum: Option<Datum> = None;
     let mut damaged = Vec::new();
     for message in reader.by_ref() {
@@ -67,11 +68,10 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
                 detection_rows(&seen).iter().try_for_each(|row| detections.row(row))?;
             }
         } else if name == topic::OWNSHIP {
-            if let Some(own) = decoded::<Ownship>(&message, &mut damaged) {
-                ownship.row(&ownship_row(&own))?;
-            }
+            ownship_rows.extend(decoded::<Ownship>(&message, &mut damaged).map(|own| ownship_row(&own)));
         } else if name == topic::DATUM {
-            datum = datum.or_else(|| decoded::<Datum>(&message, &mut damaged));
+            // One that moved holds.
+            datum = decoded::<Datum>(&message, &mut damaged).or(datum);
         } else if let Some(kind) = name.strip_prefix("/target/").and_then(|rest| rest.rsplit('/').next()) {
             let (table, covariance) = match kind {
                 "state" => (&mut estimates, true),
@@ -84,6 +84,9 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
             }
         }
     }
+    // A frame is looked at some time after its exposure, when later instants are in the flight already.
+    ownship_rows.sort_by_key(|(time, _)| *time);
+    ownship_rows.iter().try_for_each(|(_, row)| ownship.row(row))?;
     let mut warnings = reader.take_warnings();
     warnings.extend(damaged);
     let mut exported = Exported { files: Vec::new(), warnings };
@@ -150,11 +153,12 @@ fn detection_row(time: i64, frame: u32, m: &Marker) -> String {
     row
 }
 
-fn ownship_row(o: &Ownship) -> String {
+/// The row, and its time; without a number where it belongs to no frame.
+fn ownship_row(o: &Ownship) -> (i64, String) {
     let time = host_time(o.timestamp.as_ref()).ns();
-    format!(
-        "{time},{},{:.10},{:.10},{:.4},{:.6},{:.6},{:.6},{:.6},{:.6},{:.6},{:.9},{:.9},{:.9},{:.9}",
-        o.frame,
+    let frame = if o.between_frames { String::new() } else { o.frame.to_string() };
+    let row = format!(
+        "{time},{frame},{:.10},{:.10},{:.4},{:.6},{:.6},{:.6},{:.6},{:.6},{:.6},{:.9},{:.9},{:.9},{:.9}",
         o.lat_deg,
         o.lon_deg,
         o.height_m,
@@ -168,5 +172,6 @@ fn ownship_row(o: &Ownship) -> String {
         o.qx,
         o.qy,
         o.qz
-    )
+    );
+    (time, row)
 }

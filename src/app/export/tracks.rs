@@ -23,7 +23,7 @@ pub(super) struct Point {
     pub(super) sigma_m: Option<f64>,
 }
 
-/// Tracks by name: `target/NAME` and `helicopter`; only what was tracked or predicted.
+/// Tracks by name: `target/NAME` and `helicopter`, in order of time; only what was tracked or predicted.
 pub(super) fn read(reader: &mut McapReader) -> BTreeMap<String, Vec<Point>> {
     let mut tracks: BTreeMap<String, Vec<Point>> = BTreeMap::new();
     for message in reader.by_ref() {
@@ -41,6 +41,7 @@ pub(super) fn read(reader: &mut McapReader) -> BTreeMap<String, Vec<Point>> {
             tracks.entry(format!("target/{}", state.target)).or_default().push(target_point(&state));
         }
     }
+    tracks.values_mut().for_each(|points| points.sort_by_key(|point| point.t));
     tracks
 }
 

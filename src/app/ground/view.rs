@@ -285,9 +285,14 @@ impl Payload {
                     "dropped": s.dropped})
             })
             .collect();
+        let misfits: Vec<Value> = health
+            .misfits
+            .iter()
+            .map(|m| json!({"source": m.source, "figure": m.figure, "cause": m.cause, "advice": m.advice}))
+            .collect();
         let text: Arc<str> = json!({"k": "health", "p": name, "t": ms(t), "sources": sources,
             "fix": health.fix, "sats": health.sats, "clock_sigma_ms": health.clock_sigma_ms,
-            "words": health.words})
+            "misfits": misfits, "words": health.words})
         .to_string()
         .into();
         if self.health.as_ref().is_none_or(|(last, _)| *last <= t.ns()) {

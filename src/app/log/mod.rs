@@ -254,6 +254,7 @@ pub(super) mod tests {
                     source: Some(windhover_base::msg::Source::Camera),
                     target: None,
                     detail: "too short".into(),
+                    misfit: None,
                 });
             }
             events::OperatorEvent::Ready.emit("", "after 1.0 s");

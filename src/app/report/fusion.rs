@@ -9,11 +9,15 @@ use crate::plot::{Ink, Mark};
 use windhover_base::msg::{Disposition, FusionSource};
 
 /// Sources in the order of the page, with the unit and the scale their innovations are shown in.
-const SOURCES: [(FusionSource, &str, f64); 6] = [
+const SOURCES: [(FusionSource, &str, f64); 10] = [
     (FusionSource::GpsPosition, "m", 1.0),
     (FusionSource::GpsVelocity, "m/s", 1.0),
     (FusionSource::CompassHeading, "°", 180.0 / std::f64::consts::PI),
     (FusionSource::CompassTilt, "°", 180.0 / std::f64::consts::PI),
+    (FusionSource::AttitudeHeading, "°", 180.0 / std::f64::consts::PI),
+    (FusionSource::AttitudeTilt, "°", 180.0 / std::f64::consts::PI),
+    (FusionSource::ImuRate, "°/s", 180.0 / std::f64::consts::PI),
+    (FusionSource::ImuForce, "m/s²", 1.0),
     (FusionSource::Marker, "px", 1.0),
     (FusionSource::Feature, "px", 1.0),
 ];
@@ -73,8 +77,9 @@ fn innovation_chart(context: &Context<'_>, source: FusionSource, unit: &str, sca
     let of_source = || context.flight.fusion.iter().filter(move |f| f.source == source.name());
     let parts: &[&str] = match source {
         FusionSource::GpsPosition | FusionSource::GpsVelocity => &["north", "east", "down"],
-        FusionSource::CompassHeading => &["heading"],
-        FusionSource::CompassTilt => &["first axis", "second axis"],
+        FusionSource::CompassHeading | FusionSource::AttitudeHeading => &["heading"],
+        FusionSource::CompassTilt | FusionSource::AttitudeTilt => &["first axis", "second axis"],
+        FusionSource::ImuRate | FusionSource::ImuForce => &["forward", "right", "down"],
         FusionSource::Marker | FusionSource::Feature => &["u", "v"],
     };
     let points = |k: usize, refused: bool| -> Vec<[f64; 2]> {

@@ -17,11 +17,8 @@ pub(super) fn section(context: &Context<'_>, pictures: &Pictures) -> Option<Sect
     for (name, track) in &context.flight.targets {
         body += &paragraph(&of_target(context, name, track));
     }
-    if context.flight.targets.is_empty() {
-        body += &paragraph(
-            "It holds no estimates: it is a bare capture. Replay it (windhover replay CAPTURE.mcap --out \
-             FLIGHT.mcap) and report the result.",
-        );
+    if let Some(words) = without_targets(context) {
+        body += &paragraph(words);
     }
     body += &tiles(&figures(context));
     let troubles = troubles(context, pictures);
@@ -32,6 +29,22 @@ pub(super) fn section(context: &Context<'_>, pictures: &Pictures) -> Option<Sect
         body += &list("", &troubles);
     }
     Some(Section { id: "summary", title: "Summary", body })
+}
+
+/// What to say where there is nothing of any vehicle.
+fn without_targets(context: &Context<'_>) -> Option<&'static str> {
+    let flight = context.flight;
+    match (flight.targets.is_empty(), flight.ownship.is_empty()) {
+        (false, _) => None,
+        (true, false) => Some(
+            "No frame came from the camera, so no vehicle was looked for: the report tells of the helicopter's own \
+             flight alone.",
+        ),
+        (true, true) => Some(
+            "It holds no estimates: it is a bare capture. Replay it (windhover replay CAPTURE.mcap --out \
+             FLIGHT.mcap) and report the result.",
+        ),
+    }
 }
 
 fn opening(context: &Context<'_>) -> String {
@@ -175,6 +188,9 @@ fn figures(context: &Context<'_>) -> Vec<(String, String)> {
 fn troubles(context: &Context<'_>, pictures: &Pictures) -> Vec<String> {
     let flight = context.flight;
     let mut found = flight.warnings.clone();
+    if !flight.had_frames() && !flight.health.is_empty() {
+        found.push("No frame came from the camera.".to_owned());
+    }
     for stream in streams(context) {
         let Some(t) = stream.timing() else { continue };
         if t.longest.0 > LONG_GAP * t.median_ms && t.longest.0 > 333.0 {
@@ -192,6 +208,7 @@ fn troubles(context: &Context<'_>, pictures: &Pictures) -> Vec<String> {
             ));
         }
     }
+    found.extend(misfits(context));
     if let Some(last) = flight.health.last() {
         for s in &last.sources {
             if s.refused > 0 {
@@ -224,4 +241,51 @@ fn troubles(context: &Context<'_>, pictures: &Pictures) -> Vec<String> {
         found.push(format!("{} of the frames looked at could not be read.", pictures.unreadable));
     }
     found
+}
+
+/// What did not fit the configuration: each thing once, as it was told last, and from when to when.
+fn misfits(context: &Context<'_>) -> Vec<String> {
+    let mut known: Vec<(&wh::Misfit, f64, f64)> = Vec::new();
+    for health in &context.flight.health {
+        let t = context.flight.at(health.timestamp.as_ref());
+        for misfit in &health.misfits {
+            let same = |m: &wh::Misfit| m.source == misfit.source && m.kind == misfit.kind;
+            match known.iter_mut().find(|(known, ..)| same(known)) {
+                Some((last, _, until)) => (*last, *until) = (misfit, t),
+                None => known.push((misfit, t, t)),
+            }
+        }
+    }
+    let sentence = |(m, from, until): &(&wh::Misfit, f64, f64)| {
+        let wh::Misfit { source, figure, cause, advice, .. } = m;
+        format!("{source} does not fit, {from:.0} to {until:.0} s: {cause} ({figure}). What to do: {advice}.")
+    };
+    known.iter().map(sentence).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::app::flight::Flight;
+
+    #[test]
+    fn what_did_not_fit_is_worth_a_look_once_with_its_last_figure() {
+        let misfit = |figure: &str| wh::Misfit {
+            source: "ugv tag 1".into(),
+            kind: "marker_size".into(),
+            figure: figure.into(),
+            cause: format!("tag 1 is wrong by {figure}"),
+            advice: "measure it".into(),
+        };
+        let health = |misfits| wh::Health { misfits, ..wh::Health::default() };
+        let health = vec![health(vec![]), health(vec![misfit("-4 %")]), health(vec![misfit("-5 %")])];
+        let flight = Flight { health, ..Flight::default() };
+        let page = section(&Context { flight: &flight, truth: None }, &Pictures::default());
+        let body = page.expect("there is always a summary").body;
+        assert!(
+            body.contains("Worth a look") && body.contains("-5 %") && body.contains("measure it"),
+            "{body}"
+        );
+        assert_eq!(body.matches("does not fit").count(), 1, "{body}");
+    }
 }

@@ -7,6 +7,7 @@ use serde_json::json;
 
 use super::target::{Board, Target, TargetArgs, positive};
 use crate::cli::{CliError, CliResult};
+use crate::pixels;
 use crate::plot;
 use crate::plot::intrinsics::{coverage_advice, coverage_svg, per_view_svg, residuals_svg};
 use windhover_base::msg::GrayImage;
@@ -116,9 +117,12 @@ fn look_at(args: &Args) -> Result<(Vec<Photo>, (usize, usize)), CliError> {
 }
 
 fn read(path: &Path) -> Result<GrayImage, String> {
-    let image = image::open(path).map_err(|e| format!("cannot be read: {e}"))?.into_luma8();
-    let (width, height) = (image.width() as usize, image.height() as usize);
-    GrayImage::from_vec(width, height, image.into_raw()).ok_or_else(|| "has an impossible size".into())
+    let bytes = std::fs::read(path).map_err(|e| format!("cannot be read: {e}"))?;
+    match pixels::picture(&bytes) {
+        Ok((image, missing)) if missing.is_empty() => Ok(image),
+        Ok(_) => Err("is damaged: parts of it are missing".to_owned()),
+        Err(reason) => Err(format!("cannot be read: {reason}")),
+    }
 }
 
 fn corners_of(image: &GrayImage, target: Target, window_px: f64) -> Result<PlaneView, String> {

@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use super::{ImportError, parse_time};
+use super::ImportError;
+use super::stamp::timed;
 use windhover_base::time::MonoTime;
 
 /// What a line of the log had on the wire, with its time. Lines without a time are told, by number,
@@ -15,7 +16,7 @@ pub struct SerialLog {
     pub untimed: Vec<usize>,
 }
 
-/// Reads a log of which each line starts with a time and one space.
+/// Reads a log of which each line starts with a time and a blank.
 pub fn read_serial_log(path: &Path) -> Result<SerialLog, ImportError> {
     let bytes = std::fs::read(path).map_err(|e| ImportError::io(path, e))?;
     let mut log = SerialLog::default();
@@ -35,15 +36,9 @@ pub fn read_serial_log(path: &Path) -> Result<SerialLog, ImportError> {
     }
     if log.lines.is_empty() {
         let line = log.untimed.first().copied().unwrap_or(1);
-        let reason = "no line starts with a time (seconds or ISO 8601) and one space";
+        let reason = "no line starts with a time (seconds, or a date and time) and a blank";
         return Err(ImportError::line(path, line, reason));
     }
     log.lines.sort_by_key(|(t, _)| *t);
     Ok(log)
-}
-
-fn timed(line: &[u8]) -> Option<(MonoTime, &[u8])> {
-    let space = line.iter().position(|b| *b == b' ')?;
-    let t = parse_time(std::str::from_utf8(&line[..space]).ok()?)?;
-    Some((t, &line[space + 1..]))
 }

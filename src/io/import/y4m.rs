@@ -65,9 +65,15 @@ fn read_header(input: &mut impl BufRead, path: &Path) -> Result<Header, ImportEr
         s if s.contains("p1") || s.contains("mono1") => return Err(refused("has more than 8 bits a sample")),
         s if s.starts_with("mono") => 0,
         s if s.starts_with("422") => 2 * half(width) * height,
+        s if s.starts_with("444alpha") => 3 * width * height,
         s if s.starts_with("444") => 2 * width * height,
+        s if s.starts_with("440") => 2 * width * half(height),
+        s if s.starts_with("411") => 2 * width.div_ceil(4) * height,
+        s if s.starts_with("410") => 2 * width.div_ceil(4) * height.div_ceil(4),
         s if s.starts_with("420") => 2 * half(width) * half(height),
-        _ => return Err(refused("has a chroma layout that is not read here; use 420, 422, 444 or mono")),
+        _ => {
+            return Err(refused("has a chroma layout that is not read here; use 420, 422, 444, 411 or mono"));
+        }
     };
     let rate_hz = rate_hz.ok_or_else(|| refused("its Y4M header gives no frame rate"))?;
     Ok(Header { width, height, rate_hz, chroma })
@@ -118,5 +124,43 @@ impl<R: BufRead> Reader<R> {
         let frame = grey(self.index, t, width as u32, height as u32, luma);
         self.index += 1;
         Ok(Some(frame))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn luma_is_found_in_every_layout() {
+        // 5 by 3 pixels, so that halves and quarters are rounded up.
+        let layouts = [
+            ("420", 12),
+            ("420jpeg", 12),
+            ("420mpeg2", 12),
+            ("420paldv", 12),
+            ("422", 18),
+            ("444", 30),
+            ("444alpha", 45),
+            ("440", 20),
+            ("411", 12),
+            ("410", 4),
+            ("mono", 0),
+        ];
+        for (layout, chroma) in layouts {
+            let mut video = format!("YUV4MPEG2 W5 H3 F30:1 Ip A1:1 C{layout}\n").into_bytes();
+            for frame in 0..3u8 {
+                video.extend_from_slice(b"FRAME\n");
+                video.extend(std::iter::repeat_n(frame, 15));
+                video.extend(std::iter::repeat_n(200, chroma));
+            }
+            let frames = frames(std::io::Cursor::new(video), Path::new("x.y4m"), MonoTime::default());
+            let frames: Vec<_> = frames.expect("a header").collect();
+            assert_eq!(frames.len(), 3, "{layout}");
+            for (index, frame) in frames.into_iter().enumerate() {
+                let frame = frame.expect("a frame");
+                assert!(frame.data.iter().all(|level| usize::from(*level) == index), "{layout} {index}");
+            }
+        }
     }
 }

@@ -1,12 +1,12 @@
 //! Protobuf messages of what the pipeline says: our own, and Foxglove's where a schema exists.
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::{SMatrix, UnitQuaternion, Vector3};
 use prost_types::Timestamp;
 
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
 use windhover_base::msg::{
-    FeatureTrack, FixKind, Health, MarkerDetection, MarkerId, Notice, NoticeKind, Ownship, SourceHealth,
-    TargetEstimate, TrackStatus,
+    FeatureTrack, FixKind, Health, MarkerDetection, MarkerId, MisfitWords, Notice, NoticeKind, Ownship,
+    SourceHealth, TargetEstimate, TrackStatus,
 };
 use windhover_base::time::MonoTime;
 
@@ -35,7 +35,15 @@ pub(super) fn fix_number(fix: FixKind) -> u32 {
     match fix {
         FixKind::None => 0,
         FixKind::TwoD => 2,
-        FixKind::ThreeD => 3,
+        FixKind::ThreeD | FixKind::RtkFloat | FixKind::RtkFixed => 3,
+    }
+}
+
+pub(super) fn rtk(fix: FixKind) -> wh::Rtk {
+    match fix {
+        FixKind::RtkFloat => wh::Rtk::Float,
+        FixKind::RtkFixed => wh::Rtk::Fixed,
+        FixKind::None | FixKind::TwoD | FixKind::ThreeD => wh::Rtk::None,
     }
 }
 
@@ -137,7 +145,7 @@ pub fn ownship(own: &Ownship) -> wh::Ownship {
     let q = own.ned_from_body.quaternion();
     wh::Ownship {
         timestamp: stamp(own.t_valid),
-        frame: own.frame,
+        frame: own.frame.unwrap_or(0),
         lat_deg: own.lat_deg,
         lon_deg: own.lon_deg,
         height_m: own.height_m,
@@ -151,9 +159,16 @@ pub fn ownship(own: &Ownship) -> wh::Ownship {
         qx: q.i,
         qy: q.j,
         qz: q.k,
-        position_sigma_m: own.position_sigma_m.as_slice().to_vec(),
-        attitude_sigma_rad: own.attitude_sigma_rad.as_slice().to_vec(),
+        position_sigma_m: own.position_sigma_m().as_slice().to_vec(),
+        attitude_sigma_rad: own.attitude_sigma_rad().as_slice().to_vec(),
+        covariance: upper_triangle(&own.covariance),
+        between_frames: own.frame.is_none(),
     }
+}
+
+/// Row by row.
+fn upper_triangle<const N: usize>(p: &SMatrix<f64, N, N>) -> Vec<f64> {
+    (0..N).flat_map(|row| (row..N).map(move |column| p[(row, column)])).collect()
 }
 
 fn status(status: TrackStatus) -> wh::TrackStatus {
@@ -184,8 +199,7 @@ pub fn target_state(estimate: &TargetEstimate, name: &str) -> wh::TargetState {
         message.lat_deg = s.lat_deg;
         message.lon_deg = s.lon_deg;
         if let Some(p) = &s.covariance {
-            message.covariance =
-                (0..5).flat_map(|row| (row..5).map(move |column| p[(row, column)])).collect();
+            message.covariance = upper_triangle(p);
         }
     }
     message
@@ -198,9 +212,14 @@ pub(super) fn log_message(notice: &Notice) -> fox::Log {
         | NoticeKind::TargetLost
         | NoticeKind::FilterReset
         | NoticeKind::FrameUnusable
+        | NoticeKind::FrameDamaged
         | NoticeKind::Dropped
         | NoticeKind::ClockJump
+        | NoticeKind::PositionsUnused
+        | NoticeKind::PulseUnused
         | NoticeKind::TerrainMissing
+        | NoticeKind::ModelMisfit
+        | NoticeKind::MarkerSeenTwice
         | NoticeKind::BytesRefused => fox::log::Level::Warning,
         _ => fox::log::Level::Info,
     };
@@ -211,6 +230,11 @@ pub(super) fn log_message(notice: &Notice) -> fox::Log {
         name: notice.kind.name().into(),
         ..Default::default()
     }
+}
+
+fn misfit(words: &MisfitWords) -> wh::Misfit {
+    let MisfitWords { source, kind, figure, cause, advice } = words.clone();
+    wh::Misfit { source, kind: kind.into(), figure, cause, advice }
 }
 
 /// Health, as a message; `names` are the targets'.
@@ -239,6 +263,7 @@ pub fn health(now: &Health, names: &[String]) -> wh::Health {
         fix: fix_number(now.fix),
         sats: now.sats.unwrap_or(0),
         clock_sigma_ms: now.clock_sigma.map_or(-1.0, |s| s.ms()),
+        misfits: now.misfits.iter().map(misfit).collect(),
         dispositions: now.dispositions.iter().map(|(d, n)| (d.name().to_owned(), *n)).collect(),
         ..Default::default()
     }

@@ -6,7 +6,7 @@ use nalgebra::{UnitQuaternion, Vector3};
 use prost::Message;
 
 use super::output_messages::{
-    annotations, detections, fix_number, health, log_message, ownship, stamp, target_state, transform,
+    annotations, detections, fix_number, health, log_message, ownship, rtk, stamp, target_state, transform,
 };
 use super::{Record, Schema, topic};
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
@@ -113,7 +113,10 @@ impl OutputEncoder {
             EstimatorOutput::Smoothed(e) => self.state(topic::target_smoothed(self.name(e)), e, log, out),
             EstimatorOutput::Fusion(result) => out.push(fusion(result, log)),
             // The pipeline's notice tells of these.
-            EstimatorOutput::Anchored { .. } | EstimatorOutput::Reset { .. } => {}
+            EstimatorOutput::Anchored { .. }
+            | EstimatorOutput::Reset { .. }
+            | EstimatorOutput::TiltFelt { .. }
+            | EstimatorOutput::Misfit(_) => {}
         }
     }
 
@@ -185,6 +188,7 @@ fn fix(epoch: &Stamped<GnssEpoch>, log: MonoTime, out: &mut Vec<Record>) {
         sats: e.sats,
         hdop: e.hdop,
         heard: stamp(epoch.t_recv),
+        rtk: rtk(e.fix).into(),
     };
     out.push(record(topic::GPS_EPOCH.into(), Schema::GnssEpoch, log, t, &message));
     let (Some(latitude), Some(longitude)) = (e.lat_deg, e.lon_deg) else { return };

@@ -1,5 +1,5 @@
 //! Brings a Garmin receiver to the line speed of the configuration: finds the speed it speaks, tells it the
-//! other, restarts it.
+//! other, restarts it. One that was left in its binary mode answers no sentence: it is told to speak NMEA first.
 //!
 //! Source: Garmin GPS 18x technical specifications, "Sensor Configuration Information (PGRMC)": field 10 is
 //! the line speed, which takes effect after a reset (`PGRMI`, field 7 = R).
@@ -18,6 +18,9 @@ const LISTEN: Span = Span::from_ns(1_500_000_000);
 
 /// Asks for the present configuration: also a receiver whose sentences are all off answers.
 const QUERY: &str = "PGRMCE";
+
+/// Ends the binary mode: Garmin's packet 10 (line command) that asks for NMEA, between its frame's bytes.
+const SPEAK_NMEA: [u8; 8] = [0x10, 0x0A, 0x02, 0x26, 0x00, 0xCE, 0x10, 0x03];
 
 /// Restarts the receiver.
 const RESET: &str = "PGRMI,,,,,,,R";
@@ -59,10 +62,20 @@ impl Settling<'_> {
         self.line.set_speed(wanted).await
     }
 
-    /// Whether sentences arrive at the line's present speed.
+    /// Whether sentences arrive at the line's present speed, also after the way out of binary mode.
     async fn speaks(&mut self) -> Result<bool, Fault> {
         self.send(QUERY).await?;
-        self.listen(holds_a_sentence).await
+        if self.listen(holds_a_sentence).await? {
+            return Ok(true);
+        }
+        self.line.write(&SPEAK_NMEA).await?;
+        self.send(QUERY).await?;
+        let speaks = self.listen(holds_a_sentence).await?;
+        if speaks {
+            let text = "the receiver was in binary mode and was told to speak NMEA".to_owned();
+            (self.reports)(Report::Note(NoteKind::Configured, 1, text));
+        }
+        Ok(speaks)
     }
 
     async fn send(&mut self, body: &str) -> Result<(), Fault> {

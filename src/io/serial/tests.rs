@@ -136,8 +136,9 @@ fn noise_tells_of_a_wrong_speed() {
     assert!(text.contains("38400 baud"), "{text}");
 }
 
-/// A Garmin receiver at the far end of a line, which is deaf and speaks noise at any speed but its own.
-fn garmin_at(mut far: File, mut own: u32) {
+/// A Garmin receiver at the far end of a line, which is deaf and speaks noise at any speed but its own. In its
+/// binary mode it knows packets only.
+fn garmin_at(mut far: File, mut own: u32, mut binary: bool) {
     let mut reader = far.try_clone().expect("a second handle");
     let (sender, asked) = channel::<Vec<u8>>();
     std::thread::spawn(move || {
@@ -156,6 +157,14 @@ fn garmin_at(mut far: File, mut own: u32) {
             if speed(&far) != own {
                 heard.clear();
                 if far.write_all(&[0xf8, 0x00, 0x9e, 0xe6]).is_err() {
+                    return;
+                }
+                continue;
+            }
+            if binary {
+                binary = !said.windows(8).any(|bytes| bytes == [0x10, 0x0A, 2, 0x26, 0, 0xCE, 0x10, 3]);
+                let position = [0x10, 0x33, 4, 0, 0x80, 0x3F, 0x12, 0x7A, 0x10, 3];
+                if binary && far.write_all(&position).is_err() {
                     return;
                 }
                 continue;
@@ -182,7 +191,7 @@ fn garmin_at(mut far: File, mut own: u32) {
 #[test]
 fn a_receiver_at_another_speed_is_brought_to_the_configured_one() {
     let (far, name) = pty();
-    garmin_at(far, 19_200);
+    garmin_at(far, 19_200, false);
     let line = Line::start(&name, true);
     line.up();
     let configured = |report| match report {
@@ -192,5 +201,20 @@ fn a_receiver_at_another_speed_is_brought_to_the_configured_one() {
     let text = line.wait(configured);
     assert!(text.contains("spoke at 19200 baud"), "{text}");
     assert_eq!(line.wait(configured), "7 settings accepted", "then it is configured at the new speed");
+    line.wait(|r| matches!(r, Report::Bytes(_, bytes) if bytes.starts_with(b"$GPRMC")).then_some(()));
+}
+
+#[test]
+fn a_receiver_left_in_binary_mode_is_told_to_speak_nmea() {
+    let (far, name) = pty();
+    garmin_at(far, 38_400, true);
+    let line = Line::start(&name, true);
+    line.up();
+    let configured = |report| match report {
+        Report::Note(NoteKind::Configured, _, text) => Some(text),
+        _ => None,
+    };
+    let text = line.wait(configured);
+    assert!(text.contains("was in binary mode"), "{text}");
     line.wait(|r| matches!(r, Report::Bytes(_, bytes) if bytes.starts_with(b"$GPRMC")).then_some(()));
 }

@@ -21,11 +21,7 @@ use crate::config::StoreConfig;
 use crate::io::clock::HostClock;
 use crate::io::records::{self, Record};
 use windhover_base::msg::{Event, EventBody, WarmState};
-use windhover_base::time::UtcTime;
-
-/// Dates before this are a receiver's error (a week number that rolled over, a clock without a
-/// battery): the program is younger. 2026-01-01.
-const EARLIEST_UTC: UtcTime = UtcTime::from_unix_ns(1_767_225_600_000_000_000);
+use windhover_base::time::{EARLIEST_UTC, UtcTime};
 
 /// How long the link waits for the card to tell the number of the run.
 const WAIT_FOR_RUN: Duration = Duration::from_secs(5);

@@ -3,7 +3,7 @@
 use super::{SourceLine, on_the_wire};
 use windhover_base::msg::{SensorReading, Stamped, WarmArrival};
 use windhover_base::settings::GpsConfig;
-use windhover_base::time::{GnssClock, MonoTime, Span};
+use windhover_base::time::{GnssClock, MonoTime, PulseTrouble, Span};
 use windhover_decode::{DecodeCounts, GnssDecoder, HeardEpoch};
 
 /// Arrivals kept for a warm start: the jitter of a 5 Hz receiver over 10 s.
@@ -68,7 +68,12 @@ impl GpsLine {
         self.clock_sigma
     }
 
-    /// The receiver's pulse marked a whole second of UTC at this host time.
+    /// Why the receiver's pulses are not used, if they are not.
+    pub(in crate::pipeline) fn pulse_trouble(&self) -> Option<PulseTrouble> {
+        self.clock.pulse_trouble()
+    }
+
+    /// The receiver's pulse was seen at this host time.
     pub(in crate::pipeline) fn pulse(&mut self, edge: MonoTime) {
         self.clock.observe_pulse(edge);
     }

@@ -52,6 +52,14 @@ pub enum FusionSource {
     CompassHeading,
     /// Compass tilt.
     CompassTilt,
+    /// Heading of the second source of attitude.
+    AttitudeHeading,
+    /// Tilt of the second source of attitude.
+    AttitudeTilt,
+    /// Rates of turn.
+    ImuRate,
+    /// Specific forces.
+    ImuForce,
     /// A marker's pixels.
     Marker,
     /// A ground feature's pixel.
@@ -66,6 +74,10 @@ impl FusionSource {
             Self::GpsVelocity => "gps_velocity",
             Self::CompassHeading => "compass_heading",
             Self::CompassTilt => "compass_tilt",
+            Self::AttitudeHeading => "attitude_heading",
+            Self::AttitudeTilt => "attitude_tilt",
+            Self::ImuRate => "imu_rate",
+            Self::ImuForce => "imu_force",
             Self::Marker => "marker",
             Self::Feature => "feature",
         }
@@ -156,8 +168,8 @@ pub struct TargetEstimate {
 pub struct Ownship {
     /// When.
     pub t_valid: MonoTime,
-    /// Number of the frame it belongs to.
-    pub frame: u32,
+    /// Number of the frame at whose exposure it is; `None` between frames.
+    pub frame: Option<u32>,
     /// North, east, down of the datum, metres.
     pub position_ned_m: Vector3<f64>,
     /// Velocity north, east, down, m/s.
@@ -170,20 +182,110 @@ pub struct Ownship {
     pub lon_deg: f64,
     /// Height above the ellipsoid, metres.
     pub height_m: f64,
+    /// Covariance of position (north, east, down; m), velocity (likewise; m/s) and attitude (small rotations about
+    /// north, east, down: `ned_from_body = exp(δ) estimate`; rad).
+    pub covariance: SMatrix<f64, 9, 9>,
+}
+
+impl Ownship {
     /// One-sigma of position (north, east, down), metres.
-    pub position_sigma_m: Vector3<f64>,
+    pub fn position_sigma_m(&self) -> Vector3<f64> {
+        self.sigma(0)
+    }
+
+    /// One-sigma of velocity (north, east, down), m/s.
+    pub fn velocity_sigma_mps(&self) -> Vector3<f64> {
+        self.sigma(3)
+    }
+
     /// One-sigma of attitude as small rotations about north, east, down, radians.
-    pub attitude_sigma_rad: Vector3<f64>,
+    pub fn attitude_sigma_rad(&self) -> Vector3<f64> {
+        self.sigma(6)
+    }
+
+    fn sigma(&self, first: usize) -> Vector3<f64> {
+        Vector3::from_fn(|i, _| self.covariance[(first + i, first + i)].max(0.0).sqrt())
+    }
+}
+
+/// What a tilt sensor is found to feel.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum FeltTilt {
+    /// Attitude, as an AHRS tells it.
+    Attitude,
+    /// Specific force.
+    Force,
+    /// A share of the tilt.
+    Share(f64),
+}
+
+/// Something measured does not fit what the configuration, or the filter's model, says of it.
+///
+/// The filter tells it as often as it finds it, at most once a second for the same source and cause. The pipeline
+/// tells the operator once, again where the figure changes, and counts it as over when it was not told for a while.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Misfit {
+    /// When it was found, host time.
+    pub t: MonoTime,
+    /// Which source.
+    pub source: FusionSource,
+    /// The figure that shows it; see [`MisfitCause`].
+    pub figure: f64,
+    /// What does not fit.
+    pub cause: MisfitCause,
+}
+
+/// What does not fit.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum MisfitCause {
+    /// The tilt sensor feels something else than configured. Figure: slope of acceleration over what the reading
+    /// means, 1 where it tells the tilt.
+    TiltKind(FeltTilt),
+    /// It errs more than it is said to. Figure: mean normalised square of its innovations, 1 where they fit.
+    Noise,
+    /// It errs to one side. Figure: mean of its innovations over what they should scatter by.
+    Bias,
+    /// More of its measurements lie outside the gate than should. Figure: their share.
+    Outside,
+    /// A tag's edge is not its `size_m`, as another marker of the target shows. Figure: measured over configured.
+    MarkerSize(MarkerPair),
+    /// A marker lies elsewhere on its target, as another one shows. Figure: by how much, m.
+    MarkerPlace(MarkerPair),
+    /// A marker is turned on its target, as another one shows. Figure: by how much, rad, clockwise from above.
+    MarkerTurn(MarkerPair),
+    /// Markers show another height over the ground than receiver and ground do. Figure: by how much higher, m.
+    Height,
+    /// What was taken for ground moves. Figure: share of the tracked features.
+    MovingGround,
+    /// A vehicle turns faster than its model can. Figure: its yaw rate over the model's bound.
+    TargetTurns {
+        /// Index of the target in the configuration.
+        target: usize,
+    },
+    /// Its measurements are true earlier than their stamps say. Figure: by how much, s.
+    Late,
+}
+
+/// A marker that does not fit, and the one that shows it: indices in the configuration.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct MarkerPair {
+    /// The target.
+    pub target: usize,
+    /// Its marker that does not fit.
+    pub marker: usize,
+    /// Its marker that it was measured against.
+    pub against: usize,
 }
 
 /// What the joint filter says.
+#[expect(clippy::large_enum_variant, reason = "a box would be an allocation for each of them")]
 #[derive(Clone, PartialEq, Debug)]
 pub enum EstimatorOutput {
     /// A target at a frame, as known when the frame had been looked at.
     Estimate(TargetEstimate),
     /// A target at an earlier frame, with what was measured up to the smoother's lag after it.
     Smoothed(TargetEstimate),
-    /// The helicopter at a frame.
+    /// The helicopter at a frame, or between frames.
     Ownship(Ownship),
     /// What became of a measurement.
     Fusion(FusionResult),
@@ -192,6 +294,15 @@ pub enum EstimatorOutput {
         /// By how much, NED.
         moved_m: Vector3<f64>,
     },
+    /// What the tilt sensor feels was found out, and is believed from here on.
+    TiltFelt {
+        /// What it feels.
+        felt: FeltTilt,
+        /// Slope of acceleration over what the reading means.
+        slope: f64,
+    },
+    /// Something measured does not fit.
+    Misfit(Misfit),
     /// The filter started again.
     Reset {
         /// Why.

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::{Disposition, FixKind, Source, TargetEstimate};
+use super::{Disposition, FixKind, MisfitWords, Source, TargetEstimate};
 use crate::time::{MonoTime, Span};
 
 /// How one source does.
@@ -55,6 +55,8 @@ pub struct Health {
     pub targets: Vec<TargetHealth>,
     /// Measurements by what became of them, since the start.
     pub dispositions: BTreeMap<Disposition, u64>,
+    /// What does not fit the configuration, or the filter's model, now.
+    pub misfits: Vec<MisfitWords>,
 }
 
 impl Health {

@@ -19,7 +19,7 @@ pub struct Stamped<T> {
     pub value: T,
 }
 
-/// What kind of fix a receiver reports.
+/// What kind of fix a receiver reports; each says more than the one before.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug, Default)]
 pub enum FixKind {
     /// No position.
@@ -29,6 +29,31 @@ pub enum FixKind {
     TwoD,
     /// Position and height.
     ThreeD,
+    /// Position and height, from carrier phases of unknown whole cycles (GGA quality 5): decimetres.
+    RtkFloat,
+    /// Position and height, from carrier phases of known whole cycles (GGA quality 4): centimetres.
+    RtkFixed,
+}
+
+impl FixKind {
+    /// Whether there is a position.
+    pub fn has_position(self) -> bool {
+        self != Self::None
+    }
+
+    /// Whether there is a position with its height.
+    pub fn has_height(self) -> bool {
+        self >= Self::ThreeD
+    }
+
+    /// `none`, `2d` or `3d`, as logs and files tell it: RTK is `3d`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::TwoD => "2d",
+            Self::ThreeD | Self::RtkFloat | Self::RtkFixed => "3d",
+        }
+    }
 }
 
 /// Everything a receiver said of one instant. `None` where it did not say.
@@ -75,6 +100,15 @@ pub struct AttitudeSample {
     pub heading_is_true: bool,
     /// Pitch and roll as the device reports them; `None` where not valid.
     pub tilt: Option<Tilt>,
+}
+
+/// Rates of turn and specific forces. `None` where the device has no such sensors.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub struct InertialSample {
+    /// Rate of turn about each axis, rad/s.
+    pub rate_rps: Option<Vector3<f64>>,
+    /// Specific force along each axis, m/s²: level and at rest (0, 0, −9.8) in forward-right-down.
+    pub force_mps2: Option<Vector3<f64>>,
 }
 
 /// What a source's bytes were decoded to.

@@ -13,18 +13,18 @@ mod source;
 mod warm_state;
 
 pub use estimate::{
-    Disposition, EstimatorOutput, FusionResult, FusionSource, Ownship, TargetEstimate, TargetState,
-    TrackStatus,
+    Disposition, EstimatorOutput, FeltTilt, FusionResult, FusionSource, MarkerPair, Misfit, MisfitCause,
+    Ownship, TargetEstimate, TargetState, TrackStatus,
 };
 pub use event::{Event, EventBody, FrameEncoding, FramePayload};
 pub use family::{FamilySpec, TagFamily};
 pub use health::{Health, SourceHealth, TargetHealth};
 pub use image::{GrayImage, ImageView, RgbImage};
 pub use measure::{
-    AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, MarkerDetection, MarkerId,
-    SensorReading, Stamped,
+    AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, InertialSample, MarkerDetection,
+    MarkerId, SensorReading, Stamped,
 };
-pub use notice::{Notice, NoticeKind};
+pub use notice::{MisfitWords, Notice, NoticeKind};
 pub use output::{Output, TimedOutput};
 pub use predict::{FramePrediction, MarkerPrediction};
 pub use source::{Delivery, PerSource, Source};

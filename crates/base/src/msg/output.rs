@@ -5,6 +5,7 @@ use crate::geo::Geodetic;
 use crate::time::MonoTime;
 
 /// One thing the pipeline says.
+#[expect(clippy::large_enum_variant, reason = "a box would be an allocation for each estimate")]
 #[derive(Clone, Debug)]
 pub enum Output {
     /// The origin of the NED frame was settled, at this host time.

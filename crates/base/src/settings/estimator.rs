@@ -25,6 +25,8 @@ impl Default for DetectorConfig {
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct EstimatorConfig {
+    /// How often the helicopter's own state is told beside the frames, times a second.
+    pub ownship_hz: f64,
     /// How far back late measurements are still fused in their place, ms.
     pub history_ms: f64,
     /// Lag of the smoothed output, ms.
@@ -66,6 +68,7 @@ pub struct EstimatorConfig {
 impl Default for EstimatorConfig {
     fn default() -> Self {
         Self {
+            ownship_hz: 10.0,
             history_ms: 1000.0,
             smoother_lag_ms: 500.0,
             lost_after_s: 30.0,

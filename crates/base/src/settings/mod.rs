@@ -4,16 +4,18 @@
 //! ranges are made where the whole configuration is read.
 
 mod estimator;
+mod inertial;
 mod montecarlo;
 mod rig;
 mod sensors;
 mod target;
 
 pub use estimator::{DetectorConfig, EstimatorConfig};
+pub use inertial::{AttitudeConfig, ImuConfig};
 pub use montecarlo::{Distribution, MonteCarloConfig};
 pub use rig::Rig;
 pub use sensors::{
     CameraConfig, CameraMount, CompassConfig, CompassFormat, Datum, Declination, GpsConfig, GroundConfig,
-    GroundSource, PixelFormat,
+    GroundSource, PixelFormat, TiltKind,
 };
 pub use target::{Brightness, MarkerConfig, MarkerKind, TargetConfig, TargetModel};

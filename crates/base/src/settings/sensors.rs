@@ -55,6 +55,9 @@ pub struct CompassConfig {
     /// What it means by pitch and roll.
     #[serde(default)]
     pub angles: TiltConvention,
+    /// What its tilt sensor feels.
+    #[serde(default)]
+    pub tilt: TiltKind,
     /// Magnetic declination, degrees, east positive.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub declination_deg: Option<f64>,
@@ -83,6 +86,30 @@ pub struct CompassConfig {
     /// One-sigma of the tilt noise of the sensor at rest, degrees.
     #[serde(default = "defaults::tilt_noise_deg")]
     pub tilt_noise_deg: f64,
+}
+
+/// What a compass's tilt sensor feels.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TiltKind {
+    /// Not said: found out in flight.
+    #[default]
+    Auto,
+    /// Attitude, as an AHRS tells it: gyros carry it through manoeuvres.
+    Inertial,
+    /// Specific force, as a fluid or an accelerometer does. On a rotorcraft that is a part of the tilt or none.
+    Gravity,
+}
+
+impl TiltKind {
+    /// Its name in configuration.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Auto => "auto",
+            Self::Inertial => "inertial",
+            Self::Gravity => "gravity",
+        }
+    }
 }
 
 /// The enum of formats with their names, out of one row a format.
@@ -121,7 +148,9 @@ compass_formats! {
     Pni = "pni";
     /// `$PASHR`.
     Pashr = "pashr";
-    /// Generic NMEA heading sentences.
+    /// VectorNav ASCII: `$VNYPR`, `$VNYMR`, `$VNQMR`, `$VNINS` and others.
+    Vectornav = "vectornav";
+    /// Plain NMEA, and headings that receivers measure between antennas.
     Nmea = "nmea";
 }
 

@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 
 use super::jitter::{JitterFit, Point};
+use super::pulse::{PulseTrouble, Pulses};
 use super::{MonoTime, NS_PER_S, Span};
 
 /// Epochs the fit is made over.
@@ -26,12 +27,14 @@ const DAY_NS: i64 = 86_400 * NS_PER_S;
 const HEARD_WITHIN: Span = Span::from_ns(1_500_000_000);
 /// How long before it is true it may seem to be heard: the fit's error.
 const HEARD_BEFORE: Span = Span::from_ns(50_000_000);
-/// How near to a whole second of UTC, by the arrivals, a pulse must be to be that second's.
-const PULSE_NEAR_MS: f64 = 90.0;
-/// How long a pulse holds the time.
-const PULSE_HOLDS: Span = Span::from_ns(5 * NS_PER_S);
 /// One-sigma of a pulse's stamp: interrupt latency of an idle kernel.
 const PULSE_SIGMA: Span = Span::from_ns(50_000);
+/// Epochs the arrivals of which tell well enough which pulse is theirs.
+const PULSE_EPOCHS: usize = 5;
+/// Bursts nearer than this are not two of one receiver: what it tells of another time is no step.
+const APART: Span = Span::from_ns(30_000_000);
+/// A time of day told again later than this is another burst.
+const AGAIN: Span = Span::from_ns(300_000_000);
 
 /// State of the fit, for people.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -62,8 +65,25 @@ pub struct GnssClock {
     reference: Option<(MonoTime, i64)>,
     points: VecDeque<Point>,
     astray: Vec<(MonoTime, i64)>,
-    last_time_of_day_ns: Option<i64>,
-    pulse: Option<(MonoTime, i64)>,
+    last: Option<Last>,
+    pulses: Pulses,
+}
+
+/// The last epoch.
+#[derive(Clone, Copy, Debug)]
+struct Last {
+    time_of_day_ns: i64,
+    arrival: MonoTime,
+}
+
+/// What an arrival off the line tells.
+enum Astray {
+    /// UTC was put right by whole seconds, so many nanoseconds of host time later.
+    Seconds(i64),
+    /// The receiver's time was put right by some other amount.
+    Anew,
+    /// It came late, or is wild.
+    Unknown,
 }
 
 impl GnssClock {
@@ -75,8 +95,8 @@ impl GnssClock {
             reference: None,
             points: VecDeque::with_capacity(WINDOW_MAX),
             astray: Vec::new(),
-            last_time_of_day_ns: None,
-            pulse: None,
+            last: None,
+            pulses: Pulses::default(),
         }
     }
 
@@ -98,24 +118,28 @@ impl GnssClock {
 
     /// An epoch of this time of day (from 86 400 s on in a leap second) began to arrive.
     pub fn observe(&mut self, time_of_day_ns: i64, arrival: MonoTime) {
-        let leapt = self.last_time_of_day_ns.replace(time_of_day_ns);
-        if leapt == Some(time_of_day_ns) {
+        let before = self.last.replace(Last { time_of_day_ns, arrival });
+        if before.is_some_and(|b| b.time_of_day_ns == time_of_day_ns && arrival - b.arrival < AGAIN) {
             return;
         }
-        let offset_ns = arrival.ns().wrapping_sub(time_of_day_ns);
-        if leapt.is_some_and(|before| before >= DAY_NS && time_of_day_ns < DAY_NS / 2)
-            && let Some((_, reference_ns)) = &mut self.reference
-        {
+        if before.is_some_and(|b| b.time_of_day_ns >= DAY_NS && time_of_day_ns < DAY_NS / 2) {
             // The leap second is over: UTC has stood still for a second.
-            *reference_ns += NS_PER_S;
+            self.step(NS_PER_S);
         }
-        let Some((t, x)) = self.point(arrival, offset_ns) else {
+        let offset_ns = arrival.ns().wrapping_sub(time_of_day_ns);
+        let Some((t, mut x)) = self.point(arrival, offset_ns) else {
             self.restart(&[(arrival, offset_ns)]);
             return;
         };
         if self.is_astray(t, x) {
-            self.stray(arrival, offset_ns);
-            return;
+            match self.told_by(t, x, offset_ns, before) {
+                Astray::Seconds(ns) => {
+                    self.step(ns);
+                    x -= Span::from_ns(ns).ms();
+                }
+                Astray::Anew => return self.restart(&[(arrival, offset_ns)]),
+                Astray::Unknown => return self.stray(arrival, offset_ns),
+            }
         }
         self.astray.clear();
         self.points.push_back((t, x));
@@ -124,18 +148,59 @@ impl GnssClock {
             self.points.pop_front();
         }
         self.fit.fit(self.points.make_contiguous());
+        self.pair(time_of_day_ns, arrival);
     }
 
-    /// The receiver's pulse marked a whole second of UTC at this host time.
+    /// The receiver's pulse was seen at this host time.
     pub fn observe_pulse(&mut self, edge: MonoTime) {
-        let Some(offset_ns) = self.valid_offset(edge) else {
+        self.pulses.edge(edge);
+    }
+
+    /// Why pulses that come are not used; `None` where they are, or where none come.
+    pub fn pulse_trouble(&self) -> Option<PulseTrouble> {
+        self.pulses.trouble()
+    }
+
+    /// Looks for the pulse that marked an epoch.
+    fn pair(&mut self, time_of_day_ns: i64, arrival: MonoTime) {
+        if self.points.len() < PULSE_EPOCHS {
             return;
-        };
-        let time_of_day_ns = edge.ns() - offset_ns;
-        let second_ns = (time_of_day_ns + NS_PER_S / 2).div_euclid(NS_PER_S) * NS_PER_S;
-        if Span::from_ns(time_of_day_ns - second_ns).ms().abs() <= PULSE_NEAR_MS {
-            self.pulse = Some((edge, edge.ns() - second_ns));
         }
+        let Some(offset_ns) = self.arrival_offset(arrival) else { return };
+        let days = (arrival.ns() - offset_ns - time_of_day_ns + DAY_NS / 2).div_euclid(DAY_NS);
+        let of_day_ns = time_of_day_ns + days * DAY_NS;
+        self.pulses.epoch(of_day_ns, MonoTime::from_ns(of_day_ns + offset_ns), self.latency);
+    }
+
+    /// UTC stands back by this much against host time from here on.
+    fn step(&mut self, ns: i64) {
+        if let Some((_, reference_ns)) = &mut self.reference {
+            *reference_ns = reference_ns.wrapping_add(ns);
+        }
+        self.pulses.shift(ns);
+    }
+
+    /// What an arrival off the line tells. Arrivals are never early, and a time of day never goes back: where
+    /// they seem to, the receiver has put its time right (it learns of leap seconds some minutes after it
+    /// starts). A late arrival is one, unless the next is as late.
+    fn told_by(&self, t: f64, x: f64, offset_ns: i64, before: Option<Last>) -> Astray {
+        let (late_ms, gate_ms) = (x - self.fit.at(t).0, self.gate_ms(t));
+        let seconds = (late_ms / 1e3).round();
+        let is_whole = seconds != 0.0 && (late_ms - seconds * 1e3).abs() <= gate_ms;
+        let went_back = before.zip(self.last).is_some_and(|(before, last)| {
+            let step_ns = (last.time_of_day_ns - before.time_of_day_ns + DAY_NS / 2).rem_euclid(DAY_NS);
+            step_ns <= DAY_NS / 2 && last.arrival - before.arrival >= APART
+        });
+        // What a stall of the host held back comes at once, each less late than the one before.
+        let as_late_before =
+            self.astray.last().zip(before).zip(self.last).is_some_and(|((astray, b), last)| {
+                let apart = Span::from_ns(offset_ns.wrapping_sub(astray.1)).abs();
+                apart.ns() <= (last.arrival - b.arrival).ns() / 4
+            });
+        if is_whole && (late_ms < 0.0 || went_back || as_late_before) {
+            return Astray::Seconds(seconds as i64 * NS_PER_S);
+        }
+        if went_back { Astray::Anew } else { Astray::Unknown }
     }
 
     /// Host time at which an epoch of this time of day, heard at `heard`, was true, with one-sigma.
@@ -158,16 +223,12 @@ impl GnssClock {
             drift_ppm: self.fit.slope() * 1e3,
             jitter: Span::from_ms(sigma + tau),
             epochs: self.points.len(),
-            pulse: self.pulse_holds(now),
+            pulse: self.pulses.offset_ns(now).is_some(),
         })
     }
 
-    fn pulse_holds(&self, at: MonoTime) -> bool {
-        self.pulse.is_some_and(|(edge, _)| (at - edge).abs() <= PULSE_HOLDS)
-    }
-
     fn sigma(&self, at: MonoTime) -> Span {
-        if self.pulse_holds(at) {
+        if self.pulses.offset_ns(at).is_some() {
             return PULSE_SIGMA;
         }
         let by_chance = FIRST_SIGMA_MS / self.points.len().max(1) as f64;
@@ -178,16 +239,13 @@ impl GnssClock {
 
     /// Validity less time of day: of the pulse where one holds, else of the arrivals.
     fn offset_ns(&self, at: MonoTime) -> Option<i64> {
-        match self.pulse {
-            Some((_, offset_ns)) if self.pulse_holds(at) => Some(offset_ns),
-            _ => self.valid_offset(at),
-        }
+        self.pulses.offset_ns(at).or_else(|| Some(self.arrival_offset(at)? - self.latency.ns()))
     }
 
-    fn valid_offset(&self, at: MonoTime) -> Option<i64> {
+    /// Arrival less time of day, by all arrivals.
+    fn arrival_offset(&self, at: MonoTime) -> Option<i64> {
         let (reference, reference_ns) = self.reference?;
-        let line = Span::from_ms(self.fit.at((at - reference).s()).0);
-        Some(reference_ns + line.ns() - self.latency.ns())
+        Some(reference_ns + Span::from_ms(self.fit.at((at - reference).s()).0).ns())
     }
 
     /// An arrival as a point of the fit: seconds since the reference, milliseconds of offset.
@@ -200,14 +258,24 @@ impl GnssClock {
 
     /// Whether the jitter so far does not explain this point.
     fn is_astray(&self, t: f64, x: f64) -> bool {
-        let (line, line_sigma) = self.fit.at(t);
-        let late = x - line;
+        let late = x - self.fit.at(t).0;
+        late > self.gate_ms(t) || -late > self.gate_early_ms(t)
+    }
+
+    /// The most that an arrival is late by the jitter so far.
+    fn gate_ms(&self, t: f64) -> f64 {
         if self.points.len() < GATE_FIRST.0 {
-            return late.abs() > GATE_FIRST.1;
+            return GATE_FIRST.1;
         }
-        let (sigma, tau) = self.fit.jitter_ms();
-        let noise = 5.0 * sigma.hypot(line_sigma) + GATE_MS;
-        late < -noise || late > noise + 8.0 * tau
+        self.gate_early_ms(t) + 8.0 * self.fit.jitter_ms().1
+    }
+
+    /// The most that it is early.
+    fn gate_early_ms(&self, t: f64) -> f64 {
+        if self.points.len() < GATE_FIRST.0 {
+            return GATE_FIRST.1;
+        }
+        5.0 * self.fit.jitter_ms().0.hypot(self.fit.at(t).1) + GATE_MS
     }
 
     fn stray(&mut self, arrival: MonoTime, offset_ns: i64) {
@@ -230,142 +298,9 @@ impl GnssClock {
         self.reference = arrivals.first().copied();
         self.fit = JitterFit::new(DRIFT_SIGMA);
         self.astray.clear();
-        self.pulse = None;
+        self.pulses.forget();
         let points = arrivals.iter().filter_map(|&(arrival, offset_ns)| self.point(arrival, offset_ns));
         self.points = points.collect();
         self.fit.fit(self.points.make_contiguous());
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use rand::{Rng, SeedableRng};
-    use rand_chacha::ChaCha8Rng;
-    use rand_distr::{Distribution, Exp1, StandardNormal};
-
-    use super::*;
-
-    const LATENCY: Span = Span::from_ns(120_000_000);
-    /// 23:59:30 UTC of some day, so that every run passes midnight.
-    const START_NS: i64 = 1_795_046_370_000_000_000;
-
-    enum Jitter {
-        OneSided(f64),
-        Normal(f64),
-    }
-
-    impl Jitter {
-        fn draw(&self, rng: &mut impl Rng) -> Span {
-            Span::from_ms(match *self {
-                Self::OneSided(mean) => mean * Distribution::<f64>::sample(&Exp1, rng),
-                Self::Normal(sigma) => sigma * Distribution::<f64>::sample(&StandardNormal, rng),
-            })
-        }
-    }
-
-    /// Errors in ms of a receiver of 5 Hz heard by a host that is `drift_ppm` fast.
-    fn errors_ms(jitter: &Jitter, drift_ppm: f64, seconds: i64, seed: u64) -> Vec<f64> {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut clock = GnssClock::new(LATENCY);
-        let mut errors = Vec::new();
-        for epoch in 0..seconds * 5 {
-            let since_ns = epoch * 200_000_000;
-            let valid = MonoTime::from_ns(START_NS + since_ns + (since_ns as f64 * drift_ppm * 1e-6) as i64);
-            let arrival = valid + LATENCY + jitter.draw(&mut rng);
-            let time_of_day_ns = (START_NS + since_ns).rem_euclid(DAY_NS);
-            clock.observe(time_of_day_ns, arrival);
-            let fitted = clock.host_time_of(time_of_day_ns, arrival);
-            errors.push(fitted.map_or(f64::NAN, |(t, _)| (t - valid).ms()));
-        }
-        errors
-    }
-
-    fn rms(errors: &[f64]) -> f64 {
-        (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt()
-    }
-
-    #[test]
-    fn the_fit_is_within_two_milliseconds_whatever_the_jitter() {
-        let cases = [
-            Jitter::OneSided(5.0),
-            Jitter::OneSided(17.5),
-            Jitter::OneSided(30.0),
-            Jitter::Normal(5.0),
-            Jitter::Normal(15.0),
-        ];
-        for (index, jitter) in cases.iter().enumerate() {
-            let errors = errors_ms(jitter, 30.0, 80, index as u64 + 1);
-            let settled = rms(&errors[200..]);
-            assert!(settled < 2.0, "case {index}: {settled} ms rms after 40 s");
-            // From the first epoch the error is that of one arrival at most
-            assert!(errors.iter().all(|e| e.abs() < 120.0), "case {index}");
-        }
-    }
-
-    #[test]
-    fn it_settles_within_seconds_where_the_jitter_is_one_sided() {
-        let errors = errors_ms(&Jitter::OneSided(17.5), 0.0, 10, 3);
-        assert!(rms(&errors[25..]) < 4.0, "{} ms rms from 5 s on", rms(&errors[25..]));
-    }
-
-    #[test]
-    fn single_wild_arrivals_change_nothing() {
-        let mut clock = GnssClock::new(LATENCY);
-        let at = |k: i64| (k * 200_000_000, MonoTime::from_ns(START_NS + k * 200_000_000) + LATENCY);
-        for k in 0..50 {
-            let (time, arrival) = at(k);
-            clock.observe(time, arrival + Span::from_ms(if k % 7 == 6 { 400.0 } else { 0.0 }));
-        }
-        let (time, arrival) = at(50);
-        let (t_valid, sigma) = clock.host_time_of(time, arrival + Span::from_ms(400.0)).expect("a fit");
-        assert!((t_valid - (arrival - LATENCY)).ms().abs() < 1.0, "a late epoch is still put in its place");
-        assert!(sigma.ms() < 2.0);
-    }
-
-    #[test]
-    fn a_step_of_either_clock_is_followed() {
-        let mut clock = GnssClock::new(LATENCY);
-        let step = |k: i64| if k < 50 { 0 } else { 3_723 * NS_PER_S };
-        for k in 0..60 {
-            let t = MonoTime::from_ns(START_NS + k * 200_000_000);
-            clock.observe((k * 200_000_000 + step(k)).rem_euclid(DAY_NS), t + LATENCY);
-        }
-        let t = MonoTime::from_ns(START_NS + 12 * NS_PER_S);
-        let (t_valid, _) = clock.host_time_of(12 * NS_PER_S + step(60), t + LATENCY).expect("a fit");
-        assert!((t_valid - t).ms().abs() < 1.0);
-        assert!(clock.host_time_of(12 * NS_PER_S, t + LATENCY).is_none(), "the old time is no more");
-    }
-
-    #[test]
-    fn an_announced_leap_second_is_followed_at_once() {
-        let mut clock = GnssClock::new(LATENCY);
-        let last_minute_ns = DAY_NS - 60 * NS_PER_S;
-        for k in 0..310 {
-            let t = MonoTime::from_ns(START_NS + k * 200_000_000);
-            let elapsed_ns = last_minute_ns + k * 200_000_000;
-            // 23:59:60 is second 86400 of its day; the next day begins after it.
-            let of_day = if k < 305 { elapsed_ns } else { elapsed_ns - DAY_NS - NS_PER_S };
-            clock.observe(of_day, t + LATENCY);
-            let (t_valid, _) = clock.host_time_of(of_day, t + LATENCY).expect("a fit");
-            assert!((t_valid - t).ms().abs() < 2.0, "epoch {k}: {:?}", t_valid - t);
-        }
-    }
-
-    #[test]
-    fn a_pulse_takes_the_latency_out() {
-        // Given a receiver 40 ms later than configured
-        let mut clock = GnssClock::new(LATENCY);
-        let late = Span::from_ms(40.0);
-        for k in 0..30 {
-            let t = MonoTime::from_ns(START_NS + k * 200_000_000);
-            clock.observe(k * 200_000_000, t + LATENCY + late);
-            if k % 5 == 0 {
-                clock.observe_pulse(t);
-            }
-        }
-        let t = MonoTime::from_ns(START_NS + 6 * NS_PER_S);
-        let (t_valid, sigma) = clock.host_time_of(6 * NS_PER_S, t + LATENCY + late).expect("a fit");
-        assert!((t_valid - t).ms().abs() < 0.1 && sigma.ms() < 0.1);
-        assert!(clock.state().expect("a fit").pulse);
     }
 }

@@ -2,7 +2,8 @@
 //!
 //! Arrival x at time t is a + b·t + jitter. The jitter is either symmetric, normal of sigma s, or
 //! one-sided, exponential of mean τ with a little normal noise (the exponentially modified
-//! Gaussian). Its kind and size are not known: each candidate is fitted by Newton's method (both
+//! Gaussian), or anywhere up to a width w (what waits for the next tick of a timer: USB adapters hand on
+//! what they have every 16 ms). Its kind and size are not known: each candidate is fitted by Newton's method (both
 //! log-densities are concave, so there is one maximum), weighed by its evidence in Laplace's
 //! approximation, and the line is the mean over all. For symmetric jitter it runs through the
 //! middle, for one-sided jitter along the lower edge, where nothing was late. A small part of the
@@ -13,6 +14,10 @@ pub(super) type Point = (f64, f64);
 
 /// Sizes of jitter considered, milliseconds, each twice the one before.
 const SIZES_MS: [f64; 8] = [0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0];
+/// Widths of ticks considered, milliseconds: from 1, each √2 times the one before.
+const TICKS: i32 = 11;
+/// Normal noise at the edges of a tick, as a part of its width. So small that no point is near both edges.
+const TICK_NOISE_PART: f64 = 1.0 / 16.0;
 /// Normal noise beside one-sided jitter, as parts of it.
 const NOISE_PARTS: [f64; 2] = [1.0 / 16.0, 0.2];
 /// Least normal noise, milliseconds: what stamping a read costs.
@@ -20,6 +25,9 @@ const NOISE_MIN_MS: f64 = 0.1;
 /// Part of the arrivals that have nothing to do with the jitter, and their density over a second.
 const WILD_PART: f64 = 0.01;
 const WILD_DENSITY: f64 = WILD_PART / 1_000.0;
+/// How much rarer wild arrivals before the line are where it is under ticks: nothing is handed on before it is there,
+/// and arrivals that seem to be show that the ticks hid how late the others were.
+const WILD_EARLY: f64 = 1e-4;
 /// Belief (log) in symmetric against one-sided jitter before anything is seen: operating systems and
 /// receivers are late, not early.
 const LOG_SYMMETRIC: f64 = -3.0;
@@ -37,6 +45,8 @@ struct Shape {
     sigma: f64,
     /// Mean of the one-sided part; 0 for none.
     tau: f64,
+    /// Width of the even part, up to a tick; 0 for none.
+    width: f64,
 }
 
 /// One candidate shape with its fitted line.
@@ -56,6 +66,8 @@ struct Candidate {
 pub(super) struct JitterFit {
     candidates: Vec<Candidate>,
     slope_sigma: f64,
+    /// Density of wild arrivals before the line.
+    wild_early: f64,
     t_mean: f64,
     fits: u32,
 }
@@ -63,12 +75,30 @@ pub(super) struct JitterFit {
 impl JitterFit {
     /// `slope_sigma`: one-sigma of the slope expected beforehand, milliseconds a second.
     pub(super) fn new(slope_sigma: f64) -> Self {
-        let symmetric = SIZES_MS.iter().map(|&sigma| Shape { sigma, tau: 0.0 });
+        Self::of_shapes(slope_sigma, false)
+    }
+
+    /// The same for arrivals that may wait for a tick.
+    pub(super) fn with_ticks(slope_sigma: f64) -> Self {
+        Self::of_shapes(slope_sigma, true)
+    }
+
+    fn of_shapes(slope_sigma: f64, with_ticks: bool) -> Self {
+        let symmetric = SIZES_MS.iter().map(|&sigma| Shape { sigma, tau: 0.0, width: 0.0 });
         let one_sided = SIZES_MS.iter().flat_map(|&tau| {
-            NOISE_PARTS.iter().map(move |part| Shape { sigma: (tau * part).max(NOISE_MIN_MS), tau })
+            NOISE_PARTS.iter().map(move |part| Shape {
+                sigma: (tau * part).max(NOISE_MIN_MS),
+                tau,
+                width: 0.0,
+            })
+        });
+        let ticks = (0..if with_ticks { TICKS } else { 0 }).map(|n| {
+            let width = (f64::from(n) * 0.5).exp2();
+            Shape { sigma: width * TICK_NOISE_PART, tau: 0.0, width }
         });
         let candidates = symmetric
             .chain(one_sided)
+            .chain(ticks)
             .map(|shape| Candidate {
                 shape,
                 line: (0.0, 0.0),
@@ -77,7 +107,8 @@ impl JitterFit {
                 fitted: false,
             })
             .collect();
-        Self { candidates, slope_sigma, t_mean: 0.0, fits: 0 }
+        let wild_early = WILD_DENSITY * if with_ticks { WILD_EARLY } else { 1.0 };
+        Self { candidates, slope_sigma, wild_early, t_mean: 0.0, fits: 0 }
     }
 
     /// Fits the line to these points, starting from the fit before.
@@ -99,9 +130,9 @@ impl JitterFit {
                     continue;
                 }
             } else {
-                candidate.line = (x_mean - candidate.shape.tau, 0.0);
+                candidate.line = (x_mean - candidate.shape.late(), 0.0);
             }
-            candidate.maximise(points, t_mean, self.slope_sigma);
+            candidate.maximise(points, t_mean, (self.slope_sigma, self.wild_early));
         }
         let heaviest = self.candidates.iter().map(|c| c.log_weight).fold(f64::NEG_INFINITY, f64::max);
         for candidate in &mut self.candidates {
@@ -127,9 +158,9 @@ impl JitterFit {
         self.weighted(|candidate| candidate.line.1)
     }
 
-    /// Size of the jitter: normal sigma and one-sided mean, milliseconds.
+    /// Size of the jitter: normal sigma and mean lateness, milliseconds.
     pub(super) fn jitter_ms(&self) -> (f64, f64) {
-        (self.weighted(|candidate| candidate.shape.sigma), self.weighted(|candidate| candidate.shape.tau))
+        (self.weighted(|candidate| candidate.shape.sigma), self.weighted(|candidate| candidate.shape.late()))
     }
 
     fn weighted(&self, of: impl Fn(&Candidate) -> f64) -> f64 {
@@ -152,10 +183,10 @@ struct Quadratic {
 }
 
 impl Candidate {
-    fn maximise(&mut self, points: &[Point], t_mean: f64, slope_sigma: f64) {
-        let reach = 4.0 * (self.shape.sigma + self.shape.tau);
+    fn maximise(&mut self, points: &[Point], t_mean: f64, beliefs: (f64, f64)) {
+        let reach = 4.0 * (self.shape.sigma + self.shape.late());
         let mut line = self.line;
-        let mut here = self.quadratic(points, t_mean, slope_sigma, line);
+        let mut here = self.quadratic(points, t_mean, beliefs, line);
         for _ in 0..STEPS_MAX {
             let [aa, ab, bb] = here.curvature;
             let det = aa * bb - ab * ab;
@@ -166,7 +197,7 @@ impl Candidate {
             let mut better = None;
             for _ in 0..8 {
                 let next = (line.0 + step.0, line.1 + step.1);
-                let there = self.quadratic(points, t_mean, slope_sigma, next);
+                let there = self.quadratic(points, t_mean, beliefs, next);
                 if there.log >= here.log - 1e-9 {
                     better = Some((next, there));
                     break;
@@ -185,26 +216,34 @@ impl Candidate {
         let det = aa * bb - ab * ab;
         self.line = line;
         self.covariance = [bb / det, -ab / det, aa / det];
-        let belief = if self.shape.tau == 0.0 { LOG_SYMMETRIC } else { 0.0 };
+        let belief = if self.shape.late() == 0.0 { LOG_SYMMETRIC } else { 0.0 };
         self.log_weight = here.log - 0.5 * det.ln() + belief;
         self.fitted = true;
     }
 
-    fn quadratic(&self, points: &[Point], t_mean: f64, slope_sigma: f64, line: (f64, f64)) -> Quadratic {
+    fn quadratic(
+        &self,
+        points: &[Point],
+        t_mean: f64,
+        (slope_sigma, wild_early): (f64, f64),
+        line: (f64, f64),
+    ) -> Quadratic {
         let prior = 1.0 / (slope_sigma * slope_sigma);
         let mut sum = Quadratic {
             log: -0.5 * prior * line.1 * line.1,
             gradient: [0.0, -prior * line.1],
-            // A floor keeps the value determined where the density is flat (all points far above).
-            curvature: [1e-9, 0.0, prior],
+            // A floor keeps the value determined where the density is flat (all points far above, or all
+            // between the edges of a tick).
+            curvature: [if self.shape.width > 0.0 { self.shape.width.powi(-2) } else { 1e-9 }, 0.0, prior],
         };
         for &(t, x) in points {
             let dt = t - t_mean;
-            let (log, slope, bend) = self.shape.log_density(x - line.0 - line.1 * dt);
+            let off = x - line.0 - line.1 * dt;
+            let (log, slope, bend) = self.shape.log_density(off);
             // Beside the jitter, a few arrivals may be anywhere; what a point counts is how far it is
             // not one of these.
             let density = (1.0 - WILD_PART) * log.exp();
-            let mixed = density + WILD_DENSITY;
+            let mixed = density + if off < 0.0 { wild_early } else { WILD_DENSITY };
             let trust = density / mixed;
             let (slope, bend) = (trust * slope, trust * bend);
             sum.log += mixed.ln();
@@ -219,11 +258,23 @@ impl Candidate {
 }
 
 impl Shape {
+    /// Mean lateness.
+    fn late(self) -> f64 {
+        self.tau + 0.5 * self.width
+    }
+
     /// Log-density of the jitter `u` with its first and second derivative.
     ///
     /// One-sided: ln f = −ln τ + s²/2τ² − u/τ + ln Φ(z), z = u/s − s/τ.
+    /// Up to a tick: ln f = −ln w + ln Φ(z), z of the nearer edge, u/s or (w − u)/s.
     fn log_density(self, u: f64) -> (f64, f64, f64) {
-        let Self { sigma, tau } = self;
+        let Self { sigma, tau, width } = self;
+        if width > 0.0 {
+            let (inside, sign) = if u < 0.5 * width { (u, 1.0) } else { (width - u, -1.0) };
+            let z = inside / sigma;
+            let (log_phi, mills) = log_normal_cdf(z);
+            return (log_phi - width.ln(), sign * mills / sigma, -mills * (z + mills) / (sigma * sigma));
+        }
         if tau == 0.0 {
             let z = u / sigma;
             return (-0.5 * z * z - sigma.ln() - LN_SQRT_2PI, -z / sigma, -1.0 / (sigma * sigma));
@@ -284,7 +335,8 @@ mod tests {
 
     #[test]
     fn derivatives_agree_with_differences() {
-        for shape in [Shape { sigma: 2.0, tau: 0.0 }, Shape { sigma: 1.0, tau: 8.0 }] {
+        let shape = |sigma, tau, width| Shape { sigma, tau, width };
+        for shape in [shape(2.0, 0.0, 0.0), shape(1.0, 8.0, 0.0), shape(1.0, 0.0, 16.0)] {
             for u in [-5.0, -0.5, 0.0, 1.0, 20.0] {
                 let h = 1e-3;
                 let (below, here, above) =

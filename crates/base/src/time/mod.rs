@@ -6,13 +6,17 @@
 //! through the fit between them.
 
 mod fit;
+#[cfg(test)]
+mod fit_tests;
 mod jitter;
+mod pulse;
 mod steady;
 mod utc;
 
 pub use fit::{ClockFit, GnssClock};
+pub use pulse::PulseTrouble;
 pub use steady::SteadyClock;
-pub use utc::{Civil, UtcTime, days_in_month};
+pub use utc::{Civil, EARLIEST_UTC, UtcTime, days_in_month};
 
 use std::fmt;
 use std::ops::{Add, AddAssign, Neg, Sub, SubAssign};

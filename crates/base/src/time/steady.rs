@@ -16,17 +16,26 @@ const CHECK_EVERY: u32 = 12;
 const PERIOD_SIGMA: f64 = 10.0;
 /// Periods a clock can smooth, seconds.
 const PERIODS_S: (f64, f64) = (0.001, 10.0);
-/// Least coherence (1: no jitter at all, 0: no rate at all) that is taken for a rate.
-const COHERENCE_MIN: f64 = 0.4;
-/// Part of the best coherence below which the period in use is given up.
-const COHERENCE_KEPT: f64 = 0.6;
+/// Periods looked at more closely: the most coherent ones.
+const PEAKS: usize = 6;
+/// Log-odds against a sample that is missing, and against two in the place of one.
+const LOG_MISSING: f64 = 3.5;
+const LOG_DOUBLE: f64 = 5.0;
+/// Least width of jitter taken for real, seconds.
+const WIDTH_MIN_S: f64 = 3e-4;
+/// The most of a period that the jitter of a steady device fills, and the most samples of it, as a part, that
+/// are missing or double.
+const STEADY: (f64, f64) = (0.75, 0.3);
+/// Log-odds by which another period must explain the arrivals better than the one in use.
+const LOG_BETTER: f64 = 8.0;
 
 /// Most of a period that expected lateness moves the limit between one count and the next.
 const LATE_PART: f64 = 0.3;
-
 /// Takes the jitter out of the arrivals of a device with a steady rate.
 ///
-/// The rate need not be known: it is the one at which the recent arrivals are most coherent. Samples
+/// The rate need not be known: it is the one that explains the recent arrivals best, by the width of the
+/// jitter that is left and the samples that must then be missing. (Coherence alone is not enough: arrivals
+/// that wait for a tick of 16 ms are as coherent at 32.5 Hz as at the 30 Hz of their device.) Samples
 /// may be missing; a device that changes its rate is followed. While there is no steady rate the
 /// arrivals are given back as they are.
 #[derive(Clone, Debug)]
@@ -53,7 +62,7 @@ impl SteadyClock {
     /// A clock of a rate yet unknown.
     pub fn new() -> Self {
         Self {
-            fit: JitterFit::new(PERIOD_SIGMA),
+            fit: JitterFit::with_ticks(PERIOD_SIGMA),
             reference: MonoTime::default(),
             period_s: None,
             index: 0,
@@ -114,35 +123,36 @@ impl SteadyClock {
         }
         self.since_check = 0;
         let times: Vec<f64> = self.recent.iter().map(|t| (*t - self.recent[0]).s()).collect();
-        let Some((best_s, best)) = most_coherent_period(&times) else {
-            return;
-        };
+        let best = likely_periods(&times).into_iter().max_by(|a, b| a.log_odds.total_cmp(&b.log_odds));
+        let Some(best) = best else { return };
         if let Some(period_s) = self.period_s {
-            let kept = coherence(&times, self.true_period_s(period_s)).0;
-            if kept >= COHERENCE_KEPT * best {
+            let kept = Explanation::of(&times, self.true_period_s(period_s));
+            // A few seconds may hide a tick that the fit has seen already.
+            let (sigma, late) = self.fit.jitter_ms();
+            let is_known = kept.width * self.true_period_s(period_s) * 1e3 <= 2.5 * late + 5.0 * sigma;
+            if kept.is_steady() && (is_known || kept.log_odds >= best.log_odds - LOG_BETTER) {
                 return;
             }
             self.period_s = None;
         }
-        if best >= COHERENCE_MIN {
-            self.begin(&times, best_s);
+        if best.is_steady() {
+            self.begin(&times, &best);
         }
     }
 
     /// Counts the recent samples with a new period and fits the line to them; the last is left to
     /// be placed.
-    fn begin(&mut self, times: &[f64], period_s: f64) {
-        let phase = coherence(times, period_s).1;
-        self.fit = JitterFit::new(PERIOD_SIGMA);
+    fn begin(&mut self, times: &[f64], best: &Explanation) {
+        self.fit = JitterFit::with_ticks(PERIOD_SIGMA);
         self.reference = self.recent[0];
-        self.period_s = Some(period_s);
+        self.period_s = Some(best.period_s);
         self.points.clear();
         self.index = i64::MIN;
         for &time in &times[..times.len() - 1] {
-            let index = ((time / period_s) - phase).round() as i64;
+            let index = best.index(time);
             if index > self.index {
                 self.index = index;
-                self.points.push_back(point(time, index, period_s));
+                self.points.push_back(point(time, index, best.period_s));
             }
         }
         self.fit.fit(self.points.make_contiguous());
@@ -187,20 +197,74 @@ fn coherence(times: &[f64], period_s: f64) -> (f64, f64) {
     (f64::hypot(sin, cos) / times.len() as f64, sin.atan2(cos) / TAU)
 }
 
-/// The period near the median interval at which the times are most coherent, and how much.
-fn most_coherent_period(times: &[f64]) -> Option<(f64, f64)> {
-    let mut intervals: Vec<f64> = times.windows(2).map(|pair| pair[1] - pair[0]).collect();
-    intervals.sort_by(f64::total_cmp);
-    let median = *intervals.get(intervals.len() / 2)?;
-    let length = times.last()? - times.first()?;
-    if !(PERIODS_S.0..=PERIODS_S.1).contains(&median) {
-        return None;
+/// How a period explains arrivals.
+#[derive(Clone, Copy, Debug)]
+struct Explanation {
+    period_s: f64,
+    /// Where in the period the arrivals lie, turns.
+    phase: f64,
+    /// Width of the jitter, all but the extremes, as a part of the period.
+    width: f64,
+    /// Samples missing or double, as a part of those there.
+    wrong: f64,
+    /// Log-likelihood up to a constant.
+    log_odds: f64,
+}
+
+impl Explanation {
+    fn of(times: &[f64], period_s: f64) -> Self {
+        let (_, phase) = coherence(times, period_s);
+        let mut this = Self { period_s, phase, width: 1.0, wrong: 1.0, log_odds: f64::NEG_INFINITY };
+        let count = times.len() as f64;
+        let indices: Vec<i64> = times.iter().map(|&time| this.index(time)).collect();
+        let steps =
+            |few: fn(i64) -> i64| indices.windows(2).map(|pair| few(pair[1] - pair[0])).sum::<i64>() as f64;
+        let (missing, double) = (steps(|step| (step - 1).max(0)), steps(|step| i64::from(step < 1)));
+        let off = |(&time, &index): (&f64, &i64)| time - index as f64 * period_s;
+        let mut offs: Vec<f64> = times.iter().zip(&indices).map(off).collect();
+        offs.sort_by(f64::total_cmp);
+        let edge = offs.len() / 12;
+        let width_s = (offs[offs.len() - 1 - edge] - offs[edge]).max(WIDTH_MIN_S);
+        this.width = width_s / period_s;
+        this.wrong = (missing + double) / count;
+        this.log_odds = -count * width_s.ln() - LOG_MISSING * missing - LOG_DOUBLE * double;
+        this
+    }
+
+    /// The count of the sample that arrived at `time`.
+    fn index(&self, time: f64) -> i64 {
+        (time / self.period_s - self.phase).round() as i64
+    }
+
+    fn is_steady(&self) -> bool {
+        self.width <= STEADY.0 && self.wrong <= STEADY.1
+    }
+}
+
+/// The most coherent periods near the mean interval.
+fn likely_periods(times: &[f64]) -> Vec<Explanation> {
+    let intervals: Vec<f64> = times.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    let mean = |of: &[f64]| of.iter().sum::<f64>() / of.len().max(1) as f64;
+    // Without silences, which are no intervals.
+    let (length, rough) = (intervals.iter().sum::<f64>(), mean(&intervals));
+    let near: Vec<f64> = intervals.into_iter().filter(|interval| *interval <= 4.0 * rough).collect();
+    let interval = mean(&near);
+    if !(PERIODS_S.0..=PERIODS_S.1).contains(&interval) {
+        return Vec::new();
     }
     // Frequencies a tenth of the resolution 1/T apart, from a third below to a third above.
-    let (low, high) = (0.75 / median, 1.35 / median);
+    let (low, high) = (0.75 / interval, 1.35 / interval);
     let count = ((high - low) * length * 10.0).ceil().clamp(1.0, 10_000.0);
     let periods = (0..=count as u32).map(|k| 1.0 / (low + (high - low) * f64::from(k) / count));
-    periods.map(|period| (period, coherence(times, period).0)).max_by(|a, b| a.1.total_cmp(&b.1))
+    let coherent: Vec<(f64, f64)> = periods.map(|period| (period, coherence(times, period).0)).collect();
+    let mut peaks: Vec<(f64, f64)> = coherent
+        .windows(3)
+        .filter(|three| three[1].1 >= three[0].1.max(three[2].1))
+        .map(|three| three[1])
+        .collect();
+    peaks.sort_by(|a, b| b.1.total_cmp(&a.1));
+    peaks.truncate(PEAKS);
+    peaks.into_iter().map(|(period_s, _)| Explanation::of(times, period_s)).collect()
 }
 
 #[cfg(test)]
@@ -247,5 +311,52 @@ mod tests {
         }
         let mut burst = SteadyClock::new();
         (0..100).for_each(|_| assert_eq!(burst.smooth(t), t, "all in one read"));
+    }
+
+    /// One-sigma about the mean and mean, ms, of the errors of a device that arrives by ticks, after `skip`.
+    fn through_ticks(rate_hz: f64, tick_ms: f64, late_ms: f64, missing: f64, seed: u64) -> (f64, f64) {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let (mut clock, mut errors) = (SteadyClock::new(), Vec::new());
+        let (start, phase_ms) = (1i64 << 60, rng.random_range(0.0..1e3 / rate_hz));
+        for sample in 0..300 {
+            let since_ms = phase_ms + f64::from(sample) * 1e3 / rate_hz;
+            if rng.random_bool(missing) {
+                continue;
+            }
+            let sent_ms = since_ms + late_ms * Distribution::<f64>::sample(&Exp1, &mut rng);
+            let heard_ms = (sent_ms / tick_ms).ceil() * tick_ms;
+            let t = MonoTime::from_ns(start) + Span::from_ms(heard_ms);
+            errors.push((clock.smooth(t) - MonoTime::from_ns(start) - Span::from_ms(since_ms)).ms());
+        }
+        let settled = &errors[60..];
+        let mean = settled.iter().sum::<f64>() / settled.len() as f64;
+        let variance = settled.iter().map(|e| (e - mean).powi(2)).sum::<f64>() / settled.len() as f64;
+        (variance.sqrt(), mean)
+    }
+
+    #[test]
+    fn ticks_are_taken_out_at_every_rate() {
+        let kinds = [(0.0, 0.0), (0.3, 0.0), (0.5, 0.03)];
+        for (n, tick_ms) in [1.0, 4.0, 10.0, 16.0, 20.0].into_iter().enumerate() {
+            for (k, rate_hz) in [8.0, 25.0, 30.0, 30.5].into_iter().enumerate() {
+                let (late_ms, missing) = kinds[(n + k) % 3];
+                let (sigma, mean) = through_ticks(rate_hz, tick_ms, late_ms, missing, (n + k) as u64);
+                let what =
+                    format!("{tick_ms} ms at {rate_hz} Hz, {late_ms} ms late: {sigma:.2} about {mean:.2} ms");
+                assert!(sigma <= 2.5, "{what}");
+                // How much all are late is seen only where the period goes through all phases of the tick.
+                let seen = [30.0, 30.5].contains(&rate_hz) && tick_ms == 16.0;
+                assert!(mean > -1.5 && mean < if seen { 2.0 } else { tick_ms + 1.0 }, "{what}");
+            }
+        }
+    }
+
+    #[test]
+    fn where_ticks_are_as_long_as_the_period_it_is_no_worse_than_nothing() {
+        for (rate_hz, tick_ms) in [(50.0, 16.0), (100.0, 16.0), (60.0, 20.0)] {
+            let (sigma, mean) = through_ticks(rate_hz, tick_ms, 0.2, 0.0, 7);
+            let nothing = tick_ms / 12f64.sqrt();
+            assert!(sigma <= nothing * 1.2, "{tick_ms} ms at {rate_hz} Hz: {sigma:.2} about {mean:.2} ms");
+        }
     }
 }

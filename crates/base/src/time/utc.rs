@@ -9,6 +9,10 @@ use super::NS_PER_S;
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct UtcTime(i64);
 
+/// Dates before this are a device's error (a week number that rolled over, a clock without a battery): this
+/// program is younger. 2026-01-01.
+pub const EARLIEST_UTC: UtcTime = UtcTime::from_unix_ns(1_767_225_600_000_000_000);
+
 /// A calendar date and time of day in UTC.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Civil {

@@ -95,6 +95,7 @@ fn nmea_headings_and_transducers() {
 fn readings(format: CompassFormat, bytes: &[u8]) -> (Vec<HeardAttitude>, DecodeCounts) {
     let (mut decoder, mut out) = (CompassDecoder::new(format), Vec::new());
     decoder.push(bytes, MonoTime::from_ns(5), &mut out);
+    decoder.flush(&mut out);
     (out, decoder.counts().clone())
 }
 
@@ -122,4 +123,152 @@ fn bare_lines_count_only_from_a_device_that_never_sends_checksums() {
 fn tilt_needs_both_angles() {
     let reading = CompassReading { pitch_deg: Some(1.0), ..CompassReading::default() };
     assert!(reading.sample().tilt.is_none() && reading.is_valid());
+}
+
+fn bursts(bodies: &[&str], times: usize) -> String {
+    let burst: String = bodies.iter().map(|body| framed(body) + "\r\n").collect();
+    burst.repeat(times)
+}
+
+#[test]
+fn angles_in_sentences_of_their_own_make_one_reading() {
+    let bodies = ["APXDR,A,3.873,D,ROLL", "APHDM,218.652,M", "APXDR,A,0.145,D,PTCH"];
+    for rotated in 0..3 {
+        let mut bodies = bodies;
+        bodies.rotate_left(rotated);
+        for times in [1, 2, 9] {
+            let (out, counts) = readings(CompassFormat::Nmea, bursts(&bodies, times).as_bytes());
+            assert_eq!((out.len(), counts.used), (times, 3 * times as u64), "{counts}");
+            for heard in out {
+                let CompassReading { heading_deg, pitch_deg, roll_deg, .. } = heard.reading;
+                assert_eq!((heading_deg, pitch_deg, roll_deg), (Some(218.652), Some(0.145), Some(3.873)));
+            }
+        }
+    }
+}
+
+#[test]
+fn a_heading_told_in_several_ways_counts_once() {
+    let all = ["HCHDG,101.1,,,7.1,W", "HCHDM,101.1,M", "HCHDT,94.0,T", "HCTHS,94.0,A"];
+    for ways in 1..=4 {
+        let (out, counts) = readings(CompassFormat::Nmea, bursts(&all[..ways], 20).as_bytes());
+        assert_eq!((out.len(), counts.used, counts.ignored), (20, 20, 20 * (ways as u64 - 1)), "{counts}");
+        assert!(out.iter().all(|heard| heard.reading.heading_deg == Some(101.1)));
+    }
+    let derived_only = bursts(&["HCHDG,,,,,", "HCHDT,94.0,T"], 3);
+    let (out, _) = readings(CompassFormat::Nmea, derived_only.as_bytes());
+    let first = out[0].reading;
+    assert_eq!(
+        (out.len(), first.heading_deg, first.heading_is_true, first.is_valid()),
+        (3, Some(94.0), true, true)
+    );
+}
+
+#[test]
+fn what_repeats_a_whole_attitude_says_nothing_more() {
+    let bodies = ["PTNTHPR,85.9,N,-0.9,N,0.8,N", "HCHDG,85.9,,,,", "HCXDR,A,-0.9,D,PITCH,A,0.8,D,ROLL"];
+    for rotated in 0..3 {
+        let mut bodies = bodies;
+        bodies.rotate_left(rotated);
+        let (out, counts) = readings(CompassFormat::Hmr3000, bursts(&bodies, 10).as_bytes());
+        assert_eq!(out.len(), 10, "{counts}");
+        assert!(out.iter().all(|heard| heard.sample.tilt.is_some() && heard.sample.heading.is_some()));
+    }
+}
+
+#[test]
+fn a_reading_is_heard_with_its_last_sentence_once_its_end_is_known() {
+    let (mut decoder, mut out) = (CompassDecoder::new(CompassFormat::Nmea), Vec::new());
+    let bodies = ["HCHDG,101.1,,,,", "HCXDR,A,1.5,D,PITCH", "HCXDR,A,2.5,D,ROLL"];
+    // Read from the middle of a burst on, 33 ms from burst to burst, 6 ms from sentence to sentence.
+    for n in 1..60 {
+        let (burst, sentence) = (n / 3, n % 3);
+        let t = MonoTime::from_ns(burst * 33_000_000 + sentence * 6_000_000);
+        decoder.push(bursts(&bodies[sentence as usize..][..1], 1).as_bytes(), t, &mut out);
+        if burst >= 12 {
+            let last = out.last().expect("some were given out");
+            assert_eq!(last.t_recv == t, sentence == 2, "sentence {n}");
+            assert!(last.sample.heading.is_some() && last.sample.tilt.is_some());
+            if sentence == 2 {
+                assert_eq!(last.t_first, MonoTime::from_ns(burst * 33_000_000), "it began with its heading");
+            }
+        }
+    }
+    // A device that falls silent is heard out.
+    decoder.push(bursts(&bodies[..1], 1).as_bytes(), MonoTime::from_ns(2_000_000_000), &mut out);
+    let before = out.len();
+    decoder.tick(MonoTime::from_ns(2_400_000_000), &mut out);
+    assert_eq!(out.len(), before + 1);
+}
+
+#[test]
+fn vectornav_tells_angles_or_a_quaternion() {
+    let told = (Some(85.123), Some(-0.9), Some(0.8), false, true);
+    for body in [
+        "VNYPR,+085.123,-000.900,+000.800",
+        "VNYMR,+085.123,-000.900,+000.800,+01.0640,-00.2531,+03.0614,+00.005,+00.344,-09.758,-0.001,-0.001,-0.001",
+        "VNYBA,+085.123,-000.900,+000.800,+00.1,+00.2,+00.3,0,0,0",
+    ] {
+        assert_eq!(reading(CompassFormat::Vectornav, body), told, "{body}");
+    }
+    assert_eq!(reading(CompassFormat::Vectornav, "VNYPR,-090.000,+001.0,-002.0").0, Some(270.0));
+    // A turn by 90 degrees about down, then by 30 about the right wing.
+    let half = std::f64::consts::FRAC_PI_4;
+    let (s, c, p) = (half.sin(), half.cos(), 15f64.to_radians());
+    let body = format!(
+        "VNQMR,{:.6},{:.6},{:.6},{:.6},0,0,0,0,0,0,0,0,0",
+        -s * p.sin(),
+        c * p.sin(),
+        s * p.cos(),
+        c * p.cos()
+    );
+    let (heading, pitch, roll, ..) = reading(CompassFormat::Vectornav, &body);
+    for (angle, wanted) in [(heading, 90.0), (pitch, 30.0), (roll, 0.0)] {
+        assert!((angle.expect("given") - wanted).abs() < 1e-3, "{angle:?}");
+    }
+    assert_eq!(said(CompassFormat::Vectornav, "VNQTN,0.5,0.5,0.5,0.6"), Err(Refusal::OutOfRange));
+    let ins = |status| {
+        format!(
+            "VNINS,333811.902862,1694,{status},+009.500,-004.754,-000.225,+32.95602815,-096.7,160.4,0,0,0,1.0,0.1,0.1"
+        )
+    };
+    assert_eq!(
+        reading(CompassFormat::Vectornav, &ins("0002")),
+        (Some(9.5), Some(-4.754), Some(-0.225), true, true)
+    );
+    assert_eq!(reading(CompassFormat::Vectornav, &ins("0000")).0, None, "it is not aligned");
+    assert_eq!(said(CompassFormat::Vectornav, "VNMAG,1.0,2.0,3.0"), Ok(None));
+}
+
+#[test]
+fn headings_between_antennas_are_true() {
+    for (body, wanted) in [
+        ("GNHPR,040400.00,201.75,+1.20,000.00,4,33,1.00,0004", (Some(201.75), None, None, true, true)),
+        ("GNHPR,040400.00,201.75,+1.20,000.00,0,33,1.00,0004", (None, None, None, true, false)),
+        (
+            "PTNL,AVR,181059.6,+149.4688,Yaw,+0.0134,Tilt,,,60.191,3,2.5,6",
+            (Some(149.4688), None, None, true, true),
+        ),
+        (
+            "PTNL,AVR,212405.20,-10.5,Yaw,+1.5,Tilt,-2.5,Roll,12.575,3,1.4,16",
+            (Some(349.5), Some(1.5), Some(-2.5), true, true),
+        ),
+        ("PTNL,AVR,212405.20,+10.5,Yaw,+1.5,Tilt,-2.5,Roll,12.575,0,1.4,16", (None, None, None, true, false)),
+        ("PSAT,HPR,184051.50,281.1,1.7,-0.4,N", (Some(281.1), Some(1.7), Some(-0.4), true, true)),
+        ("PSSN,HRP,142820.2,010120,127.5,,-1.5,0.1,,0.2,12,2,E", (Some(127.5), None, None, true, true)),
+        (
+            "PSSN,HRP,142820.2,010120,127.5,0.5,-1.5,0.1,0.1,0.2,12,2,E",
+            (Some(127.5), Some(-1.5), Some(0.5), true, true),
+        ),
+        ("PSSN,HRP,142820.2,010120,,,,,,,12,0,E", (None, None, None, true, false)),
+        ("PRDID,-001.31,+007.81,047.31", (Some(47.31), Some(-1.31), Some(7.81), true, true)),
+    ] {
+        assert_eq!(reading(CompassFormat::Nmea, body), wanted, "{body}");
+    }
+    for body in ["PTNL,AVR,1", "PSAT,HPR,1", "GNHPR", "PRDID,1,2", "PTNL,AVR,1,400.0,Yaw,0,Tilt,,,1,3,1,1"] {
+        assert!(said(CompassFormat::Nmea, body).is_err(), "{body}");
+    }
+    for body in ["PTNL,GGK,1,2", "PSAT,GBS,1,2", "PSSN,SNC,1"] {
+        assert_eq!(said(CompassFormat::Nmea, body), Ok(None), "{body}");
+    }
 }

@@ -3,6 +3,7 @@
 //! A format is a file beside this one and a row in [`reader`]; its name in the configuration is a row of
 //! [`CompassFormat`].
 
+mod by_gnss;
 mod fields;
 #[cfg(test)]
 mod format_tests;
@@ -17,6 +18,8 @@ mod tagged;
 mod tcm2;
 #[cfg(test)]
 mod tests;
+mod together;
+mod vectornav;
 
 pub use reading::{CompassReading, HeardAttitude};
 
@@ -26,7 +29,7 @@ use windhover_base::time::MonoTime;
 use crate::counts::{DecodeCounts, Refusal};
 use crate::lines::{LineFramer, LineStart};
 use crate::sentence::Sentence;
-use reading::heard;
+use together::Together;
 
 /// What a sentence with a sound checksum says.
 type ReadSentence = fn(&Sentence<'_>) -> Result<Option<CompassReading>, Refusal>;
@@ -53,6 +56,7 @@ const fn reader(format: CompassFormat) -> Reader {
         CompassFormat::Revolution => Reader::Sentences(revolution::read),
         CompassFormat::Pni => Reader::Packets,
         CompassFormat::Pashr => Reader::Sentences(pashr::read),
+        CompassFormat::Vectornav => Reader::Sentences(vectornav::read),
         CompassFormat::Nmea => Reader::Sentences(nmea::read),
     }
 }
@@ -67,7 +71,7 @@ pub struct CompassDecoder {
 /// Collects bytes into what a format is made of.
 #[derive(Clone, Debug)]
 enum Input {
-    Text(TextInput),
+    Text(Box<TextInput>),
     Packets(pni::PacketFramer),
 }
 
@@ -78,12 +82,19 @@ struct TextInput {
     bare: Option<ReadLine>,
     /// Whether the device was seen to send checksums: then a line without one is damaged.
     has_checksums: bool,
+    together: Together,
 }
 
 impl TextInput {
     fn new(sentence: ReadSentence, bare: Option<ReadLine>) -> Self {
         let start = if bare.is_some() { LineStart::Any } else { LineStart::Dollar };
-        Self { lines: LineFramer::new(start), sentence, bare, has_checksums: false }
+        Self {
+            lines: LineFramer::new(start),
+            sentence,
+            bare,
+            has_checksums: false,
+            together: Together::default(),
+        }
     }
 
     fn push(
@@ -93,19 +104,29 @@ impl TextInput {
         counts: &mut DecodeCounts,
         out: &mut Vec<HeardAttitude>,
     ) {
-        let (sentence, bare, has_checksums) = (self.sentence, self.bare, &mut self.has_checksums);
-        self.lines.push(bytes, t_recv, counts, |line, counts| {
+        let Self { lines, sentence: read, bare, has_checksums, together } = self;
+        lines.push(bytes, t_recv, counts, |line, counts| {
             if line.text.contains(&b'*') {
                 *has_checksums = true;
             } else if *has_checksums || bare.is_none() {
                 return counts.refuse(Refusal::NoChecksum);
             }
-            let said = match bare.filter(|_| !line.text.starts_with(b"$")) {
-                Some(bare) => bare(line.text),
-                None => Sentence::of_line(line.text).and_then(|line| sentence(&line)),
+            if let Some(bare) = bare.filter(|_| !line.text.starts_with(b"$")) {
+                return match bare(line.text) {
+                    Ok(Some(reading)) => together.whole(reading, line.span, counts, out),
+                    Ok(None) => counts.ignored += 1,
+                    Err(why) => counts.refuse(why),
+                };
+            }
+            let sentence = match Sentence::of_line(line.text) {
+                Ok(sentence) => sentence,
+                Err(why) => return counts.refuse(why),
             };
-            match said {
-                Ok(Some(reading)) => out.push(heard(reading, line.span, counts)),
+            match read(&sentence) {
+                Ok(Some(reading)) if is_part(&sentence) => {
+                    together.part(reading, &sentence, line.span, counts, out);
+                }
+                Ok(Some(reading)) => together.whole(reading, line.span, counts, out),
                 Ok(None) => counts.ignored += 1,
                 Err(why) => counts.refuse(why),
             }
@@ -113,12 +134,19 @@ impl TextInput {
     }
 }
 
+/// Whether a sentence is plain NMEA, which tells an attitude in parts; others are a device's own.
+fn is_part(sentence: &Sentence<'_>) -> bool {
+    !sentence.address().starts_with("VN") && sentence.formatter().is_some()
+}
+
 impl CompassDecoder {
     /// A decoder for one format.
     pub fn new(format: CompassFormat) -> Self {
         let input = match reader(format) {
-            Reader::Sentences(sentence) => Input::Text(TextInput::new(sentence, None)),
-            Reader::SentencesOrBare(sentence, bare) => Input::Text(TextInput::new(sentence, Some(bare))),
+            Reader::Sentences(sentence) => Input::Text(Box::new(TextInput::new(sentence, None))),
+            Reader::SentencesOrBare(sentence, bare) => {
+                Input::Text(Box::new(TextInput::new(sentence, Some(bare))))
+            }
             Reader::Packets => Input::Packets(pni::PacketFramer::default()),
         };
         Self { counts: DecodeCounts::default(), input }
@@ -129,6 +157,20 @@ impl CompassDecoder {
         match &mut self.input {
             Input::Text(text) => text.push(bytes, t_recv, &mut self.counts, out),
             Input::Packets(packets) => packets.push(bytes, t_recv, &mut self.counts, out),
+        }
+    }
+
+    /// Time passed: gives out an open reading the device has fallen silent after.
+    pub fn tick(&mut self, now: MonoTime, out: &mut Vec<HeardAttitude>) {
+        if let Input::Text(text) = &mut self.input {
+            text.together.tick(now, &mut self.counts, out);
+        }
+    }
+
+    /// The stream has ended: gives out what is open.
+    pub fn flush(&mut self, out: &mut Vec<HeardAttitude>) {
+        if let Input::Text(text) = &mut self.input {
+            text.together.close(&mut self.counts, out);
         }
     }
 

@@ -1,11 +1,12 @@
 //! Headings and transducers of plain NMEA 0183, which most compasses can send beside their own sentences.
 
+use super::by_gnss;
 use super::fields::{heading, tilt};
 use super::reading::CompassReading;
 use crate::counts::Refusal;
 use crate::sentence::Sentence;
 
-/// HDG, HDM, HDT, THS and XDR of any talker.
+/// HDG, HDM, HDT, THS and XDR of any talker, and what receivers with several antennas send.
 pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
     let mut reading = CompassReading::default();
     match sentence.formatter() {
@@ -25,7 +26,7 @@ pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Re
             reading.heading_deg = heading(sentence.field(1))?.filter(|_| !reading.flagged);
         }
         Some("XDR") => return transducers(sentence),
-        _ => return Ok(None),
+        _ => return by_gnss::read(sentence),
     }
     reading.flagged |= reading.heading_deg.is_none();
     Ok(Some(reading))
@@ -43,7 +44,8 @@ fn signed_east(sentence: &Sentence<'_>, index: usize) -> Result<Option<f64>, Ref
     }
 }
 
-/// XDR: groups of type, value, unit, name; the angles (type A, unit D) named pitch and roll.
+/// XDR: groups of type, value, unit, name; the angles (type A, unit D) named pitch and roll (or heel, as
+/// sailors have it), together or each in a sentence of its own.
 fn transducers(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
     let mut reading = CompassReading::default();
     for group in 0..sentence.fields() / 4 {
@@ -54,7 +56,7 @@ fn transducers(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusa
         let name = sentence.field(at + 3).to_ascii_uppercase();
         if name.starts_with("PITCH") || name.starts_with("PTCH") {
             reading.pitch_deg = tilt(sentence.field(at + 1))?;
-        } else if name.starts_with("ROLL") {
+        } else if name.starts_with("ROLL") || name.starts_with("HEEL") {
             reading.roll_deg = tilt(sentence.field(at + 1))?;
         }
     }

@@ -1,4 +1,8 @@
-//! PNI binary packets (TCM3, TCM5, TCM XB and successors).
+//! PNI binary packets (TCM3, TCM5, TCM XB, TargetPoint, TRAX, TRAX2 and successors).
+//!
+//! A data response is a count and so many components, each an identity and its value. Heading, pitch, roll,
+//! distortion and heading status are used, the others passed over by their lengths. What follows a component
+//! of unknown length cannot be read: the packet is used up to there, and the component counted by its number.
 //!
 //! Packet: u16 length of the whole packet, frame identity, payload, u16 CRC, big-endian; the CRC is
 //! polynomial 0x1021 from 0 over everything before it. Source: PNI's manual.
@@ -59,8 +63,11 @@ impl PacketFramer {
                     bytes: packet.len(),
                     ..LineSpan::default()
                 };
-                match self.reading(&packet) {
-                    Ok(Some(reading)) => out.push(heard(reading, span, counts)),
+                match self.reading(&packet, counts) {
+                    Ok(Some(reading)) => {
+                        counts.used += 1;
+                        out.push(heard(reading, span, span, counts));
+                    }
                     Ok(None) => counts.ignored += 1,
                     Err(why) => counts.refuse(why),
                 }
@@ -118,12 +125,22 @@ impl PacketFramer {
     }
 
     /// Components of a data response: a count, then identity and value of each.
-    fn reading(&mut self, packet: &[u8]) -> Result<Option<CompassReading>, Refusal> {
+    fn reading(
+        &mut self,
+        packet: &[u8],
+        counts: &mut DecodeCounts,
+    ) -> Result<Option<CompassReading>, Refusal> {
         let payload = &packet[2..packet.len() - 2];
         let (Some(&DATA_RESPONSE), Some(&count)) = (payload.first(), payload.get(1)) else {
             return Ok(None);
         };
-        let components = components_of(&payload[2..], count)?;
+        let (components, unknown) = components_of(&payload[2..], count)?;
+        if let Some(identity) = unknown {
+            counts.leave_out(format!("component {identity}, of unknown length, and what follows it"));
+            if !components.iter().any(|component| matches!(component.identity, HEADING | PITCH | ROLL)) {
+                return Err(Refusal::Malformed);
+            }
+        }
         let plausible = |little: bool| components.iter().all(|component| component.is_plausible(little));
         if !plausible(self.little_endian) {
             if !plausible(!self.little_endian) {
@@ -139,7 +156,8 @@ impl PacketFramer {
                 HEADING => reading.heading_deg = Some(angle),
                 PITCH => reading.pitch_deg = Some(angle),
                 ROLL => reading.roll_deg = Some(angle),
-                DISTORTION => distorted = component.bytes[0] != 0,
+                DISTORTION => distorted |= component.bytes[0] != 0,
+                HEADING_STATUS => distorted |= component.bytes[0] == STATUS_POOR,
                 _ => {}
             }
         }
@@ -160,8 +178,25 @@ const ACCELERATION: std::ops::RangeInclusive<u8> = 21..=23;
 const PITCH: u8 = 24;
 const ROLL: u8 = 25;
 const MAGNETIC: std::ops::RangeInclusive<u8> = 27..=29;
+const GYRO: std::ops::RangeInclusive<u8> = 74..=76;
+const QUATERNION: u8 = 77;
+const HEADING_STATUS: u8 = 79;
+const MAGNETIC_ACCURACY: u8 = 88;
+/// Heading status of an uncertainty beyond 10 degrees (1: within 2 degrees, 2: within 10).
+const STATUS_POOR: u8 = 3;
 
-/// One component: its identity and its bytes, four of a float or one of a flag.
+/// Bytes of a component's value.
+fn length_of(identity: u8) -> Option<usize> {
+    match identity {
+        DISTORTION | CALIBRATION_STATUS | HEADING_STATUS => Some(1),
+        HEADING | TEMPERATURE | PITCH | ROLL | MAGNETIC_ACCURACY => Some(4),
+        QUATERNION => Some(16),
+        _ if [ACCELERATION, MAGNETIC, GYRO].iter().any(|of| of.contains(&identity)) => Some(4),
+        _ => None,
+    }
+}
+
+/// One component: its identity and the first bytes of its value, four of a float or one of a flag.
 #[derive(Clone, Copy, Debug)]
 struct Component {
     identity: u8,
@@ -186,23 +221,21 @@ impl Component {
     }
 }
 
-fn components_of(mut rest: &[u8], count: u8) -> Result<Vec<Component>, Refusal> {
+/// The components up to the first of unknown length, and that one's identity.
+fn components_of(mut rest: &[u8], count: u8) -> Result<(Vec<Component>, Option<u8>), Refusal> {
     let mut components = Vec::with_capacity(usize::from(count));
     for _ in 0..count {
         let (&identity, after) = rest.split_first().ok_or(Refusal::Malformed)?;
-        let size = match identity {
-            DISTORTION | CALIBRATION_STATUS => 1,
-            HEADING | TEMPERATURE | PITCH | ROLL => 4,
-            _ if ACCELERATION.contains(&identity) || MAGNETIC.contains(&identity) => 4,
-            _ => return Err(Refusal::Malformed),
+        let Some(length) = length_of(identity) else {
+            return Ok((components, Some(identity)));
         };
-        let value = after.get(..size).ok_or(Refusal::Malformed)?;
+        let value = after.get(..length).ok_or(Refusal::Malformed)?;
         let mut bytes = [0; 4];
-        bytes[..size].copy_from_slice(value);
+        bytes.iter_mut().zip(value).for_each(|(to, from)| *to = *from);
         components.push(Component { identity, bytes });
-        rest = &after[size..];
+        rest = &after[length..];
     }
-    if rest.is_empty() { Ok(components) } else { Err(Refusal::Malformed) }
+    if rest.is_empty() { Ok((components, None)) } else { Err(Refusal::Malformed) }
 }
 
 #[cfg(test)]
@@ -278,4 +311,66 @@ mod tests {
         assert_eq!(out.len(), 2, "{counts}");
         assert!(counts.refused(Refusal::BadChecksum) >= 1);
     }
+
+    fn component(identity: u8, value: &[u8]) -> Vec<u8> {
+        [&[identity], value].concat()
+    }
+
+    fn attitude() -> Vec<Vec<u8>> {
+        [(HEADING, 123.5f32), (PITCH, -2.25), (ROLL, 4.0)]
+            .map(|(identity, angle)| component(identity, &angle.to_be_bytes()))
+            .to_vec()
+    }
+
+    fn response(components: &[Vec<u8>]) -> Vec<u8> {
+        packet(DATA_RESPONSE, &[&[components.len() as u8], components.concat().as_slice()].concat())
+    }
+
+    #[test]
+    fn heading_status_tells_a_poor_heading() {
+        for (status, valid) in [(0, true), (1, true), (2, true), (3, false)] {
+            let mut components = attitude();
+            components.push(component(HEADING_STATUS, &[status]));
+            let (out, counts) = readings(&response(&components));
+            assert_eq!((out.len(), out[0].is_valid()), (1, valid), "{status}: {counts}");
+        }
+    }
+
+    #[test]
+    fn what_is_of_unknown_length_is_named() {
+        let mut components = attitude();
+        components.push(component(99, &[1, 2, 3]));
+        let (out, counts) = readings(&response(&components));
+        assert_eq!((out.len(), counts.used, counts.refused_total()), (1, 1, 0));
+        assert!(
+            counts.left_out().next().is_some_and(|(name, n)| name.starts_with("component 99,") && n == 1)
+        );
+        components.rotate_right(1);
+        let (out, counts) = readings(&response(&components));
+        assert_eq!((out.len(), counts.refused(Refusal::Malformed)), (0, 1));
+        assert!(counts.to_string().contains("component 99,"), "{counts}");
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn other_components_change_nothing_wherever_they_stand(
+            others in proptest::collection::vec((proptest::sample::select(OTHERS.to_vec()), 0usize..4), 0..12),
+            filling: u8,
+        ) {
+            let mut components = attitude();
+            for (identity, at) in others {
+                let value = vec![filling; length_of(identity).expect("of the table")];
+                components.insert(at, component(identity, &value));
+            }
+            let (out, counts) = readings(&response(&components));
+            proptest::prop_assert_eq!(out.len(), 1, "{}", counts);
+            let angles = (out[0].heading_deg, out[0].pitch_deg, out[0].roll_deg);
+            proptest::prop_assert_eq!(angles, (Some(123.5), Some(-2.25), Some(4.0)));
+            proptest::prop_assert_eq!(counts.refused_total(), 0);
+        }
+    }
+
+    /// Components that say nothing of the attitude.
+    const OTHERS: [u8; 13] =
+        [TEMPERATURE, CALIBRATION_STATUS, 21, 22, 23, 27, 28, 29, 74, 75, 76, QUATERNION, MAGNETIC_ACCURACY];
 }

@@ -48,22 +48,29 @@ pub struct HeardAttitude {
     pub reading: CompassReading,
     /// When the read returned that completed it.
     pub t_recv: MonoTime,
-    /// Its length on the wire.
+    /// When the read returned that completed its first sentence or packet.
+    pub t_first: MonoTime,
+    /// Length of that on the wire.
     pub bytes: usize,
-    /// Bytes of that read after it. Its last byte ended no later than `t_recv` less the
+    /// Bytes of that read after it. Its last byte ended no later than `t_first` less the
     /// transmission time of these.
     pub bytes_after: usize,
 }
 
-/// Stamps a reading and counts it.
-pub(super) fn heard(reading: CompassReading, span: LineSpan, counts: &mut DecodeCounts) -> HeardAttitude {
-    counts.used += 1;
+/// Stamps a reading of sentences from the first to the last.
+pub(super) fn heard(
+    reading: CompassReading,
+    first: LineSpan,
+    last: LineSpan,
+    counts: &mut DecodeCounts,
+) -> HeardAttitude {
     counts.flagged += u64::from(reading.flagged);
     HeardAttitude {
         sample: reading.sample(),
         reading,
-        t_recv: span.t_last,
-        bytes: span.bytes,
-        bytes_after: span.bytes_after,
+        t_recv: last.t_last,
+        t_first: first.t_last,
+        bytes: first.bytes,
+        bytes_after: first.bytes_after,
     }
 }

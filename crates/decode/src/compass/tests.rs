@@ -15,6 +15,7 @@ fn in_pieces(format: CompassFormat, bytes: &[u8], sizes: &[usize]) -> Vec<HeardA
         decoder.push(read, MonoTime::default(), &mut out);
         rest = after;
     }
+    decoder.flush(&mut out);
     out
 }
 

@@ -121,6 +121,11 @@ impl<M: Default, S: Default + Clone> History<M, S> {
         if index == 0 { &self.base } else { &self.entries[index - 1].after }
     }
 
+    /// The state after the last measurement that was true no later than `t`.
+    pub fn at(&self, t: MonoTime) -> &S {
+        self.before(self.entries.partition_point(|entry| entry.stamp.t_valid <= t))
+    }
+
     /// The newest state.
     pub fn head(&self) -> &S {
         self.before(self.entries.len())
@@ -180,6 +185,11 @@ mod tests {
             feed(&mut history, stamp(valid, recv, u64::from(value)), value).expect("within the history");
         }
         assert_eq!(history.head(), &vec![0, 1, 2, 3, 4]);
+        let at = |ms: i64| history.at(MonoTime::from_ns(ms * 1_000_000));
+        assert_eq!(
+            (at(89), at(150), at(219), at(900)),
+            (&vec![], &vec![0, 1, 2], &vec![0, 1, 2, 3], history.head())
+        );
     }
 
     #[test]

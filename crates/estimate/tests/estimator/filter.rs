@@ -15,14 +15,22 @@ use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 
 /// One measurement as the pipeline hands it over.
 #[derive(Clone)]
-enum Heard {
+pub(super) enum Heard {
     Gnss(Stamped<GnssEpoch>),
     Attitude(Stamped<AttitudeSample>),
     Frame(Stamped<FrameObservations>),
 }
 
 impl Heard {
-    fn t_valid(&self) -> MonoTime {
+    pub(super) fn t_recv(&self) -> MonoTime {
+        match self {
+            Self::Gnss(s) => s.t_recv,
+            Self::Attitude(s) => s.t_recv,
+            Self::Frame(s) => s.t_recv,
+        }
+    }
+
+    pub(super) fn t_valid(&self) -> MonoTime {
         match self {
             Self::Gnss(s) => s.t_valid,
             Self::Attitude(s) => s.t_valid,
@@ -38,7 +46,7 @@ impl Heard {
         }
     }
 
-    fn give(&self, filter: &mut Estimator, out: &mut Vec<EstimatorOutput>) {
+    pub(super) fn give(&self, filter: &mut Estimator, out: &mut Vec<EstimatorOutput>) {
         match self {
             Self::Gnss(s) => filter.gnss(s, out),
             Self::Attitude(s) => filter.attitude(s, out),
@@ -47,13 +55,13 @@ impl Heard {
     }
 }
 
-struct Flight {
-    world: Arc<World>,
-    site: Site,
-    heard: Vec<Heard>,
+pub(super) struct Flight {
+    pub(super) world: Arc<World>,
+    pub(super) site: Site,
+    pub(super) heard: Vec<Heard>,
 }
 
-fn fly(name: &str, seconds: f64, seed: u64, change: impl FnOnce(&mut Scenario)) -> Flight {
+pub(super) fn fly(name: &str, seconds: f64, seed: u64, change: impl FnOnce(&mut Scenario)) -> Flight {
     let mut scenario = Scenario::named(name).expect("a named scenario");
     scenario.duration_s = seconds;
     change(&mut scenario);
@@ -82,7 +90,7 @@ impl Flight {
         &self.world.scenario().rig
     }
 
-    fn filter(&self) -> Estimator {
+    pub(super) fn filter(&self) -> Estimator {
         Estimator::new(self.rig(), &EstimatorConfig::default(), &self.site)
     }
 
@@ -361,7 +369,7 @@ fn a_lasting_jump_of_the_receiver_anchors_the_scene_anew() {
     for own in ownships(&jumped).iter().filter(|o| flight.world.seconds(o.t_valid) > 6.0) {
         let truth = flight.world.ownship(own.t_valid);
         let Some(off_m) = off(own.t_valid) else { continue };
-        let (error, sigma) = (own.position_ned_m - truth.position_ned_m, own.position_sigma_m);
+        let (error, sigma) = (own.position_ned_m - truth.position_ned_m, own.position_sigma_m());
         assert!((error.x - off_m).abs() < 4.0 * sigma.x && error.y.abs() < 4.0 * sigma.y, "{own:?}");
         // Tags show the height, whatever the receiver says of it.
         assert!(error.z.abs() < 4.0 * sigma.z && error.z.abs() < 1.0, "{own:?}");

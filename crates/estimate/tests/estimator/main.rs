@@ -3,3 +3,4 @@
 mod filter;
 mod ground;
 mod honesty;
+mod ownship;

@@ -2,6 +2,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
+use super::super::company::Looks;
 use windhover_base::settings::{Brightness, MarkerConfig, MarkerKind, TargetConfig};
 use windhover_detect::{TagLayout, TagPattern, tag_pattern};
 
@@ -14,6 +15,9 @@ const WINDSCREEN: f32 = 26.0;
 const SIDES: f32 = 44.0;
 /// And of what lies on a marker.
 const COVER: f32 = 96.0;
+
+/// Darkest and lightest of clothes and painted roofs.
+const PAINTED: (f32, f32) = (25.0, 210.0);
 
 /// Markers of one vehicle that may be covered.
 const COVERABLE: usize = 8;
@@ -34,6 +38,26 @@ impl Hit {
             Self::Ground { shadow } => u32::from(shadow),
             Self::Surface { level, .. } => 2 + level as u32,
         }
+    }
+}
+
+/// Clothes and painted roofs: cubes of random grey through the whole body.
+#[derive(Clone, Copy, Debug)]
+struct Paint {
+    per_m: f32,
+    seed: u32,
+}
+
+impl Paint {
+    fn level(self, at: &Vector3<f32>) -> f32 {
+        // A face lies on a cube's border as often as not: looked at a little inside of it.
+        let cell = at.map(|x| (x * self.per_m * 0.999 + 0.013).floor() as i32 as u32);
+        let mut mixed = self.seed.wrapping_mul(0x9e37_79b9);
+        for part in cell.iter() {
+            mixed = (mixed ^ part).wrapping_mul(0x85eb_ca6b);
+            mixed ^= mixed >> 15;
+        }
+        PAINTED.0 + (PAINTED.1 - PAINTED.0) * (mixed & 0xffff) as f32 / 65_535.0
     }
 }
 
@@ -61,6 +85,7 @@ pub(super) struct Body {
     hull: Option<(Vector3<f32>, Vector3<f32>)>,
     level: f32,
     windscreen: (f32, f32),
+    paint: Option<Paint>,
 }
 
 impl Body {
@@ -82,7 +107,33 @@ impl Body {
             .iter()
             .any(|m| m.kind == MarkerKind::Disc && disc_level(m) < f32::midpoint(BODY, LIGHT_BODY));
         let level = if dark_disc { LIGHT_BODY } else { BODY };
-        Self { plates, hull, level, windscreen: (fore - 0.10 * length, fore - 0.02 * length) }
+        let windscreen = (fore - 0.10 * length, fore - 0.02 * length);
+        Self { plates, hull, level, windscreen, paint: None }
+    }
+
+    /// What companion `index` looks like, beside vehicles like `target`.
+    pub(super) fn of_companion(looks: Looks, target: &TargetConfig, index: usize) -> Self {
+        let paint = |cell_m: f32| Some(Paint { per_m: 1.0 / cell_m, seed: 1 + index as u32 });
+        match looks {
+            Looks::Double => Self::new(target),
+            Looks::Painted => {
+                let bare = Self::new(&TargetConfig { marker: Vec::new(), ..target.clone() });
+                let length = target.wheelbase_m.unwrap_or(0.8) as f32;
+                Self {
+                    paint: paint(0.12),
+                    ..bare.of_size((-0.35 * length, 1.45 * length), 0.43 * length, 0.55)
+                }
+            }
+            Looks::Person => {
+                let bare = Self::new(&TargetConfig { marker: Vec::new(), ..target.clone() });
+                Self { paint: paint(0.08), ..bare.of_size((-0.17, 0.17), 0.24, 1.7) }
+            }
+        }
+    }
+
+    fn of_size(self, (aft, fore): (f32, f32), wide: f32, height: f32) -> Self {
+        let hull = Some((Vector3::new(aft, -wide, -height), Vector3::new(fore, wide, 0.0)));
+        Self { hull, ..self }
     }
 
     /// Points that bound the vehicle and its shadow, for a sun in `sun` (vehicle frame, toward it).
@@ -118,6 +169,9 @@ impl Body {
     fn hull_hit(&self, origin: &Vector3<f32>, direction: &Vector3<f32>) -> Option<(f32, f32)> {
         let (low, high) = self.hull.as_ref()?;
         let (at, axis) = slab(low, high, origin, direction)?;
+        if let Some(paint) = &self.paint {
+            return Some((at, paint.level(&(origin + direction * at))));
+        }
         if axis != 2 {
             return Some((at, SIDES));
         }

@@ -31,6 +31,8 @@ const NOISE: usize = 1 << 16;
 const SHARP_PX: f32 = 0.5;
 /// Pixels in a run over which the ground is taken as straight.
 const RUN: usize = 8;
+/// Rows of a rolling shutter that are drawn as exposed together.
+const BAND: usize = 4;
 /// What is left of the light in shadow.
 const SHADOW: f32 = 0.42;
 /// Added to texture coordinates to keep them positive, in periods.
@@ -81,7 +83,7 @@ impl Renderer {
     /// A renderer for this world's camera and scene.
     pub fn new(world: Arc<World>) -> Self {
         let scenario = world.scenario();
-        let camera = &scenario.rig.camera;
+        let camera = &world.rig().camera;
         let mut stream = Stream::of(world.seed(), Purpose::Scene);
         let scene = scenario.scene.clone();
         // A texel is a pixel on the ground at flying height: structure down to the pixel, no aliases.
@@ -89,7 +91,12 @@ impl Renderer {
         let tile = Tile::new(texel_m, scene.objects, &mut stream);
         let noise = (0..NOISE).map(|_| stream.normal() as f32).collect();
         let spread = spread(scene.blur_px as f32);
-        let bodies = scenario.rig.target.iter().map(Body::new).collect();
+        let bodies = (0..world.movers())
+            .map(|index| match world.looks(index) {
+                (target, None) => Body::new(target),
+                (target, Some(looks)) => Body::of_companion(looks, target, index),
+            })
+            .collect();
         Self { lens: Lens::new(camera), scene, tile, bodies, noise, spread, threads: 1, world }
     }
 
@@ -105,17 +112,37 @@ impl Renderer {
         let (width, height) = (self.lens.width, self.lens.height);
         (image.width, image.height, image.stride) = (width, height, width);
         image.data.resize(width * height, 0);
-        let exposure = self.expose(t, frame);
         let rows = height.div_ceil(self.threads);
+        if self.world.scenario().camera.readout_ms != 0.0 {
+            return self.in_parts(rows.next_multiple_of(BAND), image, |first_row, data| {
+                self.draw_rolling(t, frame, first_row, data);
+            });
+        }
+        let exposure = self.expose(t, frame);
+        self.in_parts(rows, image, |first_row, data| self.draw_rows(&exposure, first_row, data));
+    }
+
+    /// Draws parts of so many rows, each on a thread of its own.
+    fn in_parts(&self, rows: usize, image: &mut GrayImage, draw: impl Fn(usize, &mut [u8]) + Sync) {
         if self.threads == 1 {
-            return self.draw_rows(&exposure, 0, &mut image.data);
+            return draw(0, &mut image.data);
         }
         std::thread::scope(|scope| {
-            for (part, data) in image.data.chunks_mut(rows * width).enumerate() {
-                let exposure = &exposure;
-                scope.spawn(move || self.draw_rows(exposure, part * rows, data));
+            for (part, data) in image.data.chunks_mut(rows * self.lens.width).enumerate() {
+                let draw = &draw;
+                scope.spawn(move || draw(part * rows, data));
             }
         });
+    }
+
+    /// Rows of a rolling shutter: each few of them are an exposure of their own.
+    fn draw_rolling(&self, t: MonoTime, frame: u32, first_row: usize, data: &mut [u8]) {
+        for (k, band) in data.chunks_mut(BAND * self.lens.width).enumerate() {
+            let row = first_row + k * BAND;
+            let middle = row as f64 + 0.5 * (BAND as f64 - 1.0);
+            let exposure = self.expose(self.world.row_time(t, middle), frame);
+            self.draw_rows(&exposure, row, band);
+        }
     }
 
     fn expose(&self, t: MonoTime, frame: u32) -> Exposure {
@@ -147,10 +174,13 @@ impl Renderer {
         };
         let placed = (0..self.bodies.len())
             .map(|target| {
-                let vehicle = self.world.vehicle(target, t);
+                let vehicle = self.world.mover(target, t);
                 let (s, c) = vehicle.heading_rad.sin_cos();
-                let vehicle_from_ned = Matrix3::new(c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0);
-                let foot = Vector3::new(vehicle.north_m, vehicle.east_m, 0.0);
+                let vehicle_from_ned = match vehicle.sways() {
+                    true => vehicle.ned_from_vehicle().matrix().transpose(),
+                    false => Matrix3::new(c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0),
+                };
+                let foot = vehicle.origin();
                 Placed {
                     vehicle_from_camera: (vehicle_from_ned * pose.ned_from_camera.matrix()).cast(),
                     origin: (vehicle_from_ned * (pose.position_ned_m - foot)).cast(),
@@ -206,7 +236,7 @@ impl Renderer {
 
     /// Where vehicle `index` and its shadow may show during an exposure.
     fn window(&self, index: usize, first: &Moment, last: &Moment) -> Option<Window> {
-        let model = &self.world.scenario().rig.camera.intrinsics;
+        let model = &self.world.rig().camera.intrinsics;
         let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
         for moment in [first, last] {
             let placed = &moment.placed[index];

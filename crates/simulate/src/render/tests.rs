@@ -23,12 +23,10 @@ fn found(world: &World, image: &GrayImage, t_s: f64) -> Vec<(MarkerTruth, Option
     families.dedup();
     let mut detector = Detector::new(&families, Limits { min_px: 10.0, max_hamming: 1 });
     let detections = detector.detect(image.view());
-    let pose = world.camera_pose(t);
     let mut pairs = Vec::new();
     for (target, settings) in config.target.iter().enumerate() {
-        let vehicle = world.vehicle(target, t);
         for (marker, tag) in settings.marker.iter().enumerate() {
-            let truth = world.marker(target, marker, &vehicle, &pose, t).expect("below the camera");
+            let truth = world.marker(target, marker, t).expect("below the camera");
             let (Some(family), Some(id), true) = (tag.family, tag.id, truth.visible) else { continue };
             let found = detections.iter().find(|d| (d.family, d.id) == (family, id));
             pairs.push((truth, found.copied()));

@@ -116,6 +116,7 @@ function panels() {
     });
     list.push(["fix", `${h.fix === 3 ? "3D" : h.fix === 2 ? "2D" : "none"}, ${h.sats} satellites`, h.fix ? "good" : "bad"]);
     if (h.clock_sigma_ms >= 0) list.push(["UTC", `±${h.clock_sigma_ms.toFixed(1)} ms`, "good"]);
+    for (const m of h.misfits) list.push([m.source, `${m.cause} (${m.figure}): ${m.advice}`, "warn"]);
     for (const [name, word] of Object.entries(h.words)) list.push([name, word, /fail|full|none|lost|error/i.test(word) ? "bad" : "good"]);
     rows(table, list); $("sensors").replaceChildren(table);
   }
@@ -234,7 +235,11 @@ $("theme").onclick = () => {
 $("zoom-in").onclick = () => map.zoom(1.5);
 $("zoom-out").onclick = () => map.zoom(1 / 1.5);
 $("follow").onclick = () => { map.follow = true; dirty = true; };
-$("whole").onclick = () => { const p = fleet.get(chosen); if (p) map.fit([...p.targets.values()].flatMap(t => t.trail).concat(p.own ? [p.own.position] : [])); };
+$("whole").onclick = () => {
+  const p = fleet.get(chosen), trails = p ? [...p.targets.values()].flatMap(t => t.trail) : [];
+  // Without a vehicle the helicopter's own way is what there is to show.
+  if (p) map.fit(trails.length ? trails.concat(p.own ? [p.own.position] : []) : p.ownTrail);
+};
 setInterval(() => {
   $("follow").classList.toggle("on", map.follow);
   if (socket && socket.readyState === 1 && performance.now() - heardAt > 4000) { chip($("server"), "station silent", "warn"); }

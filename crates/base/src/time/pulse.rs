@@ -1,0 +1,142 @@
+//! Pulses of a receiver, each paired with the epoch whose instant it marks.
+
+use std::collections::VecDeque;
+
+use super::{MonoTime, NS_PER_S, Span};
+
+/// Edges remembered.
+const EDGES_MAX: usize = 64;
+/// Edges of equal spacing before they are believed to be pulses.
+const EDGES_FIRST: usize = 4;
+/// How far a spacing may be off its even part of a second: crystals, interrupts, a missed one.
+const SPACING_OFF_NS: i64 = 2_000_000;
+/// A burst nearer than this after a pulse, or after the next one, may be of either: no receiver begins to
+/// send so soon, and arrivals are not known better.
+const TOO_SOON: Span = Span::from_ns(15_000_000);
+/// How long a pulse holds the time.
+const HOLDS: Span = Span::from_ns(5 * NS_PER_S);
+/// Edges that no epoch could be paired with before that is worth a word.
+const UNUSED_MIN: u32 = 10;
+
+/// Why pulses are not used.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum PulseTrouble {
+    /// They do not come at an even part of a second.
+    Uneven,
+    /// By their arrivals, the bursts may be of one pulse or of the next.
+    Ambiguous,
+    /// No burst that follows them is of a time they can mark.
+    NoBurst,
+}
+
+impl PulseTrouble {
+    /// In words, for people.
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::Uneven => {
+                "the pulses are not used: they do not come once or several times a second at an even spacing"
+            }
+            Self::Ambiguous => {
+                "the pulses are not used: the sentences come so that they may be of one pulse or of the next: \
+                 set gps.latency_ms to the receiver's"
+            }
+            Self::NoBurst => "the pulses are not used: no sentences follow that are of their time",
+        }
+    }
+}
+
+/// Pairs edges with epochs: an epoch is true at the pulse before its burst, so where the burst arrives by
+/// the statistics of all arrivals (not where a single one does) tells the pulse.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Pulses {
+    edges: VecDeque<MonoTime>,
+    /// The edge that holds, and its host time less the time of day it marks.
+    paired: Option<(MonoTime, i64)>,
+    unused: u32,
+    trouble: Option<PulseTrouble>,
+}
+
+impl Pulses {
+    /// An edge was heard.
+    pub(super) fn edge(&mut self, edge: MonoTime) {
+        if self.edges.back().is_some_and(|last| edge <= *last) {
+            self.edges.clear();
+        }
+        if self.edges.len() == EDGES_MAX {
+            self.edges.pop_front();
+        }
+        self.edges.push_back(edge);
+        self.unused = self.unused.saturating_add(1);
+        if self.spacing_ns().is_none() {
+            self.trouble = Some(PulseTrouble::Uneven);
+        } else if self.trouble == Some(PulseTrouble::Uneven) {
+            self.trouble = None;
+        }
+    }
+
+    /// An epoch of this time of day arrives, by all arrivals, at `expected`; `latency` is configured.
+    pub(super) fn epoch(&mut self, time_of_day_ns: i64, expected: MonoTime, latency: Span) {
+        let Some(spacing_ns) = self.spacing_ns() else { return };
+        if time_of_day_ns % spacing_ns != 0 {
+            return;
+        }
+        let Some(&last) = self.edges.back() else { return };
+        // Bursts come this long after one pulse or another; the configured latency tells which.
+        let rest_ns = (expected - last).ns().rem_euclid(spacing_ns);
+        let periods = ((latency.ns() - rest_ns + spacing_ns / 2).div_euclid(spacing_ns)).max(0);
+        let after_ns = rest_ns + periods * spacing_ns;
+        let off_ns = latency.ns() - after_ns;
+        let next_is_as_near = off_ns > spacing_ns * 9 / 20 || (off_ns < -spacing_ns * 9 / 20 && periods > 0);
+        if next_is_as_near || !(TOO_SOON.ns()..=spacing_ns - TOO_SOON.ns()).contains(&rest_ns) {
+            self.trouble = Some(PulseTrouble::Ambiguous);
+            return;
+        }
+        let marked = |edge: &&MonoTime| ((expected - **edge).ns() - after_ns).abs() <= SPACING_OFF_NS;
+        let Some(&edge) = self.edges.iter().find(marked) else {
+            self.trouble = self.trouble.or(Some(PulseTrouble::NoBurst));
+            return;
+        };
+        self.paired = Some((edge, edge.ns().wrapping_sub(time_of_day_ns)));
+        self.unused = 0;
+        self.trouble = None;
+    }
+
+    /// Host time less time of day, where a pulse holds it at `at`.
+    pub(super) fn offset_ns(&self, at: MonoTime) -> Option<i64> {
+        self.paired.filter(|(edge, _)| (at - *edge).abs() <= HOLDS).map(|(_, offset_ns)| offset_ns)
+    }
+
+    /// UTC has stepped by whole seconds against host time.
+    pub(super) fn shift(&mut self, ns: i64) {
+        if let Some((_, offset_ns)) = &mut self.paired {
+            *offset_ns = offset_ns.wrapping_add(ns);
+        }
+    }
+
+    /// What pulses marked is no longer known.
+    pub(super) fn forget(&mut self) {
+        self.paired = None;
+    }
+
+    /// Why many pulses in a row were of no use.
+    pub(super) fn trouble(&self) -> Option<PulseTrouble> {
+        let many = self.unused >= UNUSED_MIN;
+        many.then(|| self.trouble.unwrap_or(PulseTrouble::NoBurst))
+    }
+
+    /// The even part of a second at which the last edges came.
+    fn spacing_ns(&self) -> Option<i64> {
+        let last = self.edges.len().checked_sub(EDGES_FIRST)?;
+        let edges: Vec<MonoTime> = self.edges.range(last..).copied().collect();
+        let shortest = edges.windows(2).map(|pair| (pair[1] - pair[0]).ns()).min()?;
+        let parts = (NS_PER_S + shortest / 2) / shortest.max(1);
+        if !(1..=20).contains(&parts) || NS_PER_S % parts != 0 {
+            return None;
+        }
+        let spacing_ns = NS_PER_S / parts;
+        // One may be missing.
+        let even =
+            |gap: i64| (gap - (gap + spacing_ns / 2) / spacing_ns * spacing_ns).abs() <= SPACING_OFF_NS;
+        edges.windows(2).all(|pair| even((pair[1] - pair[0]).ns())).then_some(spacing_ns)
+    }
+}

@@ -1,0 +1,71 @@
+//! VectorNav's ASCII messages: yaw, pitch, roll (`$VNYPR`, `$VNYMR`, `$VNYBA`, `$VNYIA`), a quaternion (`$VNQTN`,
+//! `$VNQMR`), or an inertial solution (`$VNINS`, whose yaw is true). Angles are 3-2-1 from the tangent plane to
+//! the device, yaw from −180 to 180 degrees. Source: VectorNav's manuals.
+
+use nalgebra::{Quaternion, UnitQuaternion};
+
+use super::fields::tilt;
+use super::nmea;
+use super::reading::CompassReading;
+use crate::counts::Refusal;
+use crate::sentence::Sentence;
+
+/// How far a quaternion's length may be off one.
+const UNIT_OFF: f64 = 0.01;
+/// Modes of the inertial solution (bits 0 and 1 of its status) in which it aligns or follows.
+const INS_MODES: std::ops::RangeInclusive<u16> = 1..=2;
+
+/// What a sentence says; `None` where it says nothing of attitude.
+pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
+    match sentence.address() {
+        "VNYPR" | "VNYMR" | "VNYBA" | "VNYIA" => angles(sentence, 1).map(Some),
+        "VNQTN" | "VNQMR" => quaternion(sentence).map(Some),
+        "VNINS" => inertial(sentence).map(Some),
+        address if address.starts_with("VN") => Ok(None),
+        _ => nmea::read(sentence),
+    }
+}
+
+fn angles(sentence: &Sentence<'_>, first: usize) -> Result<CompassReading, Refusal> {
+    if sentence.fields() < first + 2 {
+        return Err(Refusal::Malformed);
+    }
+    let angle = |index: usize| tilt(sentence.field(first + index));
+    let heading_deg = sentence.number(first, -360.0, 360.0)?.map(|yaw| yaw.rem_euclid(360.0));
+    let flagged = heading_deg.is_none();
+    Ok(CompassReading {
+        heading_deg,
+        pitch_deg: angle(1)?,
+        roll_deg: angle(2)?,
+        flagged,
+        ..CompassReading::default()
+    })
+}
+
+/// Vector part, then scalar.
+fn quaternion(sentence: &Sentence<'_>) -> Result<CompassReading, Refusal> {
+    let part = |index| sentence.number(index, -1.1, 1.1)?.ok_or(Refusal::Malformed);
+    let quaternion = Quaternion::new(part(4)?, part(1)?, part(2)?, part(3)?);
+    if (quaternion.norm() - 1.0).abs() > UNIT_OFF {
+        return Err(Refusal::OutOfRange);
+    }
+    let (roll, pitch, yaw) = UnitQuaternion::new_normalize(quaternion).euler_angles();
+    Ok(CompassReading {
+        heading_deg: Some(yaw.to_degrees().rem_euclid(360.0)),
+        pitch_deg: Some(pitch.to_degrees()),
+        roll_deg: Some(roll.to_degrees()),
+        ..CompassReading::default()
+    })
+}
+
+/// Time, week, status (hexadecimal), yaw, pitch, roll, position, velocity, uncertainties.
+fn inertial(sentence: &Sentence<'_>) -> Result<CompassReading, Refusal> {
+    let status = u16::from_str_radix(sentence.field(3), 16).map_err(|_| Refusal::Malformed)?;
+    let mut reading = angles(sentence, 4)?;
+    reading.heading_is_true = true;
+    if !INS_MODES.contains(&(status & 3)) {
+        reading.heading_deg = None;
+        reading.flagged = true;
+    }
+    Ok(reading)
+}
