@@ -34,6 +34,9 @@ const LEAST_INNER_STEP: f32 = 0.4;
 const ENOUGH_EDGES: f32 = 0.7;
 const MORE_A_WRONG_BIT: f32 = 0.05;
 
+/// Share of a side's cells into which light must step down.
+const ENOUGH_OF_A_SIDE: f32 = 0.7;
+
 /// Whether light steps down into the border along each of its sides, as it does between the tag's own cells and where
 /// the corners say.
 pub(super) fn is_there(
@@ -55,7 +58,12 @@ pub(super) fn is_there(
     let contrast = (light - dark) / light.max(1.0);
     contrast > 0.0
         && (0..4).all(|side| has_edge(&profile(level, &h, family.width, side), LEAST_STEP * contrast))
-        && (light > OVER_EXPOSED || has_cells(level, &h, family, word, LEAST_INNER_STEP * contrast))
+        && (light > OVER_EXPOSED || {
+            // What has bloomed has no edge at its place.
+            let least = LEAST_INNER_STEP * contrast;
+            (0..4).all(|side| has_steps(level, &h, family.width, side, least))
+                && has_cells(level, &h, family, word, least)
+        })
 }
 
 /// Whether most edges between the border's and the data's cells are where they belong: light steps by a share `least`
@@ -85,18 +93,29 @@ fn has_cells(level: Level<'_>, h: &Homography, family: &Family, word: &Word, lea
     seen as f32 >= enough * all as f32
 }
 
+/// Light beside border cell `k` of a side, `out` cells outside its edge.
+fn beside(level: Level<'_>, h: &Homography, width: usize, side: usize, k: usize, out: f64) -> f32 {
+    let (w, along) = (width as f64, k as f64 + 0.5);
+    let (x, y) = [(along, -out), (w + out, along), (along, w + out), (-out, along)][side];
+    sample(level, h, x, y)
+}
+
 /// Mean light along a side, from inside to outside.
 fn profile(level: Level<'_>, h: &Homography, width: usize, side: usize) -> [f32; STEPS + 1] {
-    let w = width as f64;
     std::array::from_fn(|step| {
         let out = step as f64 * SPACING - REACH;
-        let sum = (0..width).map(|k| {
-            let along = k as f64 + 0.5;
-            let (x, y) = [(along, -out), (w + out, along), (along, w + out), (-out, along)][side];
-            sample(level, h, x, y)
-        });
-        sum.sum::<f32>() / width as f32
+        (0..width).map(|k| beside(level, h, width, side, k, out)).sum::<f32>() / width as f32
     })
+}
+
+/// Whether light steps down into most cells of a side by a share `least` of itself: a side that is right at one end
+/// only has a mean step too.
+fn has_steps(level: Level<'_>, h: &Homography, width: usize, side: usize, least: f32) -> bool {
+    let steps = (0..width).filter(|&k| {
+        let at = |out: f64| beside(level, h, width, side, k, out);
+        at(BESIDE) - at(-BESIDE) > least * at(BESIDE)
+    });
+    steps.count() as f32 >= ENOUGH_OF_A_SIDE * width as f32
 }
 
 /// Whether a profile steps up by a share `least` of its light, most steeply where the edge is.
