@@ -10,7 +10,7 @@ use windhover::io::clock::HostClock;
 use windhover_base::geo::{Ground, wrap_angle};
 use windhover_base::msg::{FrameObservations, MarkerId, Stamped, TargetEstimate, TrackStatus};
 use windhover_base::settings::{EstimatorConfig, Rig};
-use windhover_base::time::{MonoTime, Span};
+use windhover_base::time::{FrameClock, MonoTime, Span};
 use windhover_estimate::{Bound, BoundTruth, Estimator, EstimatorOutput, PaperEstimator, Site};
 use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 
@@ -129,6 +129,7 @@ fn truth_at(world: &World, t: MonoTime, gps_delay_s: f64) -> BoundTruth {
         ned_from_body: own.ned_from_body,
         rate: own.body_rate_radps,
         tilt_gain: world.scenario().compass.tilt_gain,
+        tilt_error: (0.0, 30.0),
         drag_per_s: world.scenario().helicopter.drag_per_s,
         gps_delay_s,
         targets: targets.collect(),
@@ -136,7 +137,7 @@ fn truth_at(world: &World, t: MonoTime, gps_delay_s: f64) -> BoundTruth {
 }
 
 /// Intensities of motion: a target's speed and yaw rate, the helicopter's rates about its roll and pitch axes
-/// and about its yaw axis, its force across and along the rotor axis; units²/s.
+/// and about its yaw axis, what pushes it beside thrust along its axis, its thrust; units²/s.
 type Intensities = [f64; 6];
 
 /// Limits of the scale at which intensities are taken, s.
@@ -151,8 +152,9 @@ fn intensities(world: &World, scales_s: &[f64; 6]) -> Intensities {
         let (vehicle, own) = (world.vehicle(0, t), world.ownship(t));
         let drag = own.velocity_ned_mps * scenario.helicopter.drag_per_s;
         let felt = own.acceleration_ned_mps2 + drag - Vector3::z() * 9.806_65;
-        let (force, rate) = (own.ned_from_body.inverse() * felt, own.body_rate_radps);
-        [vehicle.speed_mps, vehicle.yaw_rate_radps, rate.x, rate.y, rate.z, force.x, force.y, force.z]
+        let axis = own.ned_from_body * Vector3::z();
+        let (gust, rate) = (felt - axis * (felt.z / axis.z), own.body_rate_radps);
+        [vehicle.speed_mps, vehicle.yaw_rate_radps, rate.x, rate.y, rate.z, gust.x, gust.y, felt.z]
     };
     let walk = |kind: usize, places: &[usize]| {
         let step_s = scales_s[kind];
@@ -175,6 +177,9 @@ fn intensities(world: &World, scales_s: &[f64; 6]) -> Intensities {
     ]
 }
 
+/// Correlation time of the thrust beyond the weight in the filter's model, s.
+const THRUST_TAU_S: f64 = 2.0;
+
 /// The configuration with these intensities and the true noise figures.
 fn told_the_truth(world: &World, q: &Intensities) -> (Rig, EstimatorConfig) {
     let scenario = world.scenario();
@@ -183,8 +188,8 @@ fn told_the_truth(world: &World, q: &Intensities) -> (Rig, EstimatorConfig) {
     (e.target_speed_walk, e.target_yaw_rate_walk) = (q[0].sqrt(), q[1].sqrt());
     (e.tilt_rate_walk, e.yaw_rate_walk) = (q[2].sqrt(), q[3].sqrt());
     // A Gauss–Markov process of variance s² walks by 2 s²/τ.
-    let sigma = |q: f64| (q * 0.5 * e.force_tau_s).sqrt();
-    (e.side_force_mps2, e.thrust_mps2) = (sigma(q[4]), sigma(q[5]));
+    let sigma = |q: f64, tau_s: f64| (q * 0.5 * tau_s).sqrt();
+    (e.side_force_mps2, e.thrust_mps2) = (sigma(q[4], e.force_tau_s), sigma(q[5], THRUST_TAU_S));
     let (gps, compass) = (&scenario.gps, &scenario.compass);
     (e.marker_noise_px, e.feature_sigma_factor) = (0.0, 1.0);
     (rig.gps.bias_sigma_m, rig.gps.noise_m) = (gps.bias_sigma_m, gps.noise_m);
@@ -350,6 +355,7 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
     let (mut busy, mut frames, mut resets) = (Span::ZERO, 0usize, 0usize);
     let offset = Span::from_ms(rig.camera.exposure_offset_ms);
     let error = suite.gps_latency_error().ms();
+    let mut exposures = FrameClock::default();
     while let Some(sample) = suite.next() {
         let begun = HostClock::thread_processor_time();
         match &sample {
@@ -358,7 +364,7 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
             Sample::Frame { truth, seq } => {
                 frames += 1;
                 let frame = Stamped {
-                    t_valid: truth.t_stamp + offset,
+                    t_valid: exposures.exposed(truth.t_stamp) + offset,
                     t_recv: truth.t_recv,
                     seq: *seq,
                     value: suite.observations().clone(),
@@ -392,7 +398,8 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
                 }
                 EstimatorOutput::Smoothed(e) => s.add(&e, &world),
                 EstimatorOutput::Reset { .. } | EstimatorOutput::Anchored { .. } => resets += 1,
-                EstimatorOutput::Ownship(_)
+                EstimatorOutput::Coasted(_)
+                | EstimatorOutput::Ownship(_)
                 | EstimatorOutput::Fusion(_)
                 | EstimatorOutput::TiltFelt { .. }
                 | EstimatorOutput::Misfit(_) => {}

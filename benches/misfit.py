@@ -40,6 +40,7 @@ ROWS = {
     "stamps jitter by 10 ms": ("stamp-jitter=10", "", None),
     "camera 40 ms late": ("camera-late=40", "", None),
     "rolling shutter 25 ms": ("readout=25", "", None),
+    "rolling shutter 25 ms, configured": ("told-readout=25", "", None),
     "rolling shutter 25 ms, vibration": ("readout=25 vibration=0.1", "vibration=0.1", None),
     "rolling shutter 15 ms, 12 m/s": ("readout=15 speed=12", "speed=12", None),
     "pitches, rolls and bounces": ("sway=3 bounce=5", "", None),

@@ -71,7 +71,8 @@ fn modules_name_only_what_stands_above_them() {
 }
 
 /// `io` moves events and records: it decodes, detects and estimates nothing. Of `windhover_decode` it has the
-/// grammar of sentences alone, because a receiver is configured in the sentences it speaks.
+/// grammar of sentences and packets alone, because a receiver is configured in the sentences it speaks, and its line
+/// speed is judged by what is sound.
 #[test]
 fn io_names_no_stage() {
     let stages = [

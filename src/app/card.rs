@@ -77,7 +77,13 @@ pub async fn run(task: StoreTask, mut opened: Option<OpenStore>) {
         if why == Closing::End {
             return;
         }
-        OperatorEvent::FlightClosed.emit("", "power is going: everything is on the card");
+        let outcome = task.status.with(|status| status.outcome.clone());
+        let words = match outcome {
+            Some(Err(why)) => format!("power is going: NOT all is on the card: {why}"),
+            Some(Ok(words)) => format!("power is going: {words}"),
+            None => "power is going".into(),
+        };
+        OperatorEvent::FlightClosed.emit("", words);
         task.show_state("closed");
         let mut power = task.orders.power_going.subscribe();
         let back = async { power.wait_for(|going| !going).await.is_ok() };
@@ -123,11 +129,14 @@ impl StoreTask {
     /// Closes the flight; waits for the card.
     async fn close(&self, store: Store, notices: Receiver<StoreNotice>) {
         self.flight_store.set(None);
+        let handle = store.handle();
         let closed = blocking(move || {
             store.stop();
             notices
         });
         self.report(&mut closed.await);
+        let outcome = handle.status().outcome();
+        self.status.with(|status| status.outcome = Some(outcome));
         self.heart.beat();
     }
 
@@ -158,6 +167,7 @@ impl StoreTask {
         }
         let figures = CardFigures {
             state: state.into(),
+            flight: store.flight.clone(),
             free_mb: store.free_mb.map(|mb| mb as f64),
             sync_p99: (store.fsync_p99_ms > 0.0).then(|| Span::from_ms(store.fsync_p99_ms)),
             dropped: store.dropped_messages,

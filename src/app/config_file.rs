@@ -1,5 +1,7 @@
 //! Reading configuration files.
 
+use std::fs::File;
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -52,8 +54,8 @@ pub fn load(path: &Path) -> Result<Config, ConfigFileError> {
 
 /// Reads and checks a configuration file and what it names. Blocks: a tile takes seconds to read.
 pub fn load_all(path: &Path) -> Result<Loaded, ConfigFileError> {
-    let text = std::fs::read_to_string(path)
-        .map_err(|source| ConfigFileError::Unreadable { path: path.to_owned(), source })?;
+    let text =
+        read_text(path).map_err(|source| ConfigFileError::Unreadable { path: path.to_owned(), source })?;
     let config =
         Config::parse(&text).map_err(|source| ConfigFileError::Invalid { path: path.to_owned(), source })?;
     let terrain = config.ground.terrain.as_ref().map(|terrain| {
@@ -64,10 +66,34 @@ pub fn load_all(path: &Path) -> Result<Loaded, ConfigFileError> {
     Ok(Loaded { config, terrain })
 }
 
+/// A configuration is no longer than this, bytes.
+const LONGEST: u64 = 1 << 20;
+
+/// The text of a file, which may be a device that never ends.
+fn read_text(path: &Path) -> std::io::Result<String> {
+    let mut text = String::new();
+    let read = File::open(path)?.take(LONGEST + 1).read_to_string(&mut text)?;
+    if read as u64 > LONGEST {
+        return Err(std::io::Error::other("it is longer than 1 MB, which no configuration is"));
+    }
+    Ok(text)
+}
+
 /// The terrain tile of a configuration. `None` where it names none, or where it cannot be read:
 /// [`load`] has refused that already, and a recording's own configuration may name a tile of another
 /// machine, of which the pipeline then tells.
 pub fn terrain_of(config: &Config) -> Option<Arc<Tile>> {
     let path = config.ground.terrain.as_ref()?;
     io::terrain::load(Path::new(path)).ok().map(Arc::new)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_that_never_ends_is_no_configuration() {
+        let error = load(Path::new("/dev/zero")).expect_err("it never ends").to_string();
+        assert!(error.contains("/dev/zero") && error.contains("longer than 1 MB"), "{error}");
+    }
 }

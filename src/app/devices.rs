@@ -8,6 +8,7 @@ use crate::io::device::{Fault, NoteKind, Report};
 use crate::io::pps;
 use crate::io::serial::{self, SerialSettings};
 use windhover_base::msg::{EventBody, Source};
+use windhover_base::settings::GpsFormat;
 
 use super::context::TaskContext;
 use super::events::{self, OperatorEvent};
@@ -19,7 +20,7 @@ pub async fn gps(config: Arc<Config>, context: TaskContext, heart: Heart) {
     let settings = SerialSettings {
         device: config.gps.device.clone(),
         baud: config.gps.baud,
-        text: true,
+        text: config.gps.format != GpsFormat::Ubx,
         configure_garmin: config.gps.configure_garmin,
     };
     line(Part::Gps, Source::Gps, &settings, context, heart).await;

@@ -17,7 +17,7 @@ use crate::io::link::{
     Backlog, EarlyRecords, LinkError, LinkEvent, LinkHandle, LinkStatus, PayloadLink, PayloadSettings,
     Picture, StoreBacklog,
 };
-use crate::io::mavlink::{self, MavlinkSender};
+use crate::io::mavlink::{self, MavlinkSender, Station, StationNews};
 use crate::io::records::Record;
 use windhover_base::msg::{Event, EventBody, FramePayload, Output};
 use windhover_base::time::UtcTime;
@@ -128,9 +128,13 @@ pub struct LinkTask {
 /// Serves stations until the end is asked for.
 pub async fn run(task: LinkTask) {
     let mut beside = JoinSet::new();
-    if task.config.mavlink.enabled {
-        beside.spawn(send_mavlink(task.downlink.clone(), task.context.clock, every(&task.config)));
-        task.open_mavlink().await;
+    if task.config.mavlink.enabled
+        && let Some(sender) = task.open_mavlink().await
+    {
+        let every = Duration::from_secs_f64(sender.every().s());
+        task.downlink.lines().mavlink = Some(sender);
+        let (downlink, status) = (task.downlink.clone(), task.status.clone());
+        beside.spawn(send_mavlink(downlink, status, task.context.clock, every));
     }
     while !task.context.stop.is_cancelled() {
         if !task.config.link.enabled {
@@ -156,25 +160,34 @@ pub async fn run(task: LinkTask) {
     }
 }
 
-/// Time between two rounds of MAVLink messages.
-fn every(config: &Config) -> Duration {
-    Duration::from_secs_f64(1.0 / config.mavlink.rate_hz)
-}
-
-async fn send_mavlink(downlink: Downlink, clock: HostClock, every: Duration) {
+async fn send_mavlink(downlink: Downlink, status: SharedStatus, clock: HostClock, every: Duration) {
     let mut tick = tokio::time::interval(every);
     tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     loop {
         tick.tick().await;
         let names = downlink.lines().mavlink.as_mut().and_then(|mavlink| mavlink.unresolved(clock.now()));
-        let addresses = match names {
-            Some(names) => Some(blocking(move || mavlink::look_up(&names)).await),
-            None => None,
+        let found = match names {
+            Some(names) => blocking(move || mavlink::look_up(names)).await,
+            None => Vec::new(),
         };
-        if let Some(mavlink) = &mut downlink.lines().mavlink {
-            addresses.into_iter().for_each(|addresses| mavlink.send_to(addresses));
+        let told = downlink.lines().mavlink.as_mut().map(|mavlink| {
+            mavlink.found(found);
             mavlink.send(clock.now());
+            let words: Vec<String> = mavlink.stations().iter().map(Station::words).collect();
+            (mavlink.news(), words.join("; "))
+        });
+        if let Some((news, words)) = told {
+            news.iter().for_each(tell_mavlink);
+            status.with(|status| status.figures.mavlink = words);
         }
+    }
+}
+
+/// Tells the operator what became of a station that MAVLink goes to.
+fn tell_mavlink(news: &StationNews) {
+    match &news.fault {
+        Some(fault) => OperatorEvent::MavlinkFault.emit(&news.name, fault),
+        None => OperatorEvent::MavlinkUp.emit(&news.name, "datagrams go out again"),
     }
 }
 
@@ -190,12 +203,10 @@ impl LinkTask {
         self.status.with(|status| status.figures.link = word);
     }
 
-    async fn open_mavlink(&self) {
+    async fn open_mavlink(&self) -> Option<MavlinkSender> {
         let config = Arc::clone(&self.config);
-        match blocking(move || MavlinkSender::open(&config.mavlink, &config.target, &config.ground)).await {
-            Ok(sender) => self.downlink.lines().mavlink = Some(sender),
-            Err(error) => self.fault(&error),
-        }
+        let open = move || MavlinkSender::open(&config.mavlink, &config.target, &config.ground);
+        blocking(open).await.inspect_err(|error| self.fault(error)).ok()
     }
 
     async fn open(&self) -> Result<Opened, LinkError> {

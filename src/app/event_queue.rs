@@ -17,6 +17,13 @@ const READS: usize = 8192;
 const BURST: usize = 16;
 const CATCH_UP: Span = Span::from_ns(500_000_000);
 
+/// A frame whose turn comes later than this after it was heard is dropped: estimates are of now.
+const FRESH: Span = Span::from_ns(500_000_000);
+
+/// A pipeline that took no frame for so long takes one that is older, but none older than this.
+const STARVING: Span = Span::from_ns(5_000_000_000);
+const LATEST: Span = Span::from_ns(2_000_000_000);
+
 /// What devices delivered and the pipeline has not yet taken.
 ///
 /// Device tasks put events in, the pipeline's thread takes them out; neither waits for the other. No channel of a
@@ -27,7 +34,8 @@ const CATCH_UP: Span = Span::from_ns(500_000_000);
 ///
 /// A pipeline that is busy with a frame finds the newest ones when it comes back. From then on the oldest of
 /// these stays: were it replaced while the reads before it are handled, a pipeline that is behind on reads
-/// would never see a frame.
+/// would never see a frame. A frame whose turn comes too late all the same is dropped, and the pipeline handles
+/// reads until it is of now again: every frame that it handles while it is behind costs it the lead it gained.
 ///
 /// Frames that come in a burst are all kept. Only a pipeline that does not catch up loses the oldest: then no more
 /// wait than the queue is set to hold, so that estimates are of what is seen now.
@@ -48,6 +56,10 @@ struct Lanes {
     told: bool,
     /// Since when more frames wait than the queue is set to hold; until all are taken.
     crowded: Option<MonoTime>,
+    /// When the newest of everything was heard.
+    heard: Option<MonoTime>,
+    /// When a frame was last taken, by what was heard until then.
+    taken: Option<MonoTime>,
     dropped: PerSource<u32>,
     /// Whether somebody wants the taker to look up.
     woken: bool,
@@ -72,6 +84,7 @@ impl EventQueue {
             lanes.dropped[source] += 1;
         }
         lanes.reads.push_back((t_recv, body));
+        lanes.heard = lanes.heard.max(Some(t_recv));
         drop(lanes);
         self.filled.notify_one();
     }
@@ -80,6 +93,7 @@ impl EventQueue {
     pub fn put_frame(&self, t_recv: MonoTime, frame: FramePayload) {
         let mut lanes = self.lock();
         lanes.frames.push_back((t_recv, frame));
+        lanes.heard = lanes.heard.max(Some(t_recv));
         if lanes.frames.len() > self.frames {
             let since = *lanes.crowded.get_or_insert(t_recv);
             let most = if t_recv - since < CATCH_UP { self.frames.max(BURST) } else { self.frames };
@@ -126,7 +140,26 @@ impl Lanes {
         self.reads.is_empty() && self.frames.is_empty()
     }
 
+    /// Whether a frame heard at `t` comes too late.
+    fn is_stale(&self, t: MonoTime) -> bool {
+        let since = |earlier: MonoTime| self.heard.map_or(Span::ZERO, |heard| heard - earlier);
+        let starving = self.taken.is_none_or(|taken| since(taken) >= STARVING);
+        since(t) > if starving { LATEST } else { FRESH }
+    }
+
     fn next(&mut self) -> Option<Event> {
+        let read = self.reads.front().map(|(t, _)| *t);
+        while let Some(&(t, _)) = self.frames.front()
+            && read.is_none_or(|read| t < read)
+            && self.is_stale(t)
+        {
+            self.frames.pop_front();
+            self.dropped[Source::Camera] += 1;
+        }
+        self.next_in_order()
+    }
+
+    fn next_in_order(&mut self) -> Option<Event> {
         let read = self.reads.front().map(|(t, _)| *t);
         let frame = self.frames.front().map(|(t, _)| *t);
         let earliest = read.into_iter().chain(frame).min()?;
@@ -143,7 +176,7 @@ impl Lanes {
         }
         if frame_is_next {
             let (t, frame) = self.frames.pop_front()?;
-            (self.pinned, self.told) = (false, false);
+            (self.pinned, self.told, self.taken) = (false, false, self.heard);
             if self.frames.is_empty() {
                 self.crowded = None;
             }
@@ -281,6 +314,51 @@ mod tests {
         let frames = taken.iter().filter(|e| matches!(e.body, EventBody::Frame(_))).count();
         let told = taken.iter().filter(|e| matches!(e.body, EventBody::Dropped { .. })).count();
         assert!(frames >= 3 && told <= frames, "{frames} frames, {told} times told of lost ones: {taken:?}");
+    }
+
+    /// Feeds a queue for a minute: a read every 10 ms and a frame every 100 ms, and a pipeline that takes so long for
+    /// each. Gives how late each frame that it handled was, when that was, and how many were lost.
+    fn behind(read_ms: i64, frame_ms: i64) -> (Vec<(i64, i64)>, u32) {
+        let queue = EventQueue::new(3);
+        let (mut now, mut fed, mut handled, mut lost) = (0, 0, Vec::new(), 0);
+        while now < 60_000 {
+            while fed <= now {
+                queue.put(at(fed), EventBody::Bytes { source: Source::Compass, data: vec![0] });
+                if fed % 100 == 0 {
+                    queue.put_frame(at(fed), frame(fed));
+                }
+                fed += 10;
+            }
+            match queue.take(Duration::ZERO).map(|event| event.body) {
+                None => now = fed,
+                Some(EventBody::Frame(f)) => {
+                    handled.push((now, now - f.t_exposure.ns() / 1_000_000));
+                    now += frame_ms;
+                }
+                Some(EventBody::Dropped { count, .. }) => lost += count,
+                Some(_) => now += read_ms,
+            }
+        }
+        (handled, lost)
+    }
+
+    #[test]
+    fn a_pipeline_that_is_behind_catches_up_before_it_takes_a_frame() {
+        // Given a pipeline that has a fifth of its time left for frames of 900 ms, when it runs for a minute.
+        let (handled, lost) = behind(8, 900);
+        // Then no frame that it handles is of long ago, it handles as many as it has time for, and the rest is lost
+        // and counted.
+        assert!(handled.iter().all(|(_, late)| *late <= 520), "{handled:?}");
+        assert!((9..=16).contains(&handled.len()), "{} frames: {handled:?}", handled.len());
+        assert!((550..=600).contains(&(lost as usize + handled.len())), "{lost} lost, {handled:?}");
+    }
+
+    #[test]
+    fn a_pipeline_that_never_catches_up_handles_no_frame_of_long_ago() {
+        // Given a pipeline for which the reads alone are too much, then frames are lost and counted.
+        let (handled, lost) = behind(12, 100);
+        assert!(handled.iter().all(|(_, late)| *late <= 2_100), "{handled:?}");
+        assert!(lost > 50 && !handled.is_empty(), "{lost} lost, {handled:?}");
     }
 
     #[test]

@@ -159,6 +159,10 @@ table! {
     LinkDown: "link_down", WARN, every 0 s;
     /// The link does not work.
     LinkFault: "link_fault", WARN, every 30 s;
+    /// MAVLink does not reach a station: its name is not found, or the system does not take its datagrams.
+    MavlinkFault: "mavlink_fault", WARN, every 30 s;
+    /// MAVLink goes to that station again.
+    MavlinkUp: "mavlink_up", INFO, every 0 s;
     /// The supply voltage is going.
     PowerGoing: "power_going", ERROR, every 0 s;
     /// The supply voltage is back.

@@ -5,7 +5,7 @@ use tracing::Level;
 use crate::config::Config;
 use crate::io::records::DaemonFigures;
 use windhover_base::msg::{Health, Source, SourceHealth, TargetHealth, TrackStatus};
-use windhover_base::time::Span;
+use windhover_base::time::{MonoTime, Span};
 
 use super::callsite::RuntimeCallsite;
 use super::events::{OperatorEvent, TARGET};
@@ -21,6 +21,8 @@ pub struct Figures {
     pub card: CardFigures,
     /// State of the link in a word; empty where there is none.
     pub link: String,
+    /// Where MAVLink goes, and how many datagrams did and did not, in words; empty where none is sent.
+    pub mavlink: String,
     /// Temperature, degrees Celsius.
     pub temperature_c: Option<f64>,
     /// Supply voltage, volts.
@@ -38,6 +40,8 @@ pub struct Figures {
 pub struct CardFigures {
     /// `ok`, `off`, `full`, `failed`, ….
     pub state: String,
+    /// Name of the flight; empty while there is none.
+    pub flight: String,
     /// Free space, megabytes.
     pub free_mb: Option<f64>,
     /// Time to make a second's data safe, 99 of 100.
@@ -67,7 +71,12 @@ impl Figures {
     /// As the flight's health messages have them: figures and words by name.
     pub fn by_name(&self) -> DaemonFigures {
         let known = self.numbers().into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?)));
-        let words = [("card", &self.card.state), ("link", &self.link)];
+        let words = [
+            ("card", &self.card.state),
+            ("flight", &self.card.flight),
+            ("link", &self.link),
+            ("mavlink", &self.mavlink),
+        ];
         let said = words.into_iter().filter(|(_, word)| !word.is_empty());
         DaemonFigures {
             figures: known.collect(),
@@ -118,14 +127,15 @@ impl Fields {
         self.figure(&format!("{name}_sigma"), sigma.filter(|sigma| sigma.is_finite()));
     }
 
-    /// Rate, and the age where there is one.
-    fn source(&mut self, health: &SourceHealth) {
-        let name = health.source.name();
-        self.figure(&format!("{name}_hz"), Some(health.rate_hz));
-        self.figure(&format!("{name}_age_s"), health.age.map(|age| age.s()));
+    /// Rate, and the age where there is one, of a source that there is.
+    fn source(&mut self, source: Source, health: Option<&SourceHealth>) {
+        let name = source.name();
+        self.figure(&format!("{name}_hz"), health.map(|health| health.rate_hz));
+        self.figure(&format!("{name}_age_s"), health.and_then(|health| health.age).map(|age| age.s()));
     }
 
-    fn target(&mut self, name: &str, target: Option<&TargetHealth>) {
+    /// Status, figures and the age of a target's last estimate at `t`.
+    fn target(&mut self, name: &str, target: Option<&TargetHealth>, t: MonoTime) {
         self.text(name, target.map(|target| target.last.status.name()));
         self.count(&format!("{name}_seen"), target.map(|target| u64::from(target.frames_seen)));
         let last = target.map(|target| &target.last).filter(|last| last.status != TrackStatus::Lost);
@@ -138,16 +148,20 @@ impl Fields {
         self.estimate("heading_deg", heading_deg, degrees(sigma(2)));
         self.estimate("speed_mps", state.map(|s| s.speed_mps), sigma(3));
         self.estimate("yaw_rate_dps", degrees(state.map(|s| s.yaw_rate_radps)), degrees(sigma(4)));
+        let age = target.filter(|target| target.last.t_valid != MonoTime::default());
+        self.figure(&format!("{name}_age_s"), age.map(|target| (t - target.last.t_valid).s()));
     }
 
     fn daemon(&mut self, figures: &Figures) {
         let word = |word: &'static str, text| (word, Some(text).filter(|text: &&String| !text.is_empty()));
         let numbers = figures.numbers();
         let (card, link) = (word("card", &figures.card.state), word("link", &figures.link));
+        let mavlink = word("mavlink", &figures.mavlink);
         self.numbers(&numbers[..2]);
         self.text(card.0, card.1.map(String::as_str));
         self.numbers(&numbers[2..5]);
         self.text(link.0, link.1.map(String::as_str));
+        self.text(mavlink.0, mavlink.1.map(String::as_str));
         self.numbers(&numbers[5..]);
     }
 
@@ -195,14 +209,14 @@ fn fields(health: &Health, targets: &[String], figures: Option<&Figures>) -> Fie
     let mut fields = Fields::default();
     fields.0.push(("t_ns".into(), Some(Value::Time(health.t.ns()))));
     for &source in Source::ALL {
-        fields.source(&health.source(source));
+        fields.source(source, health.sources.iter().find(|listed| listed.source == source));
         if source == Source::Gps {
             fields.text("fix", Some(health.fix.name()));
             fields.count("sats", health.sats.map(u64::from));
         }
     }
     for (number, name) in targets.iter().enumerate() {
-        fields.target(name, health.targets.get(number));
+        fields.target(name, health.targets.get(number), health.t);
     }
     let misfits: Vec<&str> = health.misfits.iter().map(|misfit| misfit.source.as_str()).collect();
     fields.text("misfit", (!misfits.is_empty()).then(|| misfits.join(", ")).as_deref());
@@ -276,6 +290,8 @@ mod tests {
             yaw_rate_radps: 0.0,
             lat_deg: 0.0,
             lon_deg: 0.0,
+            height_m: 0.0,
+            relative_sigma_m: None,
             covariance: Some(nalgebra::SMatrix::from_diagonal_element(0.0025)),
         };
         let target = |number| {

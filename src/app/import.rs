@@ -4,7 +4,9 @@ use std::iter::Peekable;
 use std::path::{Path, PathBuf};
 
 use crate::io::capture::CaptureWriter;
-use crate::io::import::{Frames, ImportError, VideoSource, open_video, read_serial_log};
+use crate::io::import::{
+    Frames, ImportError, Samples, VideoSource, open_video, read_attitude, read_inertial, read_serial_log,
+};
 use crate::io::mcap_write::WriteError;
 use windhover_base::msg::{Event, EventBody, FramePayload, Source};
 use windhover_base::time::{MonoTime, Span};
@@ -16,6 +18,10 @@ pub struct Sources {
     pub gps: Option<PathBuf>,
     /// Log of the compass line.
     pub compass: Option<PathBuf>,
+    /// Table of rates and forces.
+    pub imu: Option<PathBuf>,
+    /// Table of a second source of attitude.
+    pub attitude: Option<PathBuf>,
     /// Video file, or folder of images.
     pub video: Option<PathBuf>,
     /// When the video's first frame was taken; with the first line of the logs where absent.
@@ -32,7 +38,7 @@ pub enum ImportFailure {
     #[error(transparent)]
     Write(#[from] WriteError),
     /// Nothing was asked for.
-    #[error("nothing to import: give at least one of --gps, --compass, --video")]
+    #[error("nothing to import: give at least one of --gps, --compass, --imu, --attitude, --video")]
     Nothing,
 }
 
@@ -43,6 +49,10 @@ pub struct Imported {
     pub gps_lines: usize,
     /// Lines of the compass log.
     pub compass_lines: usize,
+    /// Samples of rates and forces.
+    pub imu_samples: usize,
+    /// Samples of the second source of attitude.
+    pub attitude_samples: usize,
     /// Frames.
     pub frames: u32,
     /// How the video was read.
@@ -73,6 +83,18 @@ pub fn import(sources: &Sources, config_toml: &str, out: &Path) -> Result<Import
                 .map(|(t, bytes)| (t, EventBody::Bytes { source: Source::Compass, data: bytes })),
         );
     }
+    if let Some(path) = &sources.imu {
+        let samples = rows(path, read_inertial(path)?, &mut imported.warnings);
+        imported.imu_samples = samples.len();
+        let event = |(t, sample)| (t, EventBody::Inertial { source: Source::Imu, sample });
+        serial.extend(samples.into_iter().map(event));
+    }
+    if let Some(path) = &sources.attitude {
+        let samples = rows(path, read_attitude(path)?, &mut imported.warnings);
+        imported.attitude_samples = samples.len();
+        let event = |(t, sample)| (t, EventBody::Attitude { source: Source::Attitude, sample });
+        serial.extend(samples.into_iter().map(event));
+    }
     serial.sort_by_key(|(t, _)| *t);
     let start = sources.video_start.or_else(|| serial.first().map(|(t, _)| *t)).unwrap_or_default();
     let frames: Frames = match &sources.video {
@@ -96,6 +118,18 @@ fn serial_lines(path: &Path, warnings: &mut Vec<String>) -> Result<Vec<(MonoTime
             .push(format!("{}: {count} lines without a time left out, line {first} first", path.display()));
     }
     Ok(log.lines)
+}
+
+/// The samples of a table; rows left out are warned of.
+fn rows<T>(path: &Path, table: Samples<T>, warnings: &mut Vec<String>) -> Vec<(MonoTime, T)> {
+    if let Some(first) = table.unread.first() {
+        let count = table.unread.len();
+        warnings.push(format!(
+            "{}: {count} rows that cannot be read left out, line {first} first",
+            path.display()
+        ));
+    }
+    table.samples
 }
 
 fn write(

@@ -5,9 +5,9 @@ use prost_types::Timestamp;
 
 use super::flight::Flight;
 use crate::io::proto::{host_time, windhover as wh};
-use windhover_base::geo::Tilt;
+use crate::io::records::to_attitude;
 use windhover_base::msg::TagFamily;
-use windhover_base::msg::{AttitudeSample, FixKind, GnssEpoch, MarkerDetection, MarkerId, Stamped};
+use windhover_base::msg::{FixKind, GnssEpoch, MarkerDetection, MarkerId, Stamped};
 use windhover_base::time::UtcTime;
 use windhover_calibrate::boresight::Recording;
 
@@ -15,7 +15,7 @@ use windhover_calibrate::boresight::Recording;
 pub fn recording(flight: &Flight) -> Recording {
     Recording {
         gnss: flight.epochs.iter().map(|e| stamped(&e.timestamp, &e.heard, epoch(e))).collect(),
-        attitude: flight.attitudes.iter().map(|a| stamped(&a.timestamp, &a.heard, attitude(a))).collect(),
+        attitude: flight.attitudes.iter().map(|a| stamped(&a.timestamp, &a.heard, to_attitude(a))).collect(),
         frames: flight
             .detections
             .iter()
@@ -56,11 +56,6 @@ fn epoch(e: &wh::GnssEpoch) -> GnssEpoch {
         hdop: e.hdop,
         ..GnssEpoch::default()
     }
-}
-
-fn attitude(a: &wh::Attitude) -> AttitudeSample {
-    let tilt = a.pitch_rad.zip(a.roll_rad).map(|(pitch, roll)| Tilt { pitch, roll });
-    AttitudeSample { heading: a.heading_rad, heading_is_true: a.heading_is_true, tilt }
 }
 
 /// `None` for kinds and families this version does not know.

@@ -34,6 +34,9 @@ pub enum RunError {
     /// The card took longer than there was time for.
     #[error("the card is too slow: the end of the flight is not on it; the next start seals what is")]
     NotWritten,
+    /// The card was gone, full or failing at the end.
+    #[error("the end of the flight is not on the card: {0}")]
+    Lost(String),
 }
 
 /// How often the health task looks round.
@@ -96,11 +99,11 @@ async fn daemon(path: &Path, signals: &mut Signals) -> Result<(), RunError> {
     let result = fly(loaded, reloading, signals, clock, &log).instrument(events::run_span(clock.now())).await;
     log.settle();
     match &result {
-        Ok(()) => OperatorEvent::Stopped.emit("", "everything is written"),
+        Ok(words) => OperatorEvent::Stopped.emit("", words),
         Err(error) => OperatorEvent::Stopped.emit("", error),
     }
     drop(log_end);
-    result
+    result.map(drop)
 }
 
 /// Reads the configuration; `None` where the end was asked for meanwhile.
@@ -133,17 +136,18 @@ fn report_panics() {
     }));
 }
 
-/// Runs the task graph; this is the health task, which hears signals and strokes the watchdog.
+/// Runs the task graph; this is the health task, which hears signals and strokes the watchdog. Gives what was
+/// written, in words.
 async fn fly(
     loaded: Loaded,
     mut reloading: Reloading,
     signals: &mut Signals,
     clock: HostClock,
     log: &Log,
-) -> Result<(), RunError> {
+) -> Result<String, RunError> {
     let config = loaded.config.clone();
     let Graph { context, status, orders, power, mut tasks } = topology::start(loaded, clock)?;
-    let mut watch = Watch::new(config, context.clone(), log.clone(), (status, orders, power));
+    let mut watch = Watch::new(config, context.clone(), log.clone(), (status.clone(), orders, power));
     let mut round = tokio::time::interval(ROUND);
     round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     let (why, result) = loop {
@@ -165,7 +169,13 @@ async fn fly(
         }
     };
     let written = end(&mut tasks, &context, why).await;
-    result.and(if written { Ok(()) } else { Err(RunError::NotWritten) })
+    result?;
+    match status.with(|status| status.outcome.clone()) {
+        _ if !written => Err(RunError::NotWritten),
+        Some(Err(why)) => Err(RunError::Lost(why)),
+        Some(Ok(words)) => Ok(words),
+        None => Ok("nothing was to be recorded".into()),
+    }
 }
 
 /// Ends the tasks: devices first, then what waits is handled, then the card is flushed; whether it was.

@@ -17,6 +17,9 @@ pub struct Status {
     pub figures: Figures,
     /// The pipeline's last health. The pipeline's task writes it.
     pub health: Option<Health>,
+    /// What the last flight's end came to: in words, or why it is not on the card. The store's task writes it; `None`
+    /// where nothing is recorded.
+    pub outcome: Option<Result<String, String>>,
 }
 
 impl SharedStatus {

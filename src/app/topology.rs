@@ -36,7 +36,7 @@
 //!
 //! | channel | holds | when full |
 //! |---|---|---|
-//! | event queue, frames | `daemon.frame_queue` frames, 16 in a burst of half a second | the oldest but the next one is dropped and recorded as dropped |
+//! | event queue, frames | `daemon.frame_queue` frames, 16 in a burst of half a second | the oldest but the next one is dropped and recorded as dropped; so is one whose turn comes half a second late (two seconds, where the pipeline had none for five) |
 //! | event queue, reads | 8192 reads of the lines | the oldest is dropped and recorded as dropped |
 //! | recording to camera | 12 frames, as a driver's buffers | the recording waits |
 //! | store | see `io::store` | what does not fit is dropped and counted; the pipeline never waits |

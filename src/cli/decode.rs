@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::{CliError, CliResult};
 use windhover_base::msg::GnssEpoch;
-use windhover_base::settings::CompassFormat;
+use windhover_base::settings::{CompassFormat, GpsFormat};
 use windhover_base::time::{MonoTime, NS_PER_S, UtcTime};
 use windhover_decode::{
     CompassDecoder, CompassReading, DecodeCounts, GnssDecoder, HeardAttitude, HeardEpoch,
@@ -42,14 +42,26 @@ struct GpsArgs {
     /// One JSON object an epoch
     #[arg(long)]
     json: bool,
-    /// What the receiver speaks: NMEA with Garmin's own sentences is all there is
-    #[arg(long, value_enum, default_value = "nmea")]
-    format: GpsFormat,
+    /// What the receiver speaks: NMEA with Garmin's own sentences, u-blox's packets, or either
+    #[arg(long, value_enum, default_value = "auto")]
+    format: Speech,
 }
 
 #[derive(clap::ValueEnum, Clone, Copy, Debug)]
-enum GpsFormat {
+enum Speech {
+    Auto,
     Nmea,
+    Ubx,
+}
+
+impl From<Speech> for GpsFormat {
+    fn from(speech: Speech) -> Self {
+        match speech {
+            Speech::Auto => Self::Auto,
+            Speech::Nmea => Self::Nmea,
+            Speech::Ubx => Self::Ubx,
+        }
+    }
 }
 
 #[derive(clap::Args, Debug)]
@@ -81,11 +93,7 @@ pub(super) fn run(args: &Args) -> CliResult {
         Device::Compass(compass) => (&compass.file, "a compass's log, recorded at the right speed"),
     };
     let counts = match &args.device {
-        Device::Gps(gps) => {
-            // One format today; the option is there so that scripts need not change with a second.
-            let GpsFormat::Nmea = gps.format;
-            decode_gps(&read(&gps.file)?, gps.json, &mut out)
-        }
+        Device::Gps(gps) => decode_gps(&read(&gps.file)?, gps.format.into(), gps.json, &mut out),
         Device::Compass(compass) => {
             decode_compass(&read(&compass.file)?, compass.format, compass.json, &mut out)
         }
@@ -160,8 +168,13 @@ fn utc_text(epoch: &GnssEpoch) -> Option<String> {
     Some(utc.to_string())
 }
 
-fn decode_gps(bytes: &[u8], json: bool, out: &mut impl Write) -> std::io::Result<DecodeCounts> {
-    let (mut decoder, mut heard) = (GnssDecoder::patient(), Vec::new());
+fn decode_gps(
+    bytes: &[u8],
+    format: GpsFormat,
+    json: bool,
+    out: &mut impl Write,
+) -> std::io::Result<DecodeCounts> {
+    let (mut decoder, mut heard) = (GnssDecoder::patient().of_format(format), Vec::new());
     decoder.push(bytes, MonoTime::default(), &mut heard);
     decoder.flush(&mut heard);
     if !json {
@@ -297,7 +310,7 @@ mod tests {
 
     fn gps_json(text: &str) -> Vec<serde_json::Value> {
         let mut out = Vec::new();
-        decode_gps(text.as_bytes(), true, &mut out).expect("memory can be written");
+        decode_gps(text.as_bytes(), GpsFormat::Auto, true, &mut out).expect("memory can be written");
         String::from_utf8_lossy(&out).lines().map(|line| serde_json::from_str(line).expect("JSON")).collect()
     }
 

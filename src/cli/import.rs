@@ -1,4 +1,4 @@
-//! `windhover import --gps FILE --compass FILE --video FILE|FOLDER --out CAPTURE.mcap`
+//! `windhover import --gps FILE --compass FILE --imu FILE --attitude FILE --video FILE|FOLDER --out CAPTURE.mcap`
 
 use std::path::PathBuf;
 
@@ -11,7 +11,9 @@ use windhover_base::time::MonoTime;
 #[derive(clap::Args, Debug)]
 #[command(
     after_help = "Serial logs: each line starts with a time (seconds since any epoch, ISO 8601 with T or a blank, or
-as gpspipe -t writes it) and a blank or tab, then what came over the line. Video: a folder of images with times.csv (time_s,file), Motion
+as gpspipe -t writes it) and a blank or tab, then what came over the line. Tables: comma-separated, with a header; the
+sections [imu] and [attitude] of the configuration say how the sensors are mounted and how good they are. Video: a folder
+of images with times.csv (time_s,file), Motion
 JPEG in AVI, Y4M, or whatever an installed ffmpeg reads. All times are on one clock.
 
 Example:
@@ -25,6 +27,12 @@ pub(super) struct Args {
     /// Log of the compass's line
     #[arg(long, value_name = "FILE")]
     compass: Option<PathBuf>,
+    /// Table of rates and forces: time_s, gyro_x_dps … gyro_z_dps, acc_x_mps2 … acc_z_mps2
+    #[arg(long, value_name = "FILE")]
+    imu: Option<PathBuf>,
+    /// Table of a second source of attitude: time_s, heading_deg (true), pitch_deg, roll_deg
+    #[arg(long, value_name = "FILE")]
+    attitude: Option<PathBuf>,
     /// Video file, or folder of images with times.csv
     #[arg(long, value_name = "FILE|FOLDER")]
     video: Option<PathBuf>,
@@ -53,6 +61,8 @@ pub(super) fn run(args: &Args) -> CliResult {
     let sources = import::Sources {
         gps: args.gps.clone(),
         compass: args.compass.clone(),
+        imu: args.imu.clone(),
+        attitude: args.attitude.clone(),
         video: args.video.clone(),
         video_start: args.video_start,
     };
@@ -63,8 +73,11 @@ pub(super) fn run(args: &Args) -> CliResult {
     for warning in &imported.warnings {
         eprintln!("windhover: {warning}");
     }
+    let samples = [(imported.imu_samples, "IMU"), (imported.attitude_samples, "attitude")];
+    let samples = samples.into_iter().filter(|(count, _)| *count > 0);
+    let samples: String = samples.map(|(count, name)| format!(", {count} {name} samples")).collect();
     eprintln!(
-        "imported {} GPS lines, {} compass lines and {} frames over {:.1} s",
+        "imported {} GPS lines, {} compass lines{samples} and {} frames over {:.1} s",
         imported.gps_lines,
         imported.compass_lines,
         imported.frames,

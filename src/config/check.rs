@@ -232,6 +232,7 @@ impl Config {
         within("camera.height", f64::from(camera.height), 16.0, 16_384.0)?;
         within("camera.fps", camera.fps, 0.1, 1_000.0)?;
         within("camera.exposure_offset_ms", camera.exposure_offset_ms, -1_000.0, 1_000.0)?;
+        within("camera.readout_ms", camera.readout_ms, -200.0, 200.0)?;
         within("camera.intrinsics.fx", camera.intrinsics.fx, 1.0, 1e6)?;
         within("camera.intrinsics.fy", camera.intrinsics.fy, 1.0, 1e6)?;
         within("camera.intrinsics.cx", camera.intrinsics.cx, -1e5, 1e5)?;

@@ -68,6 +68,12 @@ pub struct MavlinkConfig {
     pub system_id: u8,
     /// Positions a second.
     pub rate_hz: f64,
+    /// An estimate older than this goes out no more, seconds.
+    pub max_age_s: f64,
+    /// A position known no better than this relative to the helicopter (one sigma) does not go out, metres.
+    pub max_sigma_m: f64,
+    /// A vehicle out of sight is predicted for this long; then its positions stop, whatever `lost_after_s` is, seconds.
+    pub coast_s: f64,
     /// File with the 32 bytes of a signing key in hexadecimal; messages are signed with it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub signing_key: Option<String>,
@@ -82,6 +88,9 @@ impl Default for MavlinkConfig {
             send_to: vec!["127.0.0.1:14550".into()],
             system_id: 42,
             rate_hz: 5.0,
+            max_age_s: 0.5,
+            max_sigma_m: 2.0,
+            coast_s: 1.0,
             signing_key: None,
             signing_link_id: 0,
         }
@@ -130,7 +139,10 @@ impl MavlinkConfig {
             }
         }
         within("mavlink.system_id", f64::from(self.system_id), 1.0, 250.0)?;
-        within("mavlink.rate_hz", self.rate_hz, 0.1, 50.0)
+        within("mavlink.rate_hz", self.rate_hz, 0.1, 50.0)?;
+        within("mavlink.max_age_s", self.max_age_s, 0.05, 10.0)?;
+        within("mavlink.max_sigma_m", self.max_sigma_m, 0.01, 1_000.0)?;
+        within("mavlink.coast_s", self.coast_s, 0.0, 60.0)
     }
 }
 

@@ -16,6 +16,7 @@ use mcap::records::{Record as McapRecord, op};
 
 use super::mcap_definitions::{ChannelInfo, Definitions};
 use super::mcap_record::{RECORD_HEAD, longest, parse, sized_u32, split, unpack_chunk};
+use super::segment_files::segment_files;
 use windhover_base::time::MonoTime;
 
 /// Longest attachment that is read: a configuration, not a film.
@@ -63,22 +64,8 @@ pub struct RawMessage {
 
 /// Files of a recording: itself, or the segments of a flight's directory in order.
 pub fn segments_of(path: &Path) -> Result<Vec<PathBuf>, ReadError> {
-    let io = |source| ReadError::Io { path: path.to_owned(), source };
-    if !path.metadata().map_err(io)?.is_dir() {
-        return Ok(vec![path.to_owned()]);
-    }
-    let mut files = Vec::new();
-    for entry in path.read_dir().map_err(io)? {
-        let file = entry.map_err(io)?.path();
-        if file.extension().is_some_and(|e| e == "mcap") {
-            files.push(file);
-        }
-    }
-    files.sort();
-    if files.is_empty() {
-        return Err(ReadError::Empty { path: path.to_owned() });
-    }
-    Ok(files)
+    let files = segment_files(path).map_err(|source| ReadError::Io { path: path.to_owned(), source })?;
+    if files.is_empty() { Err(ReadError::Empty { path: path.to_owned() }) } else { Ok(files) }
 }
 
 /// Messages of a recording in file order.

@@ -17,6 +17,7 @@ pub mod pps;
 pub mod process;
 pub mod proto;
 pub mod records;
+pub mod segment_files;
 pub mod serial;
 pub mod store;
 pub mod terrain;

@@ -1,7 +1,7 @@
 //! Terrain tiles from files: SRTM `.hgt` and GeoTIFF.
 
 use std::fs::File;
-use std::io::BufReader;
+use std::io::{BufReader, Read as _};
 use std::path::{Path, PathBuf};
 
 use tiff::decoder::{Decoder, DecodingResult, Limits};
@@ -13,6 +13,9 @@ use windhover_base::geo::{TerrainError, Tile};
 const GDAL_NODATA: Tag = Tag::Unknown(42_113);
 /// Heights farther than this from the sea are marks for missing ones, metres.
 const HIGHEST_M: f64 = 12_000.0;
+
+/// Bytes of the largest `.hgt` file, 3601 heights square.
+const LARGEST_HGT: u64 = 3601 * 3601 * 2;
 
 /// Why a file gave no tile.
 #[derive(Debug, thiserror::Error)]
@@ -57,7 +60,9 @@ pub fn load(path: &Path) -> Result<Tile, TileError> {
     if !is_hgt {
         return geotiff(path);
     }
-    let bytes = std::fs::read(path).map_err(|source| TileError::Io { path: path.to_owned(), source })?;
+    let mut bytes = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(LARGEST_HGT + 1).read_to_end(&mut bytes));
+    read.map_err(|source| TileError::Io { path: path.to_owned(), source })?;
     let stem = path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
     Tile::from_hgt(&stem, &bytes).map_err(|source| TileError::Tile { path: path.to_owned(), source })
 }

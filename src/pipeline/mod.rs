@@ -4,6 +4,7 @@
 //! from it. It reads no clock: time is what the events say, and so are the ticks at which time-outs are
 //! looked at, so a replay of the same events gives the same outputs to the last bit.
 
+mod frame_pace;
 mod lines;
 mod misfit_words;
 mod misfits;
@@ -20,7 +21,8 @@ use std::sync::Arc;
 use nalgebra::Vector2;
 
 use crate::pixels::{self, DecodedFrame, FrameFault};
-use lines::SourceLines;
+use frame_pace::FramePace;
+use lines::{Sample, SourceLines};
 use misfit_words::felt_words;
 use monitor::{Monitor, notice};
 use seen::SeenMarkers;
@@ -28,12 +30,12 @@ use site::SiteFinder;
 use ticks::{Due, Schedule};
 use windhover_base::geo::{Geodetic, Tile};
 use windhover_base::msg::{
-    AttitudeSample, Delivery, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload,
-    FramePrediction, GnssEpoch, NoticeKind, Output, SensorReading, Source, Stamped, TargetEstimate,
-    TimedOutput, TrackStatus, WarmFilter, WarmSite, WarmState,
+    AttitudeSample, EstimatorOutput, Event, EventBody, FrameObservations, FramePayload, FramePrediction,
+    GnssEpoch, NoticeKind, Output, SensorReading, Source, Stamped, TargetEstimate, TimedOutput, TrackStatus,
+    WarmFilter, WarmSite, WarmState,
 };
 use windhover_base::settings::{MarkerKind, TargetConfig};
-use windhover_base::time::{MonoTime, Span};
+use windhover_base::time::{FrameClock, MonoTime, Span};
 use windhover_detect::tracking::FrameDetector;
 use windhover_estimate::{Estimator, PaperEstimator};
 
@@ -63,6 +65,8 @@ pub struct Pipeline {
     /// Time of the last event or tick.
     now: MonoTime,
     last_exposure: Option<MonoTime>,
+    pace: FramePace,
+    exposures: FrameClock,
     outputs: Vec<Output>,
     readings: Vec<SensorReading>,
     estimated: Vec<EstimatorOutput>,
@@ -86,8 +90,7 @@ impl Pipeline {
     pub fn with_terrain(settings: PipelineSettings, terrain: Option<Arc<Tile>>) -> Self {
         let rig = &settings.rig;
         let mut lines = SourceLines::new(rig);
-        let there = |source: &Source| source.delivers() == Delivery::Frames || lines.of(*source).is_some();
-        let watched = Source::ALL.iter().copied().filter(there).collect();
+        let watched = Source::ALL.iter().copied().filter(|source| lines.awaits(*source)).collect();
         Self {
             want_rgb: wants_rgb(&rig.target),
             lines,
@@ -103,6 +106,8 @@ impl Pipeline {
             schedule: Schedule::new(settings.filter.ownship_hz),
             now: MonoTime::default(),
             last_exposure: None,
+            pace: FramePace::new(rig.camera.fps),
+            exposures: FrameClock::default(),
             outputs: Vec::new(),
             readings: Vec::new(),
             estimated: Vec::new(),
@@ -175,6 +180,15 @@ impl Pipeline {
         }
         if let Some(estimators) = &mut self.estimators {
             estimators.joint.tick(t, &mut self.estimated);
+            // While no frame comes, targets coast and are lost all the same; what is lost already is not said again.
+            if let Some(frame) = self.pace.missing_after(t)
+                && self.monitor.is_any_known()
+            {
+                estimators.joint.coast(t, frame, &mut self.estimated);
+                let monitor = &self.monitor;
+                self.estimated
+                    .retain(|said| !matches!(said, EstimatorOutput::Coasted(e) if monitor.is_lost(e.target)));
+            }
         }
         self.take_estimated(t, out);
     }
@@ -198,6 +212,12 @@ impl Pipeline {
             EventBody::Frame(frame) => {
                 let decoded = prepared.unwrap_or_else(|| pixels::decode(frame, self.want_rgb));
                 self.frame(frame, decoded, event, out);
+            }
+            EventBody::Inertial { source, sample } => {
+                self.sample(*source, sample, event, Estimator::inertial, out);
+            }
+            EventBody::Attitude { source, sample } => {
+                self.sample(*source, sample, event, Estimator::second_attitude, out);
             }
             EventBody::Dropped { source, count } => self.monitor.dropped(*source, t, *count, out),
             EventBody::Pulse => self.lines.gps.pulse(t),
@@ -247,6 +267,39 @@ impl Pipeline {
         self.take_readings(source, t, out);
     }
 
+    /// Samples go to the filter as they are: the flight has them as they were received.
+    fn sample<T: Sample>(
+        &mut self,
+        source: Source,
+        sample: &T,
+        event: &Event,
+        fuse: fn(&mut Estimator, &Stamped<T>, &mut Vec<EstimatorOutput>),
+        out: &mut Vec<Output>,
+    ) {
+        let Some(line) = self.lines.samples(source) else { return };
+        let stamped = line.stamp(sample, event.t_recv, event.seq);
+        let refused = line.refused();
+        self.heard_or_refused(source, event.t_recv, stamped.is_some(), refused, out);
+        if let (Some(sample), Some(estimators)) = (stamped, &mut self.estimators) {
+            fuse(&mut estimators.joint, &sample, &mut self.estimated);
+        }
+        self.take_estimated(event.t_recv, out);
+    }
+
+    fn heard_or_refused(
+        &mut self,
+        source: Source,
+        t: MonoTime,
+        heard: bool,
+        refused: u64,
+        out: &mut Vec<Output>,
+    ) {
+        match heard {
+            true => self.monitor.heard(source, t, out),
+            false => self.monitor.refused(source, t, refused, "values that cannot be", out),
+        }
+    }
+
     fn take_readings(&mut self, source: Source, t: MonoTime, out: &mut Vec<Output>) {
         for reading in std::mem::take(&mut self.readings) {
             self.monitor.heard(source, t, out);
@@ -259,7 +312,7 @@ impl Pipeline {
     }
 
     fn gnss(&mut self, epoch: &Stamped<GnssEpoch>, t: MonoTime, out: &mut Vec<Output>) {
-        self.monitor.fix(t, epoch.value.fix, epoch.value.sats, self.lines.gps.clock_sigma(), out);
+        self.monitor.fix(t, epoch, self.lines.gps.clock_sigma(), out);
         self.monitor.pulses(t, self.lines.gps.pulse_trouble(), out);
         out.push(Output::Reading(SensorReading::Gnss(*epoch)));
         let agreed = self.finder.agreeing();
@@ -350,7 +403,9 @@ impl Pipeline {
         out: &mut Vec<Output>,
     ) {
         let t = event.t_recv;
-        let t_valid = payload.t_exposure + Span::from_ms(self.settings.rig.camera.exposure_offset_ms);
+        self.pace.frame(t, payload.index);
+        let offset = Span::from_ms(self.settings.rig.camera.exposure_offset_ms);
+        let t_valid = self.exposures.exposed(payload.t_exposure) + offset;
         if self.last_exposure.is_some_and(|last| payload.t_exposure <= last) {
             let words = format!("frame {} is stamped no later than the one before", payload.index);
             out.push(notice(t, NoticeKind::ClockJump, Some(Source::Camera), words));
@@ -442,7 +497,9 @@ impl Pipeline {
     fn take_estimated(&mut self, t: MonoTime, out: &mut Vec<Output>) {
         for estimated in self.estimated.drain(..) {
             match &estimated {
-                EstimatorOutput::Estimate(estimate) => self.monitor.estimate(estimate, t, out),
+                EstimatorOutput::Estimate(estimate) | EstimatorOutput::Coasted(estimate) => {
+                    self.monitor.estimate(estimate, t, out);
+                }
                 EstimatorOutput::Fusion(result) => self.monitor.disposition(result.disposition),
                 EstimatorOutput::Anchored { moved_m: d } => {
                     let detail = format!(

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use windhover_base::msg::{
-    Disposition, FixKind, Health, Misfit, Notice, NoticeKind, Output, PerSource, Source, SourceHealth,
-    TargetEstimate, TargetHealth, TrackStatus,
+    Disposition, FixKind, GnssEpoch, Health, Misfit, Notice, NoticeKind, Output, PerSource, Source,
+    SourceHealth, Stamped, TargetEstimate, TargetHealth, TrackStatus,
 };
 use windhover_base::settings::Rig;
 use windhover_base::time::{MonoTime, PulseTrouble, Span};
@@ -35,6 +35,7 @@ pub(super) struct Monitor {
     fix: FixKind,
     sats: Option<u32>,
     clock_sigma: Option<Span>,
+    utc_minus_host: Option<Span>,
     targets: Vec<TargetHealth>,
     dispositions: BTreeMap<Disposition, u64>,
     began: Option<MonoTime>,
@@ -60,6 +61,7 @@ impl Monitor {
             fix: FixKind::None,
             sats: None,
             clock_sigma: None,
+            utc_minus_host: None,
             targets: (0..names.len()).map(|i| TargetHealth { frames_seen: 0, last: lost(i) }).collect(),
             names,
             misfits: Misfits::new(rig),
@@ -88,7 +90,12 @@ impl Monitor {
         while t >= due {
             self.silences(due, out);
             out.push(Output::Health(Box::new(self.health(due))));
-            due += HEALTH_PERIOD;
+            let next = due + HEALTH_PERIOD;
+            if next <= due {
+                // The end of time, which a wild stamp can name: nothing follows it.
+                break;
+            }
+            due = next;
         }
         self.next_health = Some(due);
     }
@@ -100,6 +107,10 @@ impl Monitor {
             let quiet = t - count.last.unwrap_or(began);
             if !count.silent && quiet >= source.silent_after() {
                 count.silent = true;
+                if source == Source::Gps {
+                    // What a receiver said before it fell silent is no fix of now.
+                    (self.fix, self.sats) = (FixKind::None, None);
+                }
                 let detail = format!("nothing to use from the {} for {:.1} s", source.name(), quiet.s());
                 out.push(notice(t, NoticeKind::SourceSilent, Some(source), detail));
             }
@@ -126,6 +137,7 @@ impl Monitor {
             fix: self.fix,
             sats: self.sats,
             clock_sigma: self.clock_sigma,
+            utc_minus_host: self.utc_minus_host,
             targets: self.targets.clone(),
             dispositions: self.dispositions.clone(),
             misfits: self.misfits.now(t),
@@ -178,15 +190,18 @@ impl Monitor {
         out.push(notice(t, NoticeKind::Dropped, Some(source), detail));
     }
 
-    /// The receiver's fix and the state of the time fit.
+    /// The receiver's fix and the state of the time fit, with one-sigma where the epoch was put in time by it.
     pub(super) fn fix(
         &mut self,
         t: MonoTime,
-        fix: FixKind,
-        sats: Option<u32>,
+        epoch: &Stamped<GnssEpoch>,
         clock_sigma: Option<Span>,
         out: &mut Vec<Output>,
     ) {
+        let GnssEpoch { fix, sats, utc, .. } = epoch.value;
+        if let (true, Some(utc), Some(_)) = (fix.has_position(), utc, clock_sigma) {
+            self.utc_minus_host = Some(Span::from_ns(utc.unix_ns() - epoch.t_valid.ns()));
+        }
         let had = self.fix.has_position();
         let has = fix.has_position();
         if has && !had {
@@ -213,6 +228,16 @@ impl Monitor {
         if let Some(target) = self.targets.get_mut(target) {
             target.frames_seen += 1;
         }
+    }
+
+    /// Whether a target is lost, or was never found.
+    pub(super) fn is_lost(&self, target: usize) -> bool {
+        self.targets.get(target).is_none_or(|target| target.last.status == TrackStatus::Lost)
+    }
+
+    /// Whether something is known of any target.
+    pub(super) fn is_any_known(&self) -> bool {
+        (0..self.targets.len()).any(|target| !self.is_lost(target))
     }
 
     /// A target's estimate.
@@ -264,6 +289,17 @@ pub(super) fn notice(t: MonoTime, kind: NoticeKind, source: Option<Source>, deta
 mod tests {
     use super::*;
     use crate::config::Config;
+
+    #[test]
+    fn the_end_of_time_is_one_moment() {
+        let config = Config::parse(include_str!("../../config/windhover.toml")).expect("valid");
+        let mut monitor = Monitor::new(vec![Source::Gps], &config.rig());
+        let mut out = Vec::new();
+        for t in [0, i64::MAX - 1, i64::MAX, i64::MAX] {
+            monitor.advance(MonoTime::from_ns(t), &mut out);
+        }
+        assert!(out.len() < 10, "{} outputs", out.len());
+    }
 
     #[test]
     fn only_the_sources_there_are_can_be_silent() {

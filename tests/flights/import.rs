@@ -46,7 +46,7 @@ fn logs_and_a_folder_of_images_merge_in_order() {
         gps: Some(at("gps.log")),
         compass: Some(at("compass.log")),
         video: Some(at("frames")),
-        video_start: None,
+        ..Sources::default()
     };
     let (imported, got) = run(folder.path(), sources).unwrap();
 
@@ -77,6 +77,32 @@ fn y4m_keeps_its_luma_and_its_rate() {
     let (imported, got) = run(folder.path(), Sources { video: Some(path), ..Sources::default() }).unwrap();
     assert_eq!(imported.video, Some(VideoSource::Y4m));
     assert_eq!(got, [(0, "Grey 0 8".to_owned()), (50, "Grey 1 8".to_owned())]);
+}
+
+#[test]
+fn tables_of_samples_merge_with_the_rest() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    std::fs::write(at("gps.log"), "100.0 $GPRMC,a*00\n").unwrap();
+    let rows = "100.02,180,0,0,0,0,-9.8\n99.98,0,90,0,0,0,-9.8\n100.04,x,0,0,0,0,\n";
+    let header = "time_s,gyro_x_dps,gyro_y_dps,gyro_z_dps,acc_x_mps2,acc_y_mps2,acc_z_mps2\n";
+    std::fs::write(at("imu.csv"), format!("{header}{rows}")).unwrap();
+    std::fs::write(at("ahrs.csv"), "time_s,heading_deg,pitch_deg,roll_deg\n100.01,90,0,0\n").unwrap();
+    let sources = Sources {
+        gps: Some(at("gps.log")),
+        imu: Some(at("imu.csv")),
+        attitude: Some(at("ahrs.csv")),
+        ..Sources::default()
+    };
+    let (imported, got) = run(folder.path(), sources).unwrap();
+    assert_eq!((imported.imu_samples, imported.attitude_samples), (2, 1));
+    assert!(
+        imported.warnings[0].contains("imu.csv: 1 rows") && imported.warnings[0].contains("line 4 first")
+    );
+    let times: Vec<i64> = got.iter().map(|(ms, _)| *ms).collect();
+    assert_eq!(times, [0, 20, 30, 40]);
+    assert!(got[0].1.starts_with("Inertial") && got[0].1.contains("1.57"), "{}", got[0].1);
+    assert!(got[2].1.starts_with("Attitude") && got[2].1.contains("heading_is_true: true"), "{}", got[2].1);
 }
 
 /// A chunk of an AVI file.

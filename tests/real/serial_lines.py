@@ -9,6 +9,7 @@ KNOWN = {
     "garmin-10x": {"fix 2d here, 3d there": 2, "epoch only here": 1},
     "garmin25lp": {"fix 2d here, 3d there": 9, "epoch only here": 10, "geoid_m only here": 1},
     "garmin38": {"alt_msl_m": 5},
+    "hemi": {"epoch only in gpsd's": 113},
     "isync": {"epoch only here": 1},
     "quectel-l76k-nmea": {"epoch only here": 1},
     "rst39": {

@@ -291,6 +291,7 @@ mod tests {
             fps: 15.0,
             pixel_format: PixelFormat::Grey,
             exposure_offset_ms: 0.0,
+            readout_ms: 0.0,
             intrinsics,
             mount: CameraMount::default(),
         };

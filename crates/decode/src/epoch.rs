@@ -61,7 +61,7 @@ impl Draft {
 
     /// Whether it holds a sentence that tells the receiver's main solution.
     pub(super) fn has_main(&self) -> bool {
-        self.kinds.iter().any(|kind| matches!(kind, Kind::Rmc | Kind::Gga | Kind::Gns))
+        self.kinds.iter().any(|kind| matches!(kind, Kind::Rmc | Kind::Gga | Kind::Gns | Kind::Pvt))
     }
 
     /// Adds what a sentence of the same time says.
@@ -186,19 +186,21 @@ fn velocity_of(speed_mps: Option<f64>, course_deg: Option<f64>) -> Option<Vector
 
 const fn position_rank(kind: Kind) -> u8 {
     match kind {
-        Kind::Gga => 0,
-        Kind::Gns => 1,
-        Kind::Rmc => 2,
-        Kind::Gll => 3,
-        _ => 4,
+        Kind::Pvt => 0,
+        Kind::Gga => 1,
+        Kind::Gns => 2,
+        Kind::Rmc => 3,
+        Kind::Gll => 4,
+        _ => 5,
     }
 }
 
 const fn motion_rank(kind: Kind) -> u8 {
     match kind {
-        Kind::Rmc => 0,
-        Kind::Vtg => 1,
-        _ => 2,
+        Kind::Pvt => 0,
+        Kind::Rmc => 1,
+        Kind::Vtg => 2,
+        _ => 3,
     }
 }
 

@@ -7,8 +7,10 @@ use super::epoch::Draft;
 use super::lines::{Line, LineFramer, LineSpan, LineStart};
 use super::report::{Kind, Report};
 use super::sentence::Sentence;
+use super::ubx::{self, Piece, Splitter};
 use super::{garmin, standard};
 use windhover_base::msg::GnssEpoch;
+use windhover_base::settings::GpsFormat;
 use windhover_base::time::{MonoTime, Span};
 
 /// An epoch and when its burst was heard.
@@ -42,6 +44,8 @@ const LEADING_MAX: usize = 8;
 /// when the next epoch begins, or by [`GnssDecoder::tick`] after silence.
 #[derive(Clone, Debug)]
 pub struct GnssDecoder {
+    format: GpsFormat,
+    splitter: Splitter,
     framer: LineFramer,
     counts: DecodeCounts,
     assembler: Assembler,
@@ -103,6 +107,8 @@ impl GnssDecoder {
 
     fn with_patience(patient: bool) -> Self {
         Self {
+            format: GpsFormat::Auto,
+            splitter: Splitter::default(),
             framer: LineFramer::new(LineStart::Dollar),
             counts: DecodeCounts::default(),
             assembler: Assembler {
@@ -121,12 +127,27 @@ impl GnssDecoder {
         }
     }
 
+    /// The same for a receiver that speaks this; both is what it takes otherwise.
+    #[must_use]
+    pub const fn of_format(mut self, format: GpsFormat) -> Self {
+        self.format = format;
+        self
+    }
+
     /// Takes the bytes one read returned at `t_recv`; appends the epochs they complete to `out`.
     pub fn push(&mut self, bytes: &[u8], t_recv: MonoTime, out: &mut Vec<HeardEpoch>) {
-        let assembler = &mut self.assembler;
-        self.framer.push(bytes, t_recv, &mut self.counts, |line, counts| {
-            assembler.line(&line, counts, out);
-        });
+        let Self { format, splitter, framer, counts, assembler } = self;
+        let mut piece = |piece: Piece<'_>, counts: &mut DecodeCounts| match piece {
+            Piece::Outside(bytes, _) if *format == GpsFormat::Ubx => counts.noise_bytes += bytes.len() as u64,
+            Piece::Outside(bytes, after) => framer.push(bytes, after, t_recv, counts, |line, counts| {
+                assembler.line(&line, counts, out);
+            }),
+            Piece::Packet(packet, span) => assembler.packet(packet, span, counts, out),
+        };
+        match format {
+            GpsFormat::Nmea => piece(Piece::Outside(bytes, 0), counts),
+            GpsFormat::Auto | GpsFormat::Ubx => splitter.push(bytes, 0, t_recv, counts, &mut piece),
+        }
         self.note_dates();
     }
 
@@ -167,12 +188,36 @@ impl Assembler {
         } else {
             standard::read(&sentence)
         };
+        self.said(read, sentence.address(), line.span, counts, out);
+    }
+
+    /// A packet of u-blox.
+    fn packet(
+        &mut self,
+        packet: &[u8],
+        span: LineSpan,
+        counts: &mut DecodeCounts,
+        out: &mut Vec<HeardEpoch>,
+    ) {
+        let address = ubx::address(packet);
+        self.order.heard(&address, span);
+        self.said(ubx::read(packet), &address, span, counts, out);
+    }
+
+    fn said(
+        &mut self,
+        read: Result<Option<Report>, Refusal>,
+        address: &str,
+        span: LineSpan,
+        counts: &mut DecodeCounts,
+        out: &mut Vec<HeardEpoch>,
+    ) {
         let placed = match read {
             Ok(None) => return counts.ignored += 1,
             Err(why) => Err(why),
             Ok(Some(report)) => {
                 report.left_out.iter().for_each(|field| counts.leave_out(*field));
-                self.place(report, sentence.address(), line.span, out)
+                self.place(report, address, span, out)
             }
         };
         match placed {
@@ -386,7 +431,7 @@ impl Assembler {
     }
 
     fn done_has_main(&self) -> bool {
-        let main = |kind: &Kind| matches!(kind, Kind::Rmc | Kind::Gga | Kind::Gns);
+        let main = |kind: &Kind| matches!(kind, Kind::Rmc | Kind::Gga | Kind::Gns | Kind::Pvt);
         self.draft.is_none() && self.done.as_ref().is_some_and(|done| done.kinds.iter().any(main))
     }
 

@@ -14,8 +14,12 @@ mod gnss_tests;
 mod report;
 mod sentence;
 mod standard;
+mod ubx;
+#[cfg(test)]
+mod ubx_tests;
 
 pub use compass::{CompassDecoder, CompassReading, HeardAttitude};
 pub use counts::{DecodeCounts, Refusal};
 pub use gnss::{GnssDecoder, HeardEpoch};
 pub use sentence::{Sentence, framed};
+pub use ubx::{holds_ubx_packet, ubx_framed};

@@ -63,16 +63,18 @@ impl LineFramer {
         Self { start, buffer: Vec::with_capacity(LINE_MAX), span: LineSpan::default(), state: State::Between }
     }
 
-    /// Takes the bytes of one read and hands every line they complete to `sink`.
+    /// Takes the bytes of one read, of which `after` more follow that are no text, and hands every line they
+    /// complete to `sink`.
     pub(super) fn push(
         &mut self,
         bytes: &[u8],
+        after: usize,
         t_recv: MonoTime,
         counts: &mut DecodeCounts,
         mut sink: impl FnMut(Line<'_>, &mut DecodeCounts),
     ) {
         for (index, &byte) in bytes.iter().enumerate() {
-            let left = bytes.len() - index;
+            let left = bytes.len() - index + after;
             match byte {
                 b'\r' | b'\n' => {
                     if self.state == State::Inside {
@@ -125,7 +127,7 @@ mod tests {
     fn lines(start: LineStart, reads: &[&[u8]]) -> (Vec<String>, DecodeCounts) {
         let (mut framer, mut counts, mut out) = (LineFramer::new(start), DecodeCounts::default(), Vec::new());
         for (index, read) in reads.iter().enumerate() {
-            framer.push(read, MonoTime::from_ns(index as i64), &mut counts, |line, _| {
+            framer.push(read, 0, MonoTime::from_ns(index as i64), &mut counts, |line, _| {
                 out.push(String::from_utf8_lossy(line.text).into_owned());
             });
         }
@@ -155,8 +157,8 @@ mod tests {
     fn spans_tell_reads_and_bytes() {
         let (mut framer, mut counts, mut spans) =
             (LineFramer::new(LineStart::Dollar), DecodeCounts::default(), Vec::new());
-        framer.push(b"..$GP", MonoTime::from_ns(7), &mut counts, |_, _| {});
-        framer.push(b"A\r\n$", MonoTime::from_ns(9), &mut counts, |line, _| spans.push(line.span));
+        framer.push(b"..$GP", 0, MonoTime::from_ns(7), &mut counts, |_, _| {});
+        framer.push(b"A\r\n$", 0, MonoTime::from_ns(9), &mut counts, |line, _| spans.push(line.span));
         let expected = LineSpan {
             t_first: MonoTime::from_ns(7),
             first_read_bytes: 3,

@@ -20,12 +20,14 @@ pub(super) enum Kind {
     Zda,
     Pgrme,
     Pgrmv,
+    /// u-blox NAV-PVT.
+    Pvt,
 }
 
 impl Kind {
     /// Whether the sentence has a field for the time, filled or not.
     pub(super) const fn tells_time(self) -> bool {
-        matches!(self, Self::Gga | Self::Gns | Self::Rmc | Self::Gll | Self::Pgrmf | Self::Zda)
+        matches!(self, Self::Gga | Self::Gns | Self::Rmc | Self::Gll | Self::Pgrmf | Self::Zda | Self::Pvt)
     }
 }
 

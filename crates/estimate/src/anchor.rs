@@ -8,6 +8,7 @@ use nalgebra::{Vector2, Vector3};
 use super::aid::gps_position::GpsPosition;
 use super::blocks::{Block, own};
 use super::core::Core;
+use super::fit::{Fit, WATCHED_POSITION};
 use super::start::ANYWHERE_VAR;
 use super::state::State;
 
@@ -35,14 +36,14 @@ impl Core {
         let bias_var: [f64; 3] = self.models.gps_bias_var.into();
         if error.norm() <= allowed_m {
             // The receiver's error has jumped: its bias is unknown again, position is not.
-            self.state.rejections.gps_position = 0;
+            self.forget_misfit();
             self.state.renew(own::GPS_BIAS, &bias_var.map(|v| v * BIAS_SIGMAS.powi(2)));
             return;
         }
         if !((error - before).norm() <= allowed_m) {
             return;
         }
-        self.state.rejections.gps_position = 0;
+        self.forget_misfit();
         let moved = Vector3::new(error.x, error.y, self.follow_height(&error, fix.has_height));
         let state = &mut self.state;
         state.translate(&moved);
@@ -52,6 +53,12 @@ impl Core {
         state.anchored = Some((state.t, moved));
         // The innovation is zero now: this ties position, bias and all else that makes a fix together.
         self.fuse_aid_as_it_is(fix);
+    }
+
+    /// What the fixes that have just been explained said of the receiver counts no more.
+    fn forget_misfit(&mut self) {
+        self.state.rejections.gps_position = 0;
+        self.state.fits[WATCHED_POSITION] = Fit::default();
     }
 
     /// How far down the scene moves along with the horizontal `error`. Height over the ground is seen

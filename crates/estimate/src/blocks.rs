@@ -1,7 +1,7 @@
 //! Which part of the joint state lies in which columns of the error state.
 //!
-//! Order: the helicopter and its sensors' slow errors ([`own`]), each target ([`TargetBlock`]), each ground feature
-//! (two columns). A new state of the helicopter is a constant of [`own`] behind the last one.
+//! Order: the helicopter and its sensors' slow errors ([`own`], as many as there are sensors), each target
+//! ([`TargetBlock`]), each ground feature (two columns). A new state of the helicopter is a constant of [`own`].
 
 use std::ops::Range;
 
@@ -67,27 +67,52 @@ pub(crate) mod own {
     pub(crate) const TURN: Block<1> = ATTITUDE.part(2);
     /// Angular rate in the body frame, rad/s.
     pub(crate) const RATE: Block<3> = Block::after(ATTITUDE);
-    /// Specific force in the body frame, m/s².
-    pub(crate) const FORCE: Block<3> = Block::after(RATE);
+    /// Gusts: force over mass, NED horizontal, m/s².
+    pub(crate) const GUST: Block<2> = Block::after(RATE);
+    /// Thrust beyond the weight, along the vertical, m/s².
+    pub(crate) const THRUST: Block<1> = Block::after(GUST);
+    /// Slow error of the tilt reading (pitch, roll), rad.
+    pub(crate) const TILT_ERROR: Block<2> = Block::after(THRUST);
+    /// Slow force of the wind over mass, NED horizontal, m/s².
+    pub(crate) const WIND: Block<2> = Block::after(TILT_ERROR);
+    /// Trim: the thrust's direction in the body is against (ε1, ε2, 1).
+    pub(crate) const TRIM: Block<2> = Block::after(WIND);
     /// GPS position bias, NED, m.
-    pub(crate) const GPS_BIAS: Block<3> = Block::after(FORCE);
+    pub(crate) const GPS_BIAS: Block<3> = Block::after(TRIM);
     /// Compass heading bias, rad.
     pub(crate) const HEADING_BIAS: Block<1> = Block::after(GPS_BIAS);
-    /// How much of the true tilt the compass reads.
+    /// How much of what it feels the tilt sensor reads.
     pub(crate) const TILT_GAIN: Block<1> = Block::after(HEADING_BIAS);
     /// Tilt bias (pitch, roll), rad.
     pub(crate) const TILT_BIAS: Block<2> = Block::after(TILT_GAIN);
     /// How much older GPS is than configured, s.
     pub(crate) const GPS_DELAY: Block<1> = Block::after(TILT_BIAS);
-    /// Drag: acceleration per metre a second through the air, 1/s.
+    /// Drag: acceleration per metre a second over the ground, 1/s. What the wind adds is [`WIND`].
     pub(crate) const DRAG: Block<1> = Block::after(GPS_DELAY);
 
-    /// Rate and force, which the increments of the helicopter's motion are made of.
-    pub(crate) const MOTION: Block<6> = Block::from_start_of(RATE);
-    /// Length of the helicopter's part.
+    /// Constant error of the gyros, body axes, rad/s. From here on only where there is an IMU.
+    pub(crate) const RATE_BIAS: Block<3> = Block::after(DRAG);
+    /// Constant error of the accelerometers, body axes, m/s².
+    pub(crate) const FORCE_BIAS: Block<3> = Block::after(RATE_BIAS);
+    /// Heading bias of the second source of attitude, rad. From here on only where there is one.
+    pub(crate) const SECOND_HEADING_BIAS: Block<1> = Block::after(FORCE_BIAS);
+    /// How much of what it feels its tilt sensor reads.
+    pub(crate) const SECOND_TILT_GAIN: Block<1> = Block::after(SECOND_HEADING_BIAS);
+    /// Its tilt bias (pitch, roll), rad.
+    pub(crate) const SECOND_TILT_BIAS: Block<2> = Block::after(SECOND_TILT_GAIN);
+    /// Slow error of its tilt reading, rad.
+    pub(crate) const SECOND_TILT_ERROR: Block<2> = Block::after(SECOND_TILT_BIAS);
+
+    /// What has intensities that are fitted in flight: rate, gusts, thrust, error of the tilt reading.
+    pub(crate) const MOTION: Block<{ TILT_ERROR.end() - ATTITUDE.end() }> = Block::from_start_of(RATE);
+    /// Length of the helicopter's part with GPS and compass only, with an IMU, and with a second source of attitude.
     pub(crate) const LEN: usize = DRAG.end();
-    /// The slow states, from the receiver's bias on: see `motion/slow.rs`.
-    pub(crate) const SLOW: Block<{ LEN - FORCE.end() }> = Block::after(FORCE);
+    pub(crate) const WITH_IMU: usize = FORCE_BIAS.end();
+    pub(crate) const WITH_SECOND: usize = SECOND_TILT_ERROR.end();
+    /// What moves by itself, forces and slow errors: the table of `own.rs`.
+    pub(crate) const SLOW: Block<{ WITH_SECOND - RATE.end() }> = Block::after(RATE);
+    /// The sensors' slow errors and drag, which outlive a restart.
+    pub(crate) const SENSORS: Block<{ LEN - TRIM.end() }> = Block::after(TRIM);
 }
 
 /// Length of a target's part.
@@ -144,6 +169,8 @@ impl TargetBlock {
 /// Where each part of a state of so many targets and features lies.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub(crate) struct Layout {
+    /// Length of the helicopter's part: `own::LEN` or longer.
+    pub(crate) own: usize,
     pub(crate) targets: usize,
     pub(crate) features: usize,
 }
@@ -154,14 +181,19 @@ impl Layout {
         self.feature(self.features).0
     }
 
+    /// The states of the helicopter's part that move by themselves.
+    pub(crate) const fn slow(self) -> Range<usize> {
+        own::SLOW.column(0)..self.own
+    }
+
     /// Target `i`.
     pub(crate) const fn target(self, i: usize) -> TargetBlock {
-        TargetBlock(Block(own::LEN + TARGET * i))
+        TargetBlock(Block(self.own + TARGET * i))
     }
 
     /// Feature `i`.
     pub(crate) const fn feature(self, i: usize) -> Block<FEATURE> {
-        Block(own::LEN + TARGET * self.targets + FEATURE * i)
+        Block(self.own + TARGET * self.targets + FEATURE * i)
     }
 
     /// Every pair of columns that is a place on the ground: of targets, then of features.
@@ -177,9 +209,11 @@ mod tests {
 
     #[test]
     fn the_parts_of_a_state_lie_one_behind_the_other() {
-        let layout = Layout { targets: 2, features: 3 };
-        assert_eq!(own::MOTION.range(), own::RATE.column(0)..own::FORCE.end());
-        assert_eq!(own::SLOW.range(), own::GPS_BIAS.column(0)..own::LEN);
+        let layout = Layout { own: own::LEN, targets: 2, features: 3 };
+        assert_eq!(own::MOTION.range(), own::RATE.column(0)..own::TILT_ERROR.end());
+        assert_eq!(layout.slow(), own::GUST.column(0)..own::LEN);
+        assert_eq!(own::SLOW.end(), own::WITH_SECOND);
+        assert_eq!(own::SENSORS.range(), own::GPS_BIAS.column(0)..own::LEN);
         assert_eq!(layout.target(0).all().column(0), own::LEN);
         assert_eq!(layout.target(1).all().column(0), layout.target(0).yaw_rate().end());
         assert_eq!(layout.feature(0).column(0), layout.target(1).all().end());

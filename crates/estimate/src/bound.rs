@@ -3,14 +3,17 @@
 //! covariance recursion with the Jacobians taken at the true state). A tool for simulations: it is fed
 //! with the measurements of a flight in order of their true times, and with the truth at each.
 
-use nalgebra::{Rotation3, SMatrix, Vector3};
+use nalgebra::{Rotation3, SMatrix, Vector2, Vector3};
 
 use windhover_base::msg::{AttitudeSample, FrameObservations, GnssEpoch};
 use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::MonoTime;
 
 use super::Site;
+use super::blocks::own;
 use super::core::Core;
+use super::force::Force;
+use super::kind::TiltWatch;
 use super::output::target_state;
 use super::own::GRAVITY;
 use super::sources::{AnyMeasurement, Kind};
@@ -31,6 +34,8 @@ pub struct BoundTruth {
     pub rate: Vector3<f64>,
     /// How much of the tilt the compass reads.
     pub tilt_gain: f64,
+    /// Sigma (rad) and correlation time (s) of the slow error with which it does.
+    pub tilt_error: (f64, f64),
     /// Drag, 1/s.
     pub drag_per_s: f64,
     /// How much older GPS is than its stamp says, s.
@@ -59,9 +64,15 @@ impl Bound {
     pub fn gnss(&mut self, t: MonoTime, epoch: &GnssEpoch, truth: &BoundTruth) {
         if !self.core.state.alive {
             let compass = AttitudeSample { heading: Some(0.0), ..AttitudeSample::default() };
+            self.core.state.tilt[0] = TiltWatch::known(truth.tilt_gain);
             if !start(&mut self.core.state, t, epoch, &compass, &self.core.models) {
                 return;
             }
+            let (sigma, tau_s) = truth.tilt_error;
+            let state = &mut self.core.state;
+            (state.senses.tilt_error_var, state.senses.tilt_error_tau_s) = (sigma * sigma, tau_s);
+            state.learnt.tilt_error_var = sigma * sigma;
+            state.renew(own::TILT_ERROR, &[sigma * sigma; 2]);
         }
         self.scratch.kind = Kind::Gnss;
         self.scratch.gnss = *epoch;
@@ -110,8 +121,11 @@ impl Bound {
         own.ned_from_body = truth.ned_from_body;
         own.rate = truth.rate;
         own.drag_per_s = truth.drag_per_s;
-        let drag = truth.velocity * truth.drag_per_s;
-        own.force = truth.ned_from_body.inverse() * (truth.acceleration + drag - Vector3::z() * GRAVITY);
+        // Thrust along the axis carries the weight and what vertical force is felt; the rest across is gusts.
+        let felt = truth.acceleration + truth.velocity * truth.drag_per_s - Vector3::z() * GRAVITY;
+        own.thrust = -felt.z - GRAVITY;
+        own.gust = Vector2::zeros();
+        own.gust = (felt - Force::of(own).ned - own.velocity * own.drag_per_s).xy();
         own.tilt_gain = truth.tilt_gain;
         own.gps_delay_s = truth.gps_delay_s;
         for (target, mean) in self.core.state.targets.iter_mut().zip(&truth.targets) {

@@ -1,20 +1,25 @@
 //! The filter proper: one state, one measurement after another in order of validity.
 
-use windhover_base::msg::{Disposition, FusionResult, FusionSource};
+use windhover_base::msg::{Disposition, FixKind, FusionResult, FusionSource};
 use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::{MonoTime, Span};
 
 use super::Site;
-use super::blocks::Layout;
+use super::blocks::{Layout, own};
+use super::fit::WATCHED;
 use super::fitted::{LEARN_RATIO, Learning, Learnt};
+use super::kind::TiltWatch;
 use super::measurement::Measurement;
 use super::models::Models;
+use super::own::Senses;
 use super::state::State;
 use super::update::{Outcome, Workspace};
 
 /// Interval over which increments are looked at to fit intensities: long enough that they stand
 /// out of the noise, short enough to be what the filter's memory sees.
 const LEARN_INTERVAL_MS: f64 = 400.0;
+/// Likewise while nothing but GPS and compass is measured, which show motion over a second.
+const BLIND_INTERVAL_MS: f64 = 1000.0;
 
 /// State, models and room for arithmetic.
 #[derive(Clone, Debug)]
@@ -39,23 +44,39 @@ impl Core {
     pub(crate) fn new(rig: &Rig, estimator: &EstimatorConfig, site: &Site) -> Self {
         let models = Models::new(rig, estimator, site);
         let e = estimator;
+        let second = rig.attitude.unwrap_or_default();
+        let variance = |deg: f64| deg.to_radians().powi(2);
+        let tilt = [rig.compass.tilt, second.tilt].map(TiltWatch::new);
+        let mut senses = Senses::default();
+        senses.of_tilt(&tilt);
+        senses.of_fix(FixKind::ThreeD, &models);
+        let tilt_error_var = senses.tilt_error_var;
         let start = Learnt {
             target_q: vec![models.target_walks; rig.target.len()],
             tilt_rate_q: e.tilt_rate_walk.powi(2),
             yaw_rate_q: e.yaw_rate_walk.powi(2),
-            side_force_var: e.side_force_mps2.powi(2),
+            gust_var: e.side_force_mps2.powi(2),
             thrust_var: e.thrust_mps2.powi(2),
-            tilt_var: rig.compass.tilt_noise_deg.to_radians().powi(2),
-            heading_var: rig.compass.heading_noise_deg.to_radians().powi(2),
+            tilt_error_var,
+            tilt_var: [rig.compass.tilt_noise_deg, second.tilt_noise_deg].map(variance),
+            heading_var: [rig.compass.heading_noise_deg, second.heading_noise_deg].map(variance),
             marker_factor: vec![1.0; rig.target.len()],
             feature_factor: 1.0,
             gps_factor: 1.0,
             gps_velocity_factor: 1.0,
+            force_factor: 1.0,
+            blind: true,
             t_target: MonoTime::default(),
         };
         let lag_frames = (e.smoother_lag_ms * 1e-3 * rig.camera.fps).ceil() as usize;
-        let layout = Layout { targets: rig.target.len(), features: e.features };
-        let state = State::new(layout, (lag_frames * 3 / 2 + 6).min(MAX_COPIES), start.clone());
+        let own = match (rig.imu, rig.attitude) {
+            (_, Some(_)) => own::WITH_SECOND,
+            (Some(_), None) => own::WITH_IMU,
+            (None, None) => own::LEN,
+        };
+        let layout = Layout { own, targets: rig.target.len(), features: e.features };
+        let copies = (lag_frames * 3 / 2 + 6).min(MAX_COPIES);
+        let state = State::new(layout, copies, start.clone(), senses, tilt);
         Self {
             work: Workspace::new(layout.len()),
             z: Measurement::default(),
@@ -64,6 +85,7 @@ impl Core {
                 on: e.learn,
                 over_s: e.learn_s,
                 interval: Span::from_ms(LEARN_INTERVAL_MS),
+                blind_interval: Span::from_ms(BLIND_INTERVAL_MS),
                 start,
             },
             lost_after: Span::from_s(e.lost_after_s),
@@ -79,7 +101,12 @@ impl Core {
     /// Fuses what stands in `self.z` through the gate, and reports it.
     pub(crate) fn fuse_gated(&mut self, source: FusionSource) -> Outcome {
         let gate = (!self.at_truth).then_some(self.models.gates[self.z.m]);
-        let outcome = self.fuse(gate);
+        let outcome = self.fuse(source, gate);
+        if let (Some(place), Some(gate)) = (WATCHED.iter().position(|watched| *watched == source), gate) {
+            let (z, t) = (&self.z, self.state.t);
+            let squared = outcome.ratio * gate;
+            self.state.fits[place].take(t, squared, &z.residual, &outcome.innovation_var, z.m);
+        }
         self.report(source, outcome);
         outcome
     }
@@ -90,11 +117,12 @@ impl Core {
     }
 
     /// Fuses what stands in `self.z`.
-    pub(crate) fn fuse(&mut self, gate: Option<f64>) -> Outcome {
+    pub(crate) fn fuse(&mut self, source: FusionSource, gate: Option<f64>) -> Outcome {
         if self.at_truth {
             self.z.residual.fill(0.0);
         }
-        self.work.fuse(&mut self.state, &self.z, gate)
+        let held = self.state.held(source);
+        self.work.fuse(&mut self.state, &self.z, gate, held)
     }
 
     fn report(&mut self, source: FusionSource, outcome: Outcome) {

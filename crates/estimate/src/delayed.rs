@@ -97,14 +97,13 @@ impl State {
             });
         }
         (copy.in_use, copy.t, copy.frame) = (true, self.t, frame);
-        copy.take(&self.cov, Block::<TARGET>::after(own::SLOW));
+        copy.take(&self.cov, layout.target(0).all());
     }
 
-    /// Starts a copy of the helicopter's rate and force at the present instant.
+    /// Starts a copy of what the fitted intensities drive at the present instant.
     pub(crate) fn copy_motion(&mut self) {
-        let (own, copy) = (&self.own, &mut self.past_motion);
-        copy.mean[..3].copy_from_slice(own.rate.as_slice());
-        copy.mean[3..].copy_from_slice(own.force.as_slice());
+        let (now, copy) = (self.own.motion(), &mut self.past_motion);
+        copy.mean.copy_from_slice(&now);
         (copy.in_use, copy.t) = (true, self.t);
         copy.take(&self.cov, own::MOTION);
     }

@@ -6,7 +6,7 @@ use crate::align::{History, Stamp};
 use windhover_base::geo::wrap_angle;
 use windhover_base::msg::{
     AttitudeSample, Disposition, EstimatorOutput, FrameObservations, FramePrediction, FusionResult,
-    FusionSource, GnssEpoch, Ownship, Stamped, WarmFilter,
+    FusionSource, GnssEpoch, InertialSample, Misfit, Ownship, Stamped, WarmFilter,
 };
 use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::{MonoTime, Span};
@@ -14,6 +14,7 @@ use windhover_base::time::{MonoTime, Span};
 use super::Site;
 use super::blocks::own;
 use super::core::Core;
+use super::inertial::Blocks;
 use super::sources::{AnyMeasurement, Kind};
 use super::start::start;
 use super::state::State;
@@ -25,8 +26,12 @@ pub struct Estimator {
     history: History<AnyMeasurement, State>,
     /// Compass readings that came before there was a state.
     compass: VecDeque<Stamped<AttitudeSample>>,
+    /// Whether there are gyros and accelerometers, a second source of attitude; samples since the last block.
+    has_imu: bool,
+    has_second: bool,
+    blocks: Blocks,
     /// Room to look ahead in.
-    ahead: State,
+    pub(crate) ahead: State,
     /// The state as it was last told between frames.
     carried: State,
     /// Time of the state in the history from which it was carried on; `None` where a measurement came since.
@@ -38,10 +43,16 @@ pub struct Estimator {
     smoothed_to: Option<MonoTime>,
     /// Time of the last anchoring that was reported.
     anchored: Option<MonoTime>,
+    /// Time of the last decision about the tilt sensor that was reported.
+    decided: Option<MonoTime>,
+    /// When it was last looked at whether sources fit.
+    looked: Option<MonoTime>,
 }
 
 /// Without any measurement for so long the state is given up.
 const SILENCE: Span = Span::from_ns(60_000_000_000);
+/// A source that does not fit is told of so often.
+const MISFIT_INTERVAL: Span = Span::from_ns(1_000_000_000);
 /// Farther ahead than this a frame is not foreseen, s.
 const FORESIGHT_S: f64 = 2.0;
 /// Without any measurement for longer the helicopter's own state is not told, s.
@@ -62,6 +73,9 @@ impl Estimator {
         let core = Core::new(rig, estimator, site);
         let span = Span::from_ms(estimator.history_ms);
         Self {
+            has_imu: rig.imu.is_some(),
+            has_second: rig.attitude.is_some(),
+            blocks: Blocks::default(),
             ahead: State::default(),
             carried: State::default(),
             carried_from: None,
@@ -72,6 +86,8 @@ impl Estimator {
             warm: None,
             smoothed_to: None,
             anchored: None,
+            decided: None,
+            looked: None,
         }
     }
 
@@ -116,10 +132,48 @@ impl Estimator {
             self.refused(FusionSource::CompassHeading, sample.t_valid, Disposition::NoOwnship, out);
             return;
         }
+        self.take_attitude(sample, Kind::Attitude, FusionSource::CompassHeading, out);
+    }
+
+    /// Takes a reading of the second source of attitude, in body axes. Nothing becomes of it where the rig has no
+    /// `[attitude]`.
+    pub fn second_attitude(&mut self, sample: &Stamped<AttitudeSample>, out: &mut Vec<EstimatorOutput>) {
+        if !self.has_second {
+            return;
+        }
+        if !self.core.state.alive {
+            self.refused(FusionSource::AttitudeHeading, sample.t_valid, Disposition::NoOwnship, out);
+            return;
+        }
+        self.take_attitude(sample, Kind::SecondAttitude, FusionSource::AttitudeHeading, out);
+    }
+
+    fn take_attitude(
+        &mut self,
+        sample: &Stamped<AttitudeSample>,
+        kind: Kind,
+        source: FusionSource,
+        out: &mut Vec<EstimatorOutput>,
+    ) {
         let value = sample.value;
-        self.take(stamp_of(sample), FusionSource::CompassHeading, out, |m| {
-            m.kind = Kind::Attitude;
+        self.take(stamp_of(sample), source, out, |m| {
+            m.kind = kind;
             m.attitude = value;
+        });
+        self.emit_smoothed(out);
+    }
+
+    /// Takes rates and forces, in sensor axes; they are fused in blocks of a tenth of a second. Nothing becomes of them
+    /// where the rig has no `[imu]`, or before the filter has started.
+    pub fn inertial(&mut self, sample: &Stamped<InertialSample>, out: &mut Vec<EstimatorOutput>) {
+        if !self.has_imu {
+            return;
+        }
+        let block = self.blocks.take(sample, &self.core.models.body_from_imu);
+        let Some(block) = block.filter(|_| self.core.state.alive) else { return };
+        self.take(stamp_of(&block), FusionSource::ImuRate, out, |m| {
+            m.kind = Kind::Inertial;
+            m.inertial = block.value;
         });
         self.emit_smoothed(out);
     }
@@ -180,7 +234,7 @@ impl Estimator {
     }
 
     /// The helicopter's own state at `t`, from what was taken so far; `None` where it is not known or nothing was
-    /// measured for [`GUESS_S`] before.
+    /// measured for ten seconds before.
     pub fn ownship(&mut self, t: MonoTime) -> Option<Ownship> {
         let state = self.history.at(t);
         let ahead = t - state.t;
@@ -208,22 +262,36 @@ impl Estimator {
         let targets: Vec<String> =
             l.target_q.iter().map(|q| format!("{:.3}/{:.3}", q[0].sqrt(), q[1].sqrt())).collect();
         format!(
-            "heading bias {:.2}±{:.2} deg, tilt gain {:.2}±{:.2}, tilt bias {:.2},{:.2}±{:.2} deg, delay {:.0}±{:.0} ms, \
-             sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} force {:.2}/{:.2} targets {} pixels {:.2?} {:.2}",
+            "heading bias {:.2}±{:.2} deg, tilt felt {:?} (slope {:.2}) gain {:.2}±{:.2} error {:.2},{:.2}±{:.2} deg \
+             bias {:.2},{:.2}±{:.2} deg, trim {:.1},{:.1}±{:.1} deg, wind {:.2},{:.2}±{:.2} m/s2, drag {:.2}±{:.2}, delay {:.0}±{:.0} ms, \
+             sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} gust {:.2} thrust {:.2} targets {} pixels {:.2?} {:.2}",
             own.heading_bias.to_degrees(),
             cov.sigma(own::HEADING_BIAS, 0).to_degrees(),
+            self.core.state.tilt[0].felt,
+            self.core.state.tilt[0].slope(),
             own.tilt_gain,
             cov.sigma(own::TILT_GAIN, 0),
+            own.tilt_error.x.to_degrees(),
+            own.tilt_error.y.to_degrees(),
+            cov.sigma(own::TILT_ERROR, 0).to_degrees(),
             own.tilt_bias.x.to_degrees(),
             own.tilt_bias.y.to_degrees(),
             cov.sigma(own::TILT_BIAS, 0).to_degrees(),
+            own.trim.x.to_degrees(),
+            own.trim.y.to_degrees(),
+            cov.sigma(own::TRIM, 0).to_degrees(),
+            own.wind.x,
+            own.wind.y,
+            cov.sigma(own::WIND, 0),
+            own.drag_per_s,
+            cov.sigma(own::DRAG, 0),
             own.gps_delay_s * 1e3,
             cov.sigma(own::GPS_DELAY, 0) * 1e3,
-            l.heading_var.sqrt().to_degrees(),
-            l.tilt_var.sqrt().to_degrees(),
+            l.heading_var[0].sqrt().to_degrees(),
+            l.tilt_var[0].sqrt().to_degrees(),
             l.tilt_rate_q.sqrt(),
             l.yaw_rate_q.sqrt(),
-            l.side_force_var.sqrt(),
+            l.gust_var.sqrt(),
             l.thrust_var.sqrt(),
             targets.join(" "),
             l.marker_factor,
@@ -286,6 +354,8 @@ impl Estimator {
             self.anchored = Some(t);
             out.push(EstimatorOutput::Anchored { moved_m });
         }
+        self.tell_tilt(out);
+        self.tell_misfits(out);
         if !self.is_reasonable() {
             self.reset("the state was no longer a number within reason", out);
             return None;
@@ -295,6 +365,30 @@ impl Estimator {
         let gone = before - self.history.len();
         // A measurement true just within the history may be trimmed at once; its state is the base then.
         (at >= gone).then(|| at - gone)
+    }
+
+    /// Tells once what the tilt sensor was found to feel.
+    fn tell_tilt(&mut self, out: &mut Vec<EstimatorOutput>) {
+        let tilt = &self.core.state.tilt[0];
+        let (Some(t), Some(felt)) = (tilt.decided, tilt.found()) else { return };
+        if self.decided.is_none_or(|told| t > told) {
+            self.decided = Some(t);
+            out.push(EstimatorOutput::TiltFelt { felt, slope: tilt.slope() });
+        }
+    }
+
+    /// Tells which sources do not fit what is said of them, each once a second.
+    fn tell_misfits(&mut self, out: &mut Vec<EstimatorOutput>) {
+        let t = self.core.state.t;
+        if self.looked.is_some_and(|looked| t - looked < MISFIT_INTERVAL) {
+            return;
+        }
+        self.looked = Some(t);
+        let misfits = self.core.misfits();
+        out.extend(
+            misfits
+                .map(|(source, cause, figure)| EstimatorOutput::Misfit(Misfit { t, source, figure, cause })),
+        );
     }
 
     fn is_reasonable(&self) -> bool {

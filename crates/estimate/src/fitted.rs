@@ -13,20 +13,26 @@ pub(crate) struct Learnt {
     pub(crate) tilt_rate_q: f64,
     /// Intensity of yaw rate walk, (rad/s)²/s.
     pub(crate) yaw_rate_q: f64,
-    /// Variance of the force across the rotor axis, (m/s²)².
-    pub(crate) side_force_var: f64,
-    /// Variance of the thrust about the weight, (m/s²)².
+    /// Variance of the force of gusts, (m/s²)².
+    pub(crate) gust_var: f64,
+    /// Variance of the thrust beyond the weight, (m/s²)².
     pub(crate) thrust_var: f64,
-    /// Variance of a tilt reading, rad².
-    pub(crate) tilt_var: f64,
-    /// Variance of a heading reading, rad².
-    pub(crate) heading_var: f64,
+    /// Variance of the tilt reading's slow error, rad².
+    pub(crate) tilt_error_var: f64,
+    /// Variances of a tilt reading of the compass and of the second source of attitude, rad².
+    pub(crate) tilt_var: [f64; 2],
+    /// Of a heading reading likewise, rad².
+    pub(crate) heading_var: [f64; 2],
     /// Factors on the variance of each target's marker pixels, and of ground features.
     pub(crate) marker_factor: Vec<f64>,
     pub(crate) feature_factor: f64,
     /// Factors on the variance of the receiver's position and velocity noise.
     pub(crate) gps_factor: f64,
     pub(crate) gps_velocity_factor: f64,
+    /// Factor on the variance of the accelerometers' noise.
+    pub(crate) force_factor: f64,
+    /// Whether no marker was in view when it was last fitted.
+    pub(crate) blind: bool,
     /// When the targets' intensities were last fitted.
     pub(crate) t_target: MonoTime,
 }
@@ -49,8 +55,9 @@ pub(crate) const SHORTEST_S: f64 = 0.1;
 pub(crate) struct Learning {
     pub(crate) on: bool,
     pub(crate) over_s: f64,
-    /// Interval of the increments looked at.
+    /// Interval of the increments looked at, and while no marker is seen.
     pub(crate) interval: Span,
+    pub(crate) blind_interval: Span,
     pub(crate) start: Learnt,
 }
 
@@ -66,13 +73,16 @@ impl Learnt {
             marker_factor,
             tilt_rate_q: other.tilt_rate_q,
             yaw_rate_q: other.yaw_rate_q,
-            side_force_var: other.side_force_var,
+            gust_var: other.gust_var,
             thrust_var: other.thrust_var,
+            tilt_error_var: other.tilt_error_var,
             tilt_var: other.tilt_var,
             heading_var: other.heading_var,
             feature_factor: other.feature_factor,
             gps_factor: other.gps_factor,
             gps_velocity_factor: other.gps_velocity_factor,
+            force_factor: other.force_factor,
+            blind: other.blind,
             t_target: other.t_target,
         };
     }
@@ -80,8 +90,13 @@ impl Learnt {
 
 /// Moves `value` toward `sample`, within the limits about `start`.
 pub(crate) fn blend(value: &mut f64, sample: f64, gain: f64, start: f64) {
+    blend_within(value, sample, gain, (start * LEAST * LEAST, start * MOST * MOST));
+}
+
+/// Moves `value` toward `sample`, within limits.
+pub(crate) fn blend_within(value: &mut f64, sample: f64, gain: f64, limits: (f64, f64)) {
     if sample.is_finite() {
-        *value = (*value + gain * (sample - *value)).clamp(start * LEAST * LEAST, start * MOST * MOST);
+        *value = (*value + gain * (sample - *value)).clamp(limits.0, limits.1);
     }
 }
 
@@ -96,9 +111,7 @@ pub(crate) fn blend_noise(
 ) {
     let share = *value / innovation_var.max(*value);
     let sample = (share * residual).powi(2) + *value * (1.0 - share);
-    if sample.is_finite() {
-        *value = (*value + gain * (sample - *value)).clamp(limits.0, limits.1);
-    }
+    blend_within(value, sample, gain, limits);
 }
 
 /// Moves a factor on a measurement's noise toward what its misfit (one where the noise is right) shows.

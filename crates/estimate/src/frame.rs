@@ -114,7 +114,7 @@ impl Core {
         feature.rejected = 0;
         self.state.renew(self.state.layout().feature(slot), &[GUESSED_VAR; 2]);
         match self.linearise(&pixel_of(slot, track)) {
-            Ok(()) => _ = self.fuse(None),
+            Ok(()) => _ = self.fuse(FusionSource::Feature, None),
             Err(_) => self.drop_feature(slot),
         }
     }

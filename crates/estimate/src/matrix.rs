@@ -70,6 +70,13 @@ impl Grid {
         }
     }
 
+    /// Adds to the diagonal of some columns, as far as they go.
+    pub(crate) fn add_to_diagonal(&mut self, columns: std::ops::Range<usize>, values: &[f64]) {
+        for (i, value) in columns.zip(values) {
+            self.add(i, i, *value);
+        }
+    }
+
     /// Adds to a block's diagonal.
     pub(crate) fn add_diagonal<const N: usize>(&mut self, block: Block<N>, value: &[f64; N]) {
         for (i, value) in value.iter().enumerate() {

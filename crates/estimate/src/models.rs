@@ -1,6 +1,6 @@
 //! The configuration and site in the form the filter computes with: radians, metres, matrices.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use windhover_base::geo::{CameraModel, Ground, LocalFrame, TiltConvention, rot_z};
 use windhover_base::msg::MarkerId;
@@ -14,7 +14,8 @@ use super::motion::Motion;
 #[derive(Clone, Debug)]
 pub(crate) struct Taus {
     pub(crate) rate_s: f64,
-    pub(crate) force_s: f64,
+    pub(crate) gust_s: f64,
+    pub(crate) thrust_s: f64,
     pub(crate) gps_bias_s: f64,
 }
 
@@ -58,6 +59,8 @@ pub(crate) struct Models {
     pub(crate) ground: Ground,
     pub(crate) camera: CameraModel,
     pub(crate) image_px: (f64, f64),
+    /// From the first row's exposure to the last one's, s.
+    pub(crate) readout_s: f64,
     pub(crate) camera_from_body: Matrix3<f64>,
     pub(crate) camera_at: Vector3<f64>,
     pub(crate) antenna_at: Vector3<f64>,
@@ -70,7 +73,16 @@ pub(crate) struct Models {
     pub(crate) gps_noise_var: f64,
     pub(crate) gps_velocity_var: f64,
     pub(crate) gps_delay_var: f64,
-    pub(crate) heading_bias_var: f64,
+    /// Of the compass and of the second source of attitude.
+    pub(crate) heading_bias_var: [f64; 2],
+    /// Of gyros and accelerometers, their axes, the variances of noise and of constant error.
+    pub(crate) body_from_imu: Rotation3<f64>,
+    pub(crate) rate_var: f64,
+    pub(crate) force_var: f64,
+    pub(crate) rate_bias_var: f64,
+    pub(crate) force_bias_var: f64,
+    /// What the second source of attitude means by pitch and roll.
+    pub(crate) second_convention: TiltConvention,
     pub(crate) tau: Taus,
     /// Intensity of a side slip, m²/s.
     pub(crate) slip_q: f64,
@@ -89,6 +101,7 @@ const GPS_DOWN_FACTOR: f64 = 2.0;
 impl Models {
     pub(crate) fn new(rig: &Rig, estimator: &EstimatorConfig, site: &Site) -> Self {
         let Rig { gps, compass, camera, target, .. } = rig;
+        let (imu, second) = (rig.imu.unwrap_or_default(), rig.attitude.unwrap_or_default());
         let mount = &camera.mount;
         let across = gps.bias_sigma_m.powi(2);
         let mut gates = [f64::INFINITY; 9];
@@ -100,6 +113,7 @@ impl Models {
             ground: site.ground.clone(),
             camera: camera.intrinsics,
             image_px: (f64::from(camera.width), f64::from(camera.height)),
+            readout_s: camera.readout_ms * 1e-3,
             camera_from_body: mount.body_from_camera().matrix().transpose(),
             camera_at: mount.position(),
             antenna_at: Vector3::from(gps.antenna_position_m),
@@ -112,8 +126,20 @@ impl Models {
             gps_noise_var: gps.noise_m.powi(2),
             gps_velocity_var: gps.velocity_noise_mps.powi(2),
             gps_delay_var: (gps.latency_sigma_ms * 1e-3).powi(2),
-            heading_bias_var: compass.heading_bias_sigma_deg.to_radians().powi(2),
-            tau: Taus { rate_s: RATE_TAU_S, force_s: estimator.force_tau_s, gps_bias_s: gps.bias_tau_s },
+            heading_bias_var: [compass.heading_bias_sigma_deg, second.heading_bias_sigma_deg]
+                .map(|deg| deg.to_radians().powi(2)),
+            body_from_imu: imu.body_from_imu(),
+            rate_var: imu.rate_noise_dps.to_radians().powi(2),
+            force_var: imu.force_noise_mps2.powi(2),
+            rate_bias_var: imu.rate_bias_dps.to_radians().powi(2),
+            force_bias_var: imu.force_bias_mps2.powi(2),
+            second_convention: second.angles,
+            tau: Taus {
+                rate_s: RATE_TAU_S,
+                gust_s: estimator.force_tau_s,
+                thrust_s: THRUST_TAU_S,
+                gps_bias_s: gps.bias_tau_s,
+            },
             slip_q: estimator.target_slip_walk.powi(2),
             target_walks: [estimator.target_speed_walk.powi(2), estimator.target_yaw_rate_walk.powi(2)],
             targets: target.iter().enumerate().map(|(i, t)| target_models(i, t)).collect(),
@@ -134,6 +160,9 @@ impl Models {
 
 /// Correlation time of the helicopter's angular rate, s: a rotor's body answers within a second.
 const RATE_TAU_S: f64 = 1.0;
+/// Correlation time of the thrust beyond the weight, s: a climb begins or ends within seconds.
+const THRUST_TAU_S: f64 = 2.0;
+
 fn target_models(index: usize, config: &TargetConfig) -> TargetModels {
     let markers: Vec<Marker> =
         config.marker.iter().enumerate().map(|(m, marker)| marker_model(index, m, marker)).collect();

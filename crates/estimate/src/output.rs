@@ -1,7 +1,7 @@
 //! From the state to estimates: reference point, covariance, geodetic position, expectation of a
 //! frame.
 
-use nalgebra::{SMatrix, UnitQuaternion, Vector2, Vector3};
+use nalgebra::{Matrix2, SMatrix, UnitQuaternion, Vector2, Vector3};
 
 use windhover_base::geo::wrap_angle;
 use windhover_base::msg::{
@@ -39,7 +39,9 @@ pub(crate) fn target_state(
         yaw_rate_radps: mean[4],
         lat_deg: place.lat_deg,
         lon_deg: place.lon_deg,
+        height_m: place.height_m,
         covariance: Some(jacobian * covariance * jacobian.transpose()),
+        relative_sigma_m: None,
     }
 }
 
@@ -55,9 +57,23 @@ impl State {
         let track = &self.targets[target];
         let status = if self.alive { track.life.status() } else { TrackStatus::Lost };
         let covariance = || symmetric(&self.cov, self.layout().target(target));
-        let state =
-            (status != TrackStatus::Lost).then(|| target_state(models, target, &track.mean, &covariance()));
+        let state = (status != TrackStatus::Lost).then(|| TargetState {
+            relative_sigma_m: Some(self.relative_sigma_m(models, target)),
+            ..target_state(models, target, &track.mean, &covariance())
+        });
         TargetEstimate { t_valid: t, frame, target, status, state }
+    }
+
+    /// One-sigma of the reference point's horizontal position relative to the helicopter, larger axis, metres:
+    /// `√λ(H P Hᵀ)` with H = [I, a (−sin ψ, cos ψ)ᵀ, −I] over place, heading and the helicopter's own place.
+    fn relative_sigma_m(&self, models: &Models, target: usize) -> f64 {
+        let (pose, own) = (self.layout().target(target).pose(), own::POSITION);
+        let columns = [pose.column(0), pose.column(1), pose.column(2), own.column(0), own.column(1)];
+        let p = SMatrix::<f64, 5, 5>::from_fn(|i, j| self.cov.at(columns[i], columns[j]));
+        let ahead = models.targets[target].reference_m;
+        let (s, c) = self.targets[target].mean[2].sin_cos();
+        let h = SMatrix::<f64, 2, 5>::new(1.0, 0.0, -ahead * s, -1.0, 0.0, 0.0, 1.0, ahead * c, 0.0, -1.0);
+        larger_sigma(&(h * p * h.transpose()))
     }
 
     /// The helicopter, at a frame where it is one's.
@@ -66,7 +82,9 @@ impl State {
         let place = models.frame.geodetic(&own.position);
         let blocks = [own::POSITION, own::VELOCITY, own::ATTITUDE];
         let column = |i: usize| blocks[i / 3].column(i % 3);
-        let cov = |i, j| self.cov.at(column(i), column(j));
+        // Where a source does not fit what is said of it, what it shows is less certain than the model has it.
+        let grown = self.told_factors().map(f64::sqrt);
+        let cov = |i, j| self.cov.at(column(i), column(j)) * grown[i / 3] * grown[j / 3];
         Ownship {
             t_valid: t,
             frame,
@@ -132,10 +150,14 @@ impl State {
         h.set_column(7, &(seen.d_point * Vector3::new(0.0, 1.0, slope_e)));
         h.set_column(8, &(seen.d_point * lever));
         let p = SMatrix::<f64, 9, 9>::from_fn(|i, j| self.cov.at(column(i), column(j)));
-        let s: nalgebra::Matrix2<f64> = h * p * h.transpose();
-        let (mean, half) = (0.5 * s.trace(), 0.5 * (s[(0, 0)] - s[(1, 1)]));
-        (mean + half.hypot(s[(0, 1)])).max(0.0).sqrt()
+        larger_sigma(&(h * p * h.transpose()))
     }
+}
+
+/// One-sigma along the larger axis of a covariance.
+fn larger_sigma(p: &Matrix2<f64>) -> f64 {
+    let (mean, half) = (0.5 * p.trace(), 0.5 * (p[(0, 0)] - p[(1, 1)]));
+    (mean + half.hypot(p[(0, 1)])).max(0.0).sqrt()
 }
 
 impl DelayedCopy {

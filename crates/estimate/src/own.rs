@@ -1,12 +1,15 @@
 //! The helicopter and its sensors' slow errors.
 //!
-//! A slow error more is a field of [`Own`], a block in `blocks.rs` and a row of [`SLOW`]: where it starts and how it
+//! A force or slow error more is a field of [`Own`], a block in `blocks.rs` and a row of [`SLOW`]: where it starts and how it
 //! wanders. Everything else (injection, prediction, start, warm start) goes by the table. The measurement models in
-//! `aid` that it explains take it from there.
+//! `aid` that it explains take it from there; what the forces do is in `force.rs`.
 
 use nalgebra::{Matrix3, Rotation3, Vector2, Vector3};
 
-use super::blocks::{Block, own};
+use windhover_base::msg::FixKind;
+
+use super::blocks::{Block, Layout, own};
+use super::fitted::Learnt;
 use super::models::Models;
 
 /// Standard gravity, m/s².
@@ -20,13 +23,71 @@ pub(crate) struct Own {
     pub(crate) velocity: Vector3<f64>,
     pub(crate) ned_from_body: Rotation3<f64>,
     pub(crate) rate: Vector3<f64>,
-    pub(crate) force: Vector3<f64>,
+    /// Force of gusts over mass, north and east, m/s².
+    pub(crate) gust: Vector2<f64>,
+    /// Vertical part of the thrust beyond the weight, m/s².
+    pub(crate) thrust: f64,
+    /// Slow error of the tilt reading (pitch, roll), rad.
+    pub(crate) tilt_error: Vector2<f64>,
+    /// Slow force of the wind over mass, north and east, m/s².
+    pub(crate) wind: Vector2<f64>,
+    /// The thrust's direction in the body is against (ε1, ε2, 1).
+    pub(crate) trim: Vector2<f64>,
     pub(crate) gps_bias: Vector3<f64>,
     pub(crate) heading_bias: f64,
     pub(crate) tilt_gain: f64,
     pub(crate) tilt_bias: Vector2<f64>,
     pub(crate) gps_delay_s: f64,
     pub(crate) drag_per_s: f64,
+    /// Of the gyros, rad/s, and of the accelerometers, m/s², body axes.
+    pub(crate) rate_bias: Vector3<f64>,
+    pub(crate) force_bias: Vector3<f64>,
+    /// Of the second source of attitude.
+    pub(crate) second: AttitudeErrors,
+}
+
+/// The two sources of attitude, where there are figures of both.
+pub(crate) const COMPASS: usize = 0;
+pub(crate) const SECOND: usize = 1;
+
+/// Where the errors of the compass and of the second source of attitude stand.
+pub(crate) const PLACES: [AttitudePlaces; 2] = [
+    AttitudePlaces {
+        heading_bias: own::HEADING_BIAS,
+        tilt_gain: own::TILT_GAIN,
+        tilt_bias: own::TILT_BIAS,
+        tilt_error: own::TILT_ERROR,
+    },
+    AttitudePlaces {
+        heading_bias: own::SECOND_HEADING_BIAS,
+        tilt_gain: own::SECOND_TILT_GAIN,
+        tilt_bias: own::SECOND_TILT_BIAS,
+        tilt_error: own::SECOND_TILT_ERROR,
+    },
+];
+
+/// Where the errors of a source of attitude stand.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct AttitudePlaces {
+    pub(crate) heading_bias: Block<1>,
+    pub(crate) tilt_gain: Block<1>,
+    pub(crate) tilt_bias: Block<2>,
+    pub(crate) tilt_error: Block<2>,
+}
+
+/// Errors of a source of attitude.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(crate) struct AttitudeErrors {
+    pub(crate) heading_bias: f64,
+    pub(crate) tilt_gain: f64,
+    pub(crate) tilt_bias: Vector2<f64>,
+    pub(crate) tilt_error: Vector2<f64>,
+}
+
+impl Default for AttitudeErrors {
+    fn default() -> Self {
+        Self { heading_bias: 0.0, tilt_gain: 1.0, tilt_bias: Vector2::zeros(), tilt_error: Vector2::zeros() }
+    }
 }
 
 impl Default for Own {
@@ -36,59 +97,123 @@ impl Default for Own {
             velocity: Vector3::zeros(),
             ned_from_body: Rotation3::identity(),
             rate: Vector3::zeros(),
-            force: Vector3::new(0.0, 0.0, -GRAVITY),
+            gust: Vector2::zeros(),
+            thrust: 0.0,
+            tilt_error: Vector2::zeros(),
+            wind: Vector2::zeros(),
+            trim: Vector2::zeros(),
             gps_bias: Vector3::zeros(),
             heading_bias: 0.0,
             tilt_gain: 1.0,
             tilt_bias: Vector2::zeros(),
             gps_delay_s: 0.0,
             drag_per_s: 0.0,
+            rate_bias: Vector3::zeros(),
+            force_bias: Vector3::zeros(),
+            second: AttitudeErrors::default(),
         }
     }
 }
 
-/// Number of slow states.
-pub(crate) const SLOW_STATES: usize = own::LEN - own::FORCE.end();
+/// Number of states that move by themselves, those of sensors that are not there counted.
+pub(crate) const SLOW_STATES: usize = own::SLOW.end() - own::SLOW.column(0);
+/// Number of those that outlive a restart.
+pub(crate) const SENSOR_STATES: usize = own::SENSORS.end() - own::SENSORS.column(0);
+/// Number of states whose intensities are fitted in flight.
+pub(crate) const MOTION_STATES: usize = own::MOTION.end() - own::MOTION.column(0);
+
+/// What the sensors are taken to be at present.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Senses {
+    /// Variance of the tilt reading's slow error, rad², and its correlation time, s, by what the sensor feels.
+    pub(crate) tilt_error_var: f64,
+    pub(crate) tilt_error_tau_s: f64,
+    /// Likewise of the second source of attitude.
+    pub(crate) second_error_var: f64,
+    pub(crate) second_error_tau_s: f64,
+    /// The quality of the receiver's fix, and by it the variances of its bias and its noise, m².
+    pub(crate) fix: FixKind,
+    pub(crate) gps_bias_var: [f64; 3],
+    pub(crate) gps_noise_var: f64,
+}
+
+/// What the walks depend on.
+#[derive(Clone, Copy)]
+pub(crate) struct Terms<'a> {
+    pub(crate) models: &'a Models,
+    pub(crate) learnt: &'a Learnt,
+    pub(crate) senses: &'a Senses,
+}
 
 /// How a slow state moves.
 enum Wander {
-    /// Not at all.
-    Constant,
     /// A random walk, units per √s.
     Walk(f64),
     /// Gauss–Markov about zero: correlation time, s. Its variance is that it starts with.
-    Reverts(fn(&Models) -> f64),
+    Reverts(fn(&Terms<'_>) -> f64),
 }
 
 /// A slow state of up to three components.
 struct Slow {
     first: usize,
     mean: for<'a> fn(&'a mut Own) -> &'a mut [f64],
-    start_var: fn(&Models) -> [f64; 3],
+    start_var: fn(&Terms<'_>) -> [f64; 3],
     wander: Wander,
 }
 
 /// The slow states in the order of their columns.
-const SLOW: [Slow; 6] = [
+const SLOW: [Slow; 17] = [
+    Slow {
+        first: place(own::GUST),
+        mean: |own| own.gust.as_mut_slice(),
+        start_var: |terms| [terms.learnt.gust_var; 3],
+        wander: Wander::Reverts(|terms| terms.models.tau.gust_s),
+    },
+    Slow {
+        first: place(own::THRUST),
+        mean: |own| std::slice::from_mut(&mut own.thrust),
+        start_var: |terms| [terms.learnt.thrust_var; 3],
+        wander: Wander::Reverts(|terms| terms.models.tau.thrust_s),
+    },
+    Slow {
+        first: place(own::TILT_ERROR),
+        mean: |own| own.tilt_error.as_mut_slice(),
+        start_var: |terms| [terms.learnt.tilt_error_var; 3],
+        wander: Wander::Reverts(|terms| terms.senses.tilt_error_tau_s),
+    },
+    Slow {
+        first: place(own::WIND),
+        mean: |own| own.wind.as_mut_slice(),
+        // 8 m/s of wind at a drag of 0.2 /s.
+        start_var: |_| [1.5f64.powi(2); 3],
+        wander: Wander::Walk(0.1),
+    },
+    Slow {
+        first: place(own::TRIM),
+        mean: |own| own.trim.as_mut_slice(),
+        // 3.5°: a tail rotor alone makes a helicopter hang by some degrees.
+        start_var: |_| [0.06f64.powi(2); 3],
+        wander: Wander::Walk(1e-4),
+    },
     Slow {
         first: place(own::GPS_BIAS),
         mean: |own| own.gps_bias.as_mut_slice(),
-        start_var: |models| models.gps_bias_var.into(),
-        wander: Wander::Reverts(|models| models.tau.gps_bias_s),
+        start_var: |terms| terms.senses.gps_bias_var,
+        wander: Wander::Reverts(|terms| terms.models.tau.gps_bias_s),
     },
     Slow {
         first: place(own::HEADING_BIAS),
         mean: |own| std::slice::from_mut(&mut own.heading_bias),
-        start_var: |models| [models.heading_bias_var; 3],
+        start_var: |terms| [terms.models.heading_bias_var[COMPASS]; 3],
         // A tenth of a degree over 100 s would be 2e-4.
         wander: Wander::Walk(3e-4),
     },
     Slow {
         first: place(own::TILT_GAIN),
         mean: |own| std::slice::from_mut(&mut own.tilt_gain),
-        // From a sensor that reads nothing to one that reads all.
-        start_var: |_| [0.5f64.powi(2); 3],
-        wander: Wander::Walk(0.005),
+        // It is one, or found out beside the filter (`kind.rs`).
+        start_var: |_| [0.0; 3],
+        wander: Wander::Walk(0.0),
     },
     Slow {
         first: place(own::TILT_BIAS),
@@ -100,17 +225,57 @@ const SLOW: [Slow; 6] = [
     Slow {
         first: place(own::GPS_DELAY),
         mean: |own| std::slice::from_mut(&mut own.gps_delay_s),
-        start_var: |models| [models.gps_delay_var; 3],
+        start_var: |terms| [terms.models.gps_delay_var; 3],
         wander: Wander::Walk(2e-4),
     },
     Slow {
         first: place(own::DRAG),
         mean: |own| std::slice::from_mut(&mut own.drag_per_s),
-        // Of a small helicopter 0.1 to 0.3 is usual.
-        start_var: |_| [0.2f64.powi(2); 3],
-        wander: Wander::Constant,
+        // About START_DRAG_PER_S.
+        start_var: |_| [0.1f64.powi(2); 3],
+        wander: Wander::Walk(1e-4),
+    },
+    Slow {
+        first: place(own::RATE_BIAS),
+        mean: |own| own.rate_bias.as_mut_slice(),
+        start_var: |terms| [terms.models.rate_bias_var; 3],
+        wander: Wander::Walk(1e-4),
+    },
+    Slow {
+        first: place(own::FORCE_BIAS),
+        mean: |own| own.force_bias.as_mut_slice(),
+        start_var: |terms| [terms.models.force_bias_var; 3],
+        // What vibration rectifies changes with the load.
+        wander: Wander::Walk(0.05),
+    },
+    Slow {
+        first: place(own::SECOND_HEADING_BIAS),
+        mean: |own| std::slice::from_mut(&mut own.second.heading_bias),
+        start_var: |terms| [terms.models.heading_bias_var[SECOND]; 3],
+        wander: Wander::Walk(3e-4),
+    },
+    Slow {
+        first: place(own::SECOND_TILT_GAIN),
+        mean: |own| std::slice::from_mut(&mut own.second.tilt_gain),
+        start_var: |_| [0.0; 3],
+        wander: Wander::Walk(0.0),
+    },
+    Slow {
+        first: place(own::SECOND_TILT_BIAS),
+        mean: |own| own.second.tilt_bias.as_mut_slice(),
+        start_var: |_| [0.007f64.powi(2); 3],
+        wander: Wander::Walk(3e-4),
+    },
+    Slow {
+        first: place(own::SECOND_TILT_ERROR),
+        mean: |own| own.second.tilt_error.as_mut_slice(),
+        start_var: |terms| [terms.senses.second_error_var; 3],
+        wander: Wander::Reverts(|terms| terms.senses.second_error_tau_s),
     },
 ];
+
+/// Drag at the start, 1/s: of a small rotorcraft 0.1 to 0.3 is usual, and every one has some.
+pub(crate) const START_DRAG_PER_S: f64 = 0.2;
 
 /// Where a block begins among the slow states.
 const fn place<const N: usize>(block: Block<N>) -> usize {
@@ -118,11 +283,6 @@ const fn place<const N: usize>(block: Block<N>) -> usize {
 }
 
 impl Own {
-    /// Acceleration in NED: `R f + g − c v`, where the drag of the wind is part of f.
-    pub(crate) fn acceleration(&self) -> Vector3<f64> {
-        self.ned_from_body * self.force + Vector3::new(0.0, 0.0, GRAVITY) - self.velocity * self.drag_per_s
-    }
-
     /// `ned_from_body` as a matrix.
     pub(crate) fn rotation(&self) -> &Matrix3<f64> {
         self.ned_from_body.matrix()
@@ -133,19 +293,34 @@ impl Own {
         self.velocity + self.ned_from_body * self.rate.cross(lever_m)
     }
 
-    /// Moves it by an error-state step.
-    pub(crate) fn inject(&mut self, dx: &[f64]) {
+    /// Errors of the compass (0) or of the second source of attitude (1).
+    pub(crate) fn errors_of(&self, source: usize) -> AttitudeErrors {
+        if source == SECOND {
+            return self.second;
+        }
+        let Self { heading_bias, tilt_gain, tilt_bias, tilt_error, .. } = *self;
+        AttitudeErrors { heading_bias, tilt_gain, tilt_bias, tilt_error }
+    }
+
+    /// The states of [`own::MOTION`] in the order of their columns.
+    pub(crate) fn motion(&self) -> [f64; MOTION_STATES] {
+        let (rate, gust, error) = (&self.rate, &self.gust, &self.tilt_error);
+        [rate.x, rate.y, rate.z, gust.x, gust.y, self.thrust, error.x, error.y]
+    }
+
+    /// Moves it by an error-state step, of which the helicopter's part has this layout.
+    pub(crate) fn inject(&mut self, dx: &[f64], layout: Layout) {
         self.position += own::POSITION.of(dx);
         self.velocity += own::VELOCITY.of(dx);
         self.ned_from_body = Rotation3::new(own::ATTITUDE.of(dx)) * self.ned_from_body;
         self.rate += own::RATE.of(dx);
-        self.force += own::FORCE.of(dx);
-        self.change_slow(|i, mean| *mean += dx[own::SLOW.column(i)]);
+        let slow = &dx[layout.slow()];
+        self.change_slow(|i, mean| *mean += slow.get(i).unwrap_or(&0.0));
     }
 
     /// Whether every mean is a number.
     pub(crate) fn is_finite(&self) -> bool {
-        let vectors = [&self.position, &self.velocity, &self.rate, &self.force];
+        let vectors = [&self.position, &self.velocity, &self.rate];
         vectors.iter().all(|v| v.iter().all(|x| x.is_finite()))
             && self.slow().iter().all(|x| x.is_finite())
             && self.rotation().iter().all(|x| x.is_finite())
@@ -166,33 +341,34 @@ impl Own {
     }
 }
 
-/// Variances that the slow states start with.
-pub(crate) fn slow_start_vars(models: &Models) -> [f64; SLOW_STATES] {
-    by_row(|slow| (slow.start_var)(models))
-}
+impl Terms<'_> {
+    /// Variances that the slow states start with.
+    pub(crate) fn start_vars(&self) -> [f64; SLOW_STATES] {
+        by_row(|slow| (slow.start_var)(self))
+    }
 
-/// Factors on the slow states' errors over a time: below one of those that revert.
-pub(crate) fn slow_decays(models: &Models, dt_s: f64) -> [f64; SLOW_STATES] {
-    by_row(|slow| [slow.decay(models, dt_s); 3])
-}
+    /// Factors on the slow states' errors over a time: below one of those that revert.
+    pub(crate) fn decays(&self, dt_s: f64) -> [f64; SLOW_STATES] {
+        by_row(|slow| [slow.decay(self, dt_s); 3])
+    }
 
-/// Variances that the slow states gain over a time.
-pub(crate) fn slow_growth(models: &Models, dt_s: f64) -> [f64; SLOW_STATES] {
-    by_row(|slow| match slow.wander {
-        Wander::Constant => [0.0; 3],
-        Wander::Walk(walk) => [walk.powi(2) * dt_s; 3],
-        Wander::Reverts(_) => {
-            let decay = slow.decay(models, dt_s);
-            (slow.start_var)(models).map(|var| var * (1.0 - decay * decay))
-        }
-    })
+    /// Variances that the slow states gain over a time.
+    pub(crate) fn growth(&self, dt_s: f64) -> [f64; SLOW_STATES] {
+        by_row(|slow| match slow.wander {
+            Wander::Walk(walk) => [walk.powi(2) * dt_s; 3],
+            Wander::Reverts(_) => {
+                let decay = slow.decay(self, dt_s);
+                (slow.start_var)(self).map(|var| var * (1.0 - decay * decay))
+            }
+        })
+    }
 }
 
 impl Slow {
-    fn decay(&self, models: &Models, dt_s: f64) -> f64 {
+    fn decay(&self, terms: &Terms<'_>, dt_s: f64) -> f64 {
         match self.wander {
-            Wander::Reverts(tau_s) => (-dt_s / tau_s(models)).exp(),
-            Wander::Constant | Wander::Walk(_) => 1.0,
+            Wander::Reverts(tau_s) => (-dt_s / tau_s(terms)).exp(),
+            Wander::Walk(_) => 1.0,
         }
     }
 }
@@ -220,7 +396,7 @@ mod tests {
             *mean = i as f64;
         });
         assert_eq!(places, (0..SLOW_STATES).collect::<Vec<_>>());
-        assert_eq!(own.drag_per_s, (SLOW_STATES - 1) as f64);
+        assert_eq!(own.second.tilt_error.y, (SLOW_STATES - 1) as f64);
         assert_eq!(own.slow()[place(own::GPS_DELAY)], own.gps_delay_s);
     }
 }

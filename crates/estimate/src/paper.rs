@@ -175,7 +175,9 @@ impl PaperEstimator {
             yaw_rate_radps: yaw_rate,
             lat_deg: place.lat_deg,
             lon_deg: place.lon_deg,
+            height_m: place.height_m,
             covariance: None,
+            relative_sigma_m: None,
         }
     }
 }

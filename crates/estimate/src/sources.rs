@@ -1,8 +1,10 @@
 //! What the filter takes, a row a source: the measurement in a form that is recycled, and the file that fuses it.
 
-use windhover_base::msg::{AttitudeSample, FrameObservations, GnssEpoch};
+use windhover_base::msg::{AttitudeSample, FrameObservations, GnssEpoch, InertialSample};
 use windhover_base::time::MonoTime;
 
+use super::aid::rate::Rate;
+use super::aid::specific_force::SpecificForce;
 use super::aid::{compass, gnss};
 use super::core::Core;
 
@@ -13,6 +15,8 @@ pub(crate) enum Kind {
     Nothing,
     Gnss,
     Attitude,
+    SecondAttitude,
+    Inertial,
     Frame,
 }
 
@@ -22,6 +26,8 @@ pub(crate) struct AnyMeasurement {
     pub(crate) kind: Kind,
     pub(crate) gnss: GnssEpoch,
     pub(crate) attitude: AttitudeSample,
+    /// A block, in body axes.
+    pub(crate) inertial: InertialSample,
     pub(crate) frame: FrameObservations,
 }
 
@@ -33,7 +39,13 @@ impl Default for AnyMeasurement {
             markers: Vec::with_capacity(ROOM),
             features: Vec::with_capacity(ROOM),
         };
-        Self { kind: Kind::Nothing, gnss: GnssEpoch::default(), attitude: AttitudeSample::default(), frame }
+        Self {
+            kind: Kind::Nothing,
+            gnss: GnssEpoch::default(),
+            attitude: AttitudeSample::default(),
+            inertial: InertialSample::default(),
+            frame,
+        }
     }
 }
 
@@ -48,8 +60,19 @@ impl Core {
             Kind::Nothing => {}
             Kind::Gnss => gnss::fuse(self, &measurement.gnss),
             Kind::Attitude => compass::fuse(self, &measurement.attitude),
+            Kind::SecondAttitude => compass::fuse_second(self, &measurement.attitude),
+            Kind::Inertial => self.fuse_inertial(&measurement.inertial),
             Kind::Frame => self.fuse_frame(&measurement.frame),
         }
         self.state.learn(&self.models, &self.learning);
+    }
+
+    fn fuse_inertial(&mut self, block: &InertialSample) {
+        if let Some(rate) = block.rate_rps {
+            Rate(rate).fuse(self);
+        }
+        if let Some(force) = block.force_mps2 {
+            SpecificForce(force).fuse(self);
+        }
     }
 }

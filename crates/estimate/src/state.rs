@@ -3,13 +3,15 @@
 
 use nalgebra::{Vector2, Vector3};
 
-use windhover_base::time::MonoTime;
+use windhover_base::time::{MonoTime, Span};
 
 use super::blocks::{Block, FEATURE, Layout, TARGET, own};
 use super::delayed::DelayedCopy;
+use super::fit::{Fit, WATCHED};
 use super::fitted::Learnt;
+use super::kind::TiltWatch;
 use super::matrix::Grid;
-use super::own::Own;
+use super::own::{Own, Senses};
 use super::standstill::Standstill;
 use super::track::Life;
 
@@ -17,6 +19,9 @@ use super::track::Life;
 /// as a prior it must say nothing of where that is: with 30 m each new ground feature said a little, and a
 /// thousand of them twice what the receiver does.
 pub(crate) const GUESSED_VAR: f64 = 1e5;
+
+/// For so long what a marker showed keeps the forces and the sensors' errors in place.
+const SEEN: Span = Span::from_ns(2_000_000_000);
 
 /// One vehicle: rear axle north, east, heading, speed, yaw rate, and its track.
 #[derive(Clone, Copy, Debug, Default)]
@@ -48,8 +53,10 @@ pub(crate) struct Rejections {
     /// Horizontal error of the receiver that the last fix implied, m.
     pub(crate) gps_error: Vector2<f64>,
     pub(crate) gps_velocity: u32,
-    pub(crate) heading: u32,
-    pub(crate) tilt: u32,
+    /// Of the compass and of the second source of attitude.
+    pub(crate) heading: [u32; 2],
+    pub(crate) tilt: [u32; 2],
+    pub(crate) rate: u32,
 }
 
 /// The whole filter state at one instant.
@@ -59,6 +66,8 @@ pub(crate) struct State {
     /// Whether the helicopter's own state is known.
     pub(crate) alive: bool,
     pub(crate) own: Own,
+    /// Columns of the helicopter's part.
+    pub(crate) own_columns: usize,
     pub(crate) targets: Vec<Target>,
     pub(crate) features: Vec<Feature>,
     pub(crate) cov: Grid,
@@ -67,21 +76,36 @@ pub(crate) struct State {
     /// Rates and forces as they were a moment ago, to fit their intensity from.
     pub(crate) past_motion: DelayedCopy,
     pub(crate) learnt: Learnt,
+    /// What the sensors are taken to be.
+    pub(crate) senses: Senses,
+    /// What the tilt sensors of the compass and of the second source of attitude are found to feel.
+    pub(crate) tilt: [TiltWatch; 2],
+    /// How the sources of own motion fit, by [`WATCHED`].
+    pub(crate) fits: [Fit; WATCHED.len()],
     pub(crate) rejections: Rejections,
     /// When the scene was last anchored anew, and by how much it moved.
     pub(crate) anchored: Option<(MonoTime, Vector3<f64>)>,
 }
 
 impl State {
-    pub(crate) fn new(layout: Layout, copies: usize, learnt: Learnt) -> Self {
+    pub(crate) fn new(
+        layout: Layout,
+        copies: usize,
+        learnt: Learnt,
+        senses: Senses,
+        tilt: [TiltWatch; 2],
+    ) -> Self {
         let n = layout.len();
         Self {
+            own_columns: layout.own,
             targets: vec![Target::default(); layout.targets],
             features: vec![Feature::default(); layout.features],
             cov: Grid::zeros(n, n),
             copies: vec![DelayedCopy::of_targets(layout); copies],
             past_motion: DelayedCopy::of_states(own::MOTION.range().len(), n),
             learnt,
+            senses,
+            tilt,
             ..Self::default()
         }
     }
@@ -96,6 +120,7 @@ impl State {
         self.past_motion.copy_from(&other.past_motion);
         self.rejections = other.rejections;
         self.anchored = other.anchored;
+        self.tilt = other.tilt;
     }
 
     /// Copies all but the delayed copies, to look ahead with; without allocating where the sizes match.
@@ -103,6 +128,9 @@ impl State {
         self.t = other.t;
         self.alive = other.alive;
         self.own = other.own;
+        self.own_columns = other.own_columns;
+        self.senses = other.senses;
+        self.fits = other.fits;
         self.targets.clone_from(&other.targets);
         self.features.clone_from(&other.features);
         self.cov.copy_from(&other.cov);
@@ -120,7 +148,7 @@ impl State {
 
     /// Which part lies where.
     pub(crate) fn layout(&self) -> Layout {
-        Layout { targets: self.targets.len(), features: self.features.len() }
+        Layout { own: self.own_columns, targets: self.targets.len(), features: self.features.len() }
     }
 
     /// Forgets some states and gives them variances of their own.
@@ -133,7 +161,7 @@ impl State {
     /// Moves the mean by an error-state step.
     pub(crate) fn inject(&mut self, dx: &[f64]) {
         let layout = self.layout();
-        self.own.inject(dx);
+        self.own.inject(dx, layout);
         let add = |mean: &mut [f64], step: &[f64]| mean.iter_mut().zip(step).for_each(|(x, d)| *x += d);
         for (i, target) in self.targets.iter_mut().enumerate() {
             add(&mut target.mean, &dx[layout.target(i).all().range()]);
@@ -147,14 +175,14 @@ impl State {
     ///
     /// What is seen of vehicles and ground says nothing of absolute heading: turning helicopter,
     /// velocity and everything seen about the vertical together changes no pixel. In error states
-    /// that direction is `(e_D × p̂, e_D × v̂, 1, e_D × f̂, …)`; it depends on the estimate, so an update
+    /// that direction is `(e_D × p̂, e_D × v̂, 1, e_D × d̂, …)`; it depends on the estimate, so an update
     /// that moves p̂ by Δ leaves the covariance with the old one, and the filter gains heading it never
     /// measured. Adding `e_D × Δ` times the heading error to each horizontal vector's error keeps the
     /// direction where it belongs (the error of an invariant filter, restricted to the vertical axis:
     /// Barrau and Bonnabel 2017).
     pub(crate) fn keep_heading_unobserved(&mut self, dx: &[f64]) {
         let turn = own::TURN.column(0);
-        let level: [Block<2>; 2] = [own::POSITION.part(0), own::VELOCITY.part(0)];
+        let level: [Block<2>; 4] = [own::POSITION.part(0), own::VELOCITY.part(0), own::WIND, own::GUST];
         for block in level.into_iter().chain(self.layout().places()) {
             let moved = block.of(dx);
             if moved.x == 0.0 && moved.y == 0.0 {
@@ -173,6 +201,12 @@ impl State {
                 }
             }
         }
+    }
+
+    /// Whether no marker has been seen for so long that own motion stands on GPS and compass alone (or on ground features,
+    /// which show no tilt by themselves).
+    pub(crate) fn is_blind(&self) -> bool {
+        !self.targets.iter().any(|target| target.life.is_held() && self.t - target.last_seen <= SEEN)
     }
 
     /// Whether every mean is a number and every variance a number not below zero.

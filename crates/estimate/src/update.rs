@@ -1,9 +1,15 @@
 //! One measurement into the state: gate, gain, mean, covariance, delayed copies.
+//!
+//! States may be held (consider states, Schmidt 1966): what is not known of them counts in the innovation's covariance
+//! and in what the others become, but the measurement does not move them. With the rows of the gain that belong to held
+//! states set to zero, Joseph's form leaves the part of the covariance between two held states as it is and gives every
+//! other part what the optimal update gives it.
 
 #![expect(clippy::needless_range_loop, reason = "matrix arithmetic reads by its indices")]
 
 use windhover_base::msg::Disposition;
 
+use super::blocks::{Block, own};
 use super::delayed::DelayedCopy;
 use super::matrix::{Grid, MAX_MEASURED, Small, axpy, cholesky, forward};
 use super::measurement::Measurement;
@@ -11,6 +17,32 @@ use super::state::State;
 
 /// Beyond this many times the gate a measurement is refused: no model error explains it.
 pub(crate) const REFUSE_RATIO: f64 = 50.0;
+
+/// States of the helicopter's part that a measurement does not move.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub(crate) struct Held(u64);
+
+const _: () = assert!(own::WITH_SECOND <= u64::BITS as usize);
+
+impl Held {
+    /// None: the measurement moves everything.
+    pub(crate) const NONE: Self = Self(0);
+
+    /// These and those of a block.
+    pub(crate) const fn and<const N: usize>(self, block: Block<N>) -> Self {
+        Self(self.0 | ((1 << N) - 1) << block.column(0))
+    }
+
+    /// Those of them that lie before a column.
+    pub(crate) const fn before(self, end: usize) -> Self {
+        Self(self.0 & ((1 << end) - 1))
+    }
+
+    /// Their columns.
+    pub(crate) fn columns(self) -> impl Iterator<Item = usize> {
+        (0..own::WITH_SECOND).filter(move |column| self.0 >> column & 1 == 1)
+    }
+}
 
 /// What became of a measurement.
 #[derive(Clone, Copy, Debug)]
@@ -33,17 +65,43 @@ pub(crate) struct Workspace {
     dx: Vec<f64>,
     /// `L⁻¹ H P_xc`, one entry a state of the delayed copy at hand.
     gains: Vec<[f64; MAX_MEASURED]>,
+    /// Covariance of the helicopter's part between held states, as it was before.
+    kept: Grid,
 }
 
 impl Workspace {
     pub(crate) fn new(n: usize) -> Self {
-        Self { whitened: Grid::zeros(MAX_MEASURED, n), dx: vec![0.0; n], gains: vec![[0.0; MAX_MEASURED]; n] }
+        Self {
+            whitened: Grid::zeros(MAX_MEASURED, n),
+            dx: vec![0.0; n],
+            gains: vec![[0.0; MAX_MEASURED]; n],
+            kept: Grid::zeros(own::WITH_SECOND, own::WITH_SECOND),
+        }
+    }
+
+    /// Normalised innovation squared over the gate, without fusing; `None` where it cannot be computed.
+    pub(crate) fn ratio(&mut self, state: &State, z: &Measurement, gate: f64) -> Option<f64> {
+        self.project(state, z);
+        let mut s = self.innovation_covariance(z);
+        if !z.is_finite() || !cholesky(&mut s, z.m) {
+            return None;
+        }
+        let mut white = z.residual;
+        forward(&s, z.m, &mut white);
+        Some(white[..z.m].iter().map(|x| x * x).sum::<f64>() / gate)
     }
 
     /// Fuses `z`. With a gate (a chi-square value) the noise of a measurement outside it is raised until
     /// its innovation lies on the gate (soft gate: `R ← R + (ratio − 1) S`, so its weight falls as
-    /// 1/ratio however uncertain the state is), and one absurdly far outside is refused.
-    pub(crate) fn fuse(&mut self, state: &mut State, z: &Measurement, gate: Option<f64>) -> Outcome {
+    /// 1/ratio however uncertain the state is), and one absurdly far outside is refused. States that are held do
+    /// not move.
+    pub(crate) fn fuse(
+        &mut self,
+        state: &mut State,
+        z: &Measurement,
+        gate: Option<f64>,
+        held: Held,
+    ) -> Outcome {
         let mut outcome = Outcome {
             disposition: Disposition::Invalid,
             ratio: f64::NAN,
@@ -55,13 +113,7 @@ impl Workspace {
         }
         let m = z.m;
         self.project(state, z);
-        let spread = self.spread(z);
-        let mut s = spread;
-        for i in 0..m {
-            for j in 0..m {
-                s[i][j] += z.noise[i][j];
-            }
-        }
+        let mut s = self.innovation_covariance(z);
         for i in 0..m {
             outcome.innovation_var[i] = s[i][i];
         }
@@ -85,8 +137,19 @@ impl Workspace {
             s.iter_mut().flatten().for_each(|x| *x *= root);
             white.iter_mut().for_each(|x| *x /= root);
         }
-        self.apply(state, z, &s, &white);
+        self.apply(state, z, &s, &white, held);
         outcome
+    }
+
+    /// `H P Hᵀ + R` of what [`Self::project`] left.
+    fn innovation_covariance(&self, z: &Measurement) -> Small {
+        let mut s = self.spread(z);
+        for i in 0..z.m {
+            for j in 0..z.m {
+                s[i][j] += z.noise[i][j];
+            }
+        }
+        s
     }
 
     /// `H P` into the workspace.
@@ -115,7 +178,14 @@ impl Workspace {
         s
     }
 
-    fn apply(&mut self, state: &mut State, z: &Measurement, l: &Small, white: &[f64; MAX_MEASURED]) {
+    fn apply(
+        &mut self,
+        state: &mut State,
+        z: &Measurement,
+        l: &Small,
+        white: &[f64; MAX_MEASURED],
+        held: Held,
+    ) {
         let m = z.m;
         for i in 0..m {
             for k in 0..i {
@@ -128,12 +198,19 @@ impl Workspace {
         for (i, white) in white[..m].iter().enumerate() {
             axpy(&mut self.dx, *white, self.whitened.row(i));
         }
+        for a in held.columns() {
+            self.dx[a] = 0.0;
+            held.columns().for_each(|b| self.kept.set(a, b, state.cov.at(a, b)));
+        }
         for r in 0..state.cov.rows() {
             let row = state.cov.row_mut(r);
             for i in 0..m {
                 let w = self.whitened.row(i);
                 axpy(row, -w[r], w);
             }
+        }
+        for a in held.columns() {
+            held.columns().for_each(|b| state.cov.set(a, b, self.kept.at(a, b)));
         }
         for copy in state.copies_in_use() {
             self.update_copy(copy, z, l, white);

@@ -71,6 +71,9 @@ pub(super) const DEVIATIONS: &[Deviation] = deviations![
         "stamps of frames are late", |s, v| s.camera.stamp_late_ms = v;
     Misfit "readout" = 25.0 "ms" (-60.0, 60.0) in "follow",
         "rolling shutter: from the first row's exposure to the last one's", |s, v| s.camera.readout_ms = v;
+    Condition "told-readout" = 25.0 "ms" (-60.0, 60.0) in "follow",
+        "rolling shutter that is configured",
+        |s, v| (s.camera.readout_ms, s.rig.camera.readout_ms) = (v, v);
     Absorbed "vibration" = 0.1 "deg" (0.0, 2.0) in "follow",
         "the camera shakes at 17 to 50 Hz, rms an axis", |s, v| s.camera.vibration_deg = v;
     Absorbed "gps-late" = 150.0 "ms" (-300.0, 500.0) in "follow",

@@ -32,10 +32,16 @@ pub fn geojson(vehicles: &[Vehicle]) -> String {
         let s = &vehicle.state;
         let (sigma_n, sigma_e) =
             sigmas_m(vehicle).map_or((Value::Null, Value::Null), |(n, e)| (json!(n), json!(e)));
+        // What is no position of now has none (RFC 7946, 3.2: an unlocated feature); the trail ends where it was.
+        let here = json!({"type": "Point", "coordinates": [s.lon_deg, s.lat_deg]});
+        let geometry = if vehicle.is_current() { here } else { Value::Null };
         features.push(json!({"type": "Feature", "id": format!("{}/{}", vehicle.payload, vehicle.target),
-            "geometry": {"type": "Point", "coordinates": [s.lon_deg, s.lat_deg]},
+            "geometry": geometry,
             "properties": {"payload": vehicle.payload, "target": vehicle.target,
-                "time_ms": host_time(s.timestamp.as_ref()).ns() / 1_000_000,
+                "status": vehicle.status, "age_s": vehicle.age.s(),
+                "utc": vehicle.utc.map(|utc| utc.to_string()),
+                "time_ms": vehicle.utc.map(|utc| utc.unix_ns() / 1_000_000),
+                "host_time_ms": host_time(s.timestamp.as_ref()).ns() / 1_000_000,
                 "heading_deg": heading_deg(vehicle), "speed_mps": s.speed_mps,
                 "yaw_rate_radps": s.yaw_rate_radps, "sigma_north_m": sigma_n, "sigma_east_m": sigma_e}}));
         let line: Vec<Value> = thinned(vehicle).map(|(lat, lon)| json!([lon, lat])).collect();
@@ -68,18 +74,8 @@ pub fn kml(vehicles: &[Vehicle]) -> String {
          <name>windhover</name>",
     );
     for vehicle in vehicles {
-        let s = &vehicle.state;
         let name = escaped(&format!("{} ({})", vehicle.target, vehicle.payload));
-        out += &format!(
-            "<Placemark><name>{name}</name><description>{:.2} m/s, {:.0}°</description><Style><IconStyle>\
-             <color>ff0f48d9</color><heading>{:.1}</heading></IconStyle></Style><Point><coordinates>\
-             {:.9},{:.9},0</coordinates></Point></Placemark>",
-            s.speed_mps,
-            heading_deg(vehicle),
-            heading_deg(vehicle),
-            s.lon_deg,
-            s.lat_deg
-        );
+        out += &if vehicle.is_current() { placemark(vehicle, &name) } else { last_known(vehicle, &name) };
         let line: Vec<String> = thinned(vehicle).map(|(lat, lon)| format!("{lon:.9},{lat:.9},0")).collect();
         if line.len() > 1 {
             out += &format!(
@@ -91,6 +87,32 @@ pub fn kml(vehicles: &[Vehicle]) -> String {
         }
     }
     out + "</Document></kml>\n"
+}
+
+/// A vehicle where it is now, turned to its heading; one that is only predicted is orange.
+fn placemark(vehicle: &Vehicle, name: &str) -> String {
+    let (s, heading) = (&vehicle.state, heading_deg(vehicle));
+    let colour = if vehicle.status == "tracking" { "ff0f48d9" } else { "ff00a5ff" };
+    format!(
+        "<Placemark><name>{name}</name><description>{}, {:.1} s old{}: {:.2} m/s, {heading:.0}°</description><Style>\
+         <IconStyle><color>{colour}</color><heading>{heading:.1}</heading></IconStyle></Style><Point><coordinates>\
+         {:.9},{:.9},0</coordinates></Point></Placemark>",
+        vehicle.status,
+        vehicle.age.s(),
+        vehicle.utc.map_or(String::new(), |utc| format!(", at {utc}")),
+        s.speed_mps,
+        s.lon_deg,
+        s.lat_deg
+    )
+}
+
+/// A vehicle that is lost: in the list with its age, and nowhere on the map; its trail ends where it was.
+fn last_known(vehicle: &Vehicle, name: &str) -> String {
+    format!(
+        "<Placemark><name>{name}: {}, last known {:.0} s ago</name></Placemark>",
+        vehicle.status,
+        vehicle.age.s()
+    )
 }
 
 /// A sentence with its checksum.
@@ -108,24 +130,29 @@ fn angle(degrees: f64, width: usize, hemispheres: [char; 2]) -> String {
     format!("{whole:0width$}{:02}.{:06},{hemisphere}", rest / 1_000_000, rest % 1_000_000)
 }
 
-/// RMC and GGA of a vehicle. Altitude stays empty: the link carries heights above the ellipsoid, and GGA
-/// wants mean sea level.
+/// RMC and GGA of a vehicle. One that is predicted is "estimated" (mode E, quality 6), whose data are not valid by
+/// NMEA 0183; one that is lost has neither position nor time. Time and date stay empty where UTC is not known. Altitude
+/// stays empty: the link carries heights above the ellipsoid, and GGA wants mean sea level.
 pub fn nmea(vehicle: &Vehicle) -> String {
     let s = &vehicle.state;
-    let (time, date) = nmea_time(host_time(s.timestamp.as_ref()));
+    if !vehicle.is_current() {
+        return sentence("GPRMC,,V,,,,,,,,,,N") + &sentence("GPGGA,,,,,,0,,,,M,,M,,");
+    }
+    let (time, date) = nmea_time(vehicle.utc);
     let (lat, lon) = (angle(s.lat_deg, 2, ['N', 'S']), angle(s.lon_deg, 3, ['E', 'W']));
     // Course over ground: of a vehicle that reverses, the way it goes.
     let course = if s.speed_mps < 0.0 { heading_deg(vehicle) + 180.0 } else { heading_deg(vehicle) } % 360.0;
     let knots = s.speed_mps.abs() * KNOTS;
-    let rmc = sentence(&format!("GPRMC,{time},A,{lat},{lon},{knots:.2},{course:.1},{date},,,A"));
-    rmc + &sentence(&format!("GPGGA,{time},{lat},{lon},1,,,,M,,M,,"))
+    let (valid, mode, quality) = if vehicle.status == "tracking" { ('A', 'A', 1) } else { ('V', 'E', 6) };
+    let rmc = sentence(&format!("GPRMC,{time},{valid},{lat},{lon},{knots:.2},{course:.1},{date},,,{mode}"));
+    rmc + &sentence(&format!("GPGGA,{time},{lat},{lon},{quality},,,,M,,M,,"))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::io::proto::{timestamp, windhover as wh};
-    use windhover_base::time::MonoTime;
+    use windhover_base::time::{MonoTime, Span, UtcTime};
 
     fn vehicle() -> Vehicle {
         let t = MonoTime::from_ns(1_795_046_445_250_000_000);
@@ -142,6 +169,9 @@ mod tests {
                 lon_deg: -85.5,
                 ..Default::default()
             },
+            status: "tracking",
+            age: Span::from_ms(70.0),
+            utc: Some(UtcTime::from_unix_ns(t.ns())),
             trail: vec![(t, 30.0, -85.0), (t, 30.1, -85.1)],
         }
     }
@@ -159,6 +189,37 @@ mod tests {
                 other => panic!("{other:?}"),
             }
         }
+    }
+
+    #[test]
+    fn what_is_predicted_is_no_fix_and_what_is_lost_no_position() {
+        let coasting = Vehicle { status: "coasting", ..vehicle() };
+        let text = nmea(&coasting);
+        assert!(
+            text.starts_with("$GPRMC,000045.25,V,3100.000000,N,08530.000000,W,3.89,270.0,191126,,,E*"),
+            "{text}"
+        );
+        assert!(text.contains("GPGGA,000045.25,3100.000000,N,08530.000000,W,6,"), "{text}");
+        let lost = Vehicle { status: "lost", age: Span::from_s(35.2), ..vehicle() };
+        assert_eq!(nmea(&lost), "$GPRMC,,V,,,,,,,,,,N*53\r\n$GPGGA,,,,,,0,,,,M,,M,,*66\r\n");
+        let parsed: Value = serde_json::from_str(&geojson(std::slice::from_ref(&lost))).expect("JSON");
+        assert_eq!(parsed["features"][0]["geometry"], Value::Null);
+        assert_eq!(parsed["features"][0]["properties"]["status"], json!("lost"));
+        assert_eq!(parsed["features"][0]["properties"]["age_s"], json!(35.2));
+        let kml = kml(&[lost]);
+        assert!(!kml.contains("<Point>") && kml.contains("ugv (a&lt;b): lost, last known 35 s ago"), "{kml}");
+    }
+
+    #[test]
+    fn utc_is_said_where_the_receiver_told_it_and_nowhere_else() {
+        let unset = Vehicle { utc: None, ..vehicle() };
+        assert!(nmea(&unset).starts_with("$GPRMC,,A,3100.000000,N,08530.000000,W,3.89,270.0,,,,A*"));
+        let parsed: Value = serde_json::from_str(&geojson(&[unset])).expect("JSON");
+        let properties = &parsed["features"][0]["properties"];
+        assert_eq!((&properties["utc"], &properties["time_ms"]), (&Value::Null, &Value::Null));
+        assert_eq!(properties["host_time_ms"], json!(1_795_046_445_250_i64));
+        let parsed: Value = serde_json::from_str(&geojson(&[vehicle()])).expect("JSON");
+        assert_eq!(parsed["features"][0]["properties"]["utc"], json!("2026-11-19T00:00:45.250Z"));
     }
 
     #[test]

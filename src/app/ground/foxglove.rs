@@ -7,7 +7,6 @@
 //! viewer of the present takes the latest message for the newest.
 
 use std::collections::{BTreeMap, HashMap};
-use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use axum::Router;
@@ -23,10 +22,12 @@ use prost::Message as _;
 use serde_json::{Value, json};
 use tokio::sync::broadcast;
 
+use super::door::Door;
 use super::web::{query_token, same};
 use crate::io::link::{Arrival, Class, downlink_class};
 use crate::io::proto::link::Thumbnail;
 use crate::io::proto::{foxglove as fox, schema_of_package, timestamp, windhover as wh};
+use crate::io::records::topic;
 use windhover_base::time::MonoTime;
 
 /// Names of the protocol that clients ask for.
@@ -104,13 +105,19 @@ impl Scope {
         if !arrival.live && comes_live && !is_kept(&channel.topic) {
             return;
         }
-        let topic = format!("/{}{}", arrival.payload, channel.topic);
-        self.say(&topic, &channel.schema_name, &channel.schema, arrival.publish_time, &arrival.data);
-        let is_state = channel.schema_name == "windhover.TargetState" && channel.topic.ends_with("/state");
+        let name = format!("/{}{}", arrival.payload, channel.topic);
+        self.say(&name, &channel.schema_name, &channel.schema, arrival.publish_time, &arrival.data);
+        let is_state = channel.schema_name == "windhover.TargetState" && topic::is_target_now(&channel.topic);
         let state = is_state.then(|| wh::TargetState::decode(&arrival.data[..]).ok()).flatten();
         if let Some(fix) = state.as_ref().and_then(location) {
-            let topic = format!("{}/location", topic.trim_end_matches("/state"));
-            self.say(&topic, "foxglove.LocationFix", &[], arrival.publish_time, &fix.encode_to_vec());
+            let target = name.rsplit_once('/').map_or(&*name, |(target, _)| target);
+            self.say(
+                &format!("{target}/location"),
+                "foxglove.LocationFix",
+                &[],
+                arrival.publish_time,
+                &fix.encode_to_vec(),
+            );
         }
     }
 
@@ -374,7 +381,7 @@ pub async fn serve(listener: tokio::net::TcpListener, server: Server) -> std::io
         .route("/", get(upgrade))
         .layer(axum::middleware::from_fn_with_state(server.clone(), guard))
         .with_state(server);
-    axum::serve(listener, router.into_make_service_with_connect_info::<SocketAddr>()).await
+    axum::serve(Door::new(listener, "foxglove"), router).await
 }
 
 #[cfg(test)]

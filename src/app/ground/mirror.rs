@@ -10,14 +10,20 @@ use std::path::{Path, PathBuf};
 
 use mcap::records::MessageHeader;
 use mcap::{Compression, WriteOptions};
+use prost::Message as _;
 
 use crate::io::link::{Arrival, Channel, RangeSet};
 use crate::io::mcap_read::{McapReader, RawMessage};
-use crate::io::proto::schema_of_package;
+use crate::io::proto::{schema_of_package, windhover as wh};
+use crate::io::store::flight::is_flight_name;
 use windhover_base::time::MonoTime;
 
 /// File in a flight's directory that tells which run it is of.
 pub(super) const RUN_FILE: &str = "run";
+/// The word of health messages that names the flight on the payload's card.
+const FLIGHT_WORD: &str = "flight";
+/// How the name of a flight without a date begins.
+const UNDATED: &str = "boot-";
 /// A segment ends at this many bytes of messages.
 const SEGMENT_BYTES: u64 = 64 << 20;
 
@@ -87,6 +93,11 @@ impl Mirror {
             self.open.insert(key.clone(), Segment::create(&dir, arrival.run)?);
         }
         let segment = self.open.get_mut(&key).expect("inserted above when it was not there");
+        if arrival.channel.schema_name == "windhover.Health"
+            && let Some(name) = dated_name(&arrival.data)
+        {
+            segment.rename_flight(&name)?;
+        }
         segment.write(arrival)
     }
 
@@ -121,7 +132,32 @@ impl Mirror {
     }
 }
 
+/// The name that the payload gave its flight since it knows the date, as its health tells it.
+fn dated_name(health: &[u8]) -> Option<String> {
+    let health = wh::Health::decode(health).ok()?;
+    let name = health.words.get(FLIGHT_WORD)?;
+    // A name of somebody else's making becomes a directory here: only a flight's is one.
+    (is_flight_name(name) && !name.starts_with(UNDATED)).then(|| name.clone())
+}
+
 impl Segment {
+    /// A flight that began without a date gets its name as it has on the card; one that has a date keeps it.
+    fn rename_flight(&mut self, name: &str) -> Result<(), MirrorError> {
+        let (Some(dir), Some(file)) = (self.path.parent().map(Path::to_owned), self.path.file_name()) else {
+            return Ok(());
+        };
+        let undated =
+            dir.file_name().is_some_and(|dir| dir.as_encoded_bytes().starts_with(UNDATED.as_bytes()));
+        let Some(payload) = dir.parent().filter(|_| undated) else { return Ok(()) };
+        let names = std::iter::once(name.to_owned()).chain((2..).map(|n| format!("{name}-{n}")));
+        let mut free = names.map(|name| payload.join(name)).filter(|dir| !dir.exists());
+        let dated = free.next().expect("some number is free");
+        std::fs::rename(&dir, &dated).map_err(io_error(&dir))?;
+        File::open(payload).and_then(|d| d.sync_all()).map_err(io_error(payload))?;
+        self.path = dated.join(file);
+        Ok(())
+    }
+
     fn create(dir: &Path, run: u32) -> Result<Self, MirrorError> {
         std::fs::create_dir_all(dir).map_err(io_error(dir))?;
         let run_file = dir.join(RUN_FILE);
@@ -207,9 +243,18 @@ pub(super) fn segments(dir: &Path) -> Vec<PathBuf> {
     files
 }
 
-/// The directory of a run: named after its flight, with -2, -3, … where another run has that name already.
+/// The directory of a run: the one that has it, whatever its name has become; else named after its flight, with -2, -3, …
+/// where another run has that name already.
 fn flight_dir(root: &Path, payload: &str, flight: &str, run: u32) -> PathBuf {
     let payload = root.join(payload);
+    let entries = std::fs::read_dir(&payload).into_iter().flatten().flatten();
+    let has_run = |dir: &PathBuf| {
+        let text = std::fs::read_to_string(dir.join(RUN_FILE));
+        text.is_ok_and(|text| text.trim() == format!("{run:08x}"))
+    };
+    if let Some(dir) = entries.map(|entry| entry.path()).find(has_run) {
+        return dir;
+    }
     let names = std::iter::once(flight.to_owned()).chain((2..).map(|n| format!("{flight}-{n}")));
     let of_run = |dir: &PathBuf| match std::fs::read_to_string(dir.join(RUN_FILE)) {
         Ok(text) => text.trim() == format!("{run:08x}"),
@@ -239,6 +284,38 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
+
+    #[test]
+    fn a_flight_gets_the_date_that_it_has_on_the_card() {
+        let dir = tempfile::tempdir().expect("a temporary directory");
+        let mut mirror = Mirror::at(dir.path()).expect("a mirror");
+        mirror.keep(&arrival(7, 0)).expect("kept");
+        // Names that are no flight's become no directory, whoever says them.
+        for name in ["boot-1", "../../elsewhere", "20261118T150405Z"] {
+            let words = [(FLIGHT_WORD.to_owned(), name.to_owned())].into();
+            let data = wh::Health { words, ..Default::default() }.encode_to_vec();
+            let channel = Channel {
+                topic: "/health".into(),
+                schema_name: "windhover.Health".into(),
+                schema: Vec::new(),
+            };
+            let health = Arrival { channel: Arc::new(channel), data, ..arrival(7, 1) };
+            mirror.keep(&health).expect("kept");
+        }
+        mirror.keep(&arrival(7, 2)).expect("kept");
+        mirror.finish().expect("finished");
+        let names: Vec<_> = std::fs::read_dir(dir.path().join("alpha"))
+            .expect("a directory")
+            .map(|entry| entry.expect("an entry").file_name())
+            .collect();
+        assert_eq!(names, ["20261118T150405Z"]);
+        // The payload goes on calling it by the name it began with.
+        assert_eq!(recall(dir.path(), "alpha", "boot-1", 7).len(), 3);
+        let mut again = Mirror::at(dir.path()).expect("a mirror");
+        again.keep(&arrival(7, 3)).expect("kept");
+        again.finish().expect("finished");
+        assert_eq!(segments(&dir.path().join("alpha/20261118T150405Z")).len(), 2);
+    }
 
     fn arrival(run: u32, number: u32) -> Arrival {
         Arrival {

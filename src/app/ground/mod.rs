@@ -7,13 +7,16 @@
 //!                                 └─► one line a second per payload
 //! ```
 
+mod door;
 mod feeds;
 #[cfg(feature = "zenoh")]
 pub mod fleet;
 pub mod foxglove;
+mod freshness;
 #[cfg(feature = "zenoh")]
 mod history;
 pub mod mirror;
+mod nmea_port;
 mod terminal;
 pub mod view;
 pub mod web;
@@ -23,7 +26,6 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use tokio::io::AsyncWriteExt as _;
 use tokio::sync::{broadcast, mpsc, watch};
 
 use crate::app::events::OperatorEvent;
@@ -31,6 +33,7 @@ use crate::io::clock::HostClock;
 use crate::io::link::{
     Arrival, FromPayload, LinkError, LinkEvent, StationHandle, StationLink, StationSettings,
 };
+use door::Door;
 use foxglove::Scope;
 use mirror::{Mirror, MirrorError};
 use terminal::Terminal;
@@ -43,8 +46,6 @@ const PAGE_QUEUE: usize = 4_096;
 const DISK_QUEUE: usize = 16_384;
 /// What is received reaches the disk this often.
 const SYNC: Duration = Duration::from_secs(1);
-/// NMEA sentences at most this often.
-const NMEA_EVERY: Duration = Duration::from_millis(200);
 
 /// What a station is made of.
 #[derive(Clone, Debug)]
@@ -177,7 +178,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     if let Some(address) = settings.nmea {
         let listener = listen(address).await?;
         terminal.line(format_args!("NMEA at tcp://{}", listener.local_addr()?));
-        tasks.spawn(serve_nmea(listener, Arc::clone(&view)));
+        tasks.spawn(nmea_port::serve(Door::new(listener, "nmea"), Arc::clone(&view)));
     }
     let (to_disk, from_link) = std::sync::mpsc::sync_channel(DISK_QUEUE);
     let (failed, mut failure) = mpsc::channel(1);
@@ -334,11 +335,12 @@ async fn report(
     loop {
         tick.tick().await;
         let status = handle.status();
-        let passed = std::mem::replace(&mut last, tokio::time::Instant::now()).elapsed().as_secs_f64();
+        let now = tokio::time::Instant::now();
+        let passed = (now - std::mem::replace(&mut last, now)).as_secs_f64();
         let (message, lines) = {
             let mut view = lock(&view);
-            let message = view.link(&status, passed);
-            (message, status.iter().map(|s| view.line(s)).collect::<Vec<_>>())
+            let message = view.link(&status, passed, now);
+            (message, status.iter().map(|s| view.line(s, now)).collect::<Vec<_>>())
         };
         let _ = live.send(message);
         terminal.status(&lines);
@@ -373,46 +375,4 @@ async fn tell(
         }
     }
     Ok(())
-}
-
-/// RMC and GGA of every vehicle whose state is new, to every client.
-async fn serve_nmea(listener: tokio::net::TcpListener, view: Arc<Mutex<View>>) -> std::io::Result<()> {
-    let sentences = broadcast::Sender::<Arc<str>>::new(64);
-    let source = sentences.clone();
-    let produce = async move {
-        let mut told = std::collections::BTreeMap::new();
-        loop {
-            tokio::time::sleep(NMEA_EVERY).await;
-            for vehicle in lock(&view).vehicles() {
-                let key = (vehicle.payload.clone(), vehicle.target.clone());
-                let t = vehicle.state.timestamp;
-                if told.insert(key, t) != Some(t) {
-                    let _ = source.send(feeds::nmea(&vehicle).into());
-                }
-            }
-        }
-    };
-    let accept = async move {
-        loop {
-            let (mut client, _) = listener.accept().await?;
-            let mut news = sentences.subscribe();
-            tokio::spawn(async move {
-                loop {
-                    match news.recv().await {
-                        Ok(text) => {
-                            if client.write_all(text.as_bytes()).await.is_err() {
-                                return;
-                            }
-                        }
-                        Err(broadcast::error::RecvError::Lagged(_)) => {}
-                        Err(broadcast::error::RecvError::Closed) => return,
-                    }
-                }
-            });
-        }
-    };
-    tokio::select! {
-        () = produce => Ok(()),
-        outcome = accept => outcome,
-    }
 }

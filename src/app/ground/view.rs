@@ -5,11 +5,15 @@ use std::sync::Arc;
 
 use prost::Message as _;
 use serde_json::{Value, json};
+use tokio::time::Instant;
 
 use crate::io::link::{Arrival, PayloadStatus};
 use crate::io::proto::{foxglove, host_time, link::Thumbnail, windhover as wh};
+use crate::io::records::topic;
 use windhover_base::geo::euler_321;
-use windhover_base::time::{MonoTime, NS_PER_S};
+use windhover_base::time::{MonoTime, NS_PER_S, Span, UtcTime};
+
+use super::freshness::{PayloadClock, status_at};
 
 /// Estimates kept for pages opened later: ten minutes at 15 Hz.
 const TRAIL: usize = 9_000;
@@ -25,8 +29,21 @@ pub struct Vehicle {
     pub target: String,
     /// Its latest known state.
     pub state: wh::TargetState,
+    /// What the payload holds of it now.
+    pub status: &'static str,
+    /// How old that state is.
+    pub age: Span,
+    /// UTC of that state, where the payload's receiver told it.
+    pub utc: Option<UtcTime>,
     /// Latitude and longitude over time, oldest first.
     pub trail: Vec<(MonoTime, f64, f64)>,
+}
+
+impl Vehicle {
+    /// Whether its state is a position of now; else it is the last place known, and says nothing of where it is.
+    pub fn is_current(&self) -> bool {
+        self.status != "lost"
+    }
 }
 
 #[derive(Default)]
@@ -45,6 +62,7 @@ struct Payload {
     datum: Option<Arc<str>>,
     notices: VecDeque<Arc<str>>,
     thumbnail: Option<(Arc<str>, Arc<[u8]>)>,
+    clock: PayloadClock,
     live: (u64, u64),
     live_hz: f64,
     kbps: f64,
@@ -54,19 +72,17 @@ struct Payload {
 #[derive(Default)]
 pub struct View {
     payloads: BTreeMap<String, Payload>,
+    /// How the link did when that was last told.
+    link: Option<Arc<str>>,
 }
 
 fn ms(t: MonoTime) -> f64 {
     t.ns() as f64 * 1e-6
 }
 
-fn status_name(status: i32) -> &'static str {
-    match wh::TrackStatus::try_from(status) {
-        Ok(wh::TrackStatus::Acquiring) => "acquiring",
-        Ok(wh::TrackStatus::Tracking) => "tracking",
-        Ok(wh::TrackStatus::Coasting) => "coasting",
-        Ok(wh::TrackStatus::Lost) | Err(_) => "lost",
-    }
+/// The name of a state's status at an age.
+fn status_name(state: &wh::TargetState, age: Span) -> &'static str {
+    status_at(state.status(), age)
 }
 
 /// (nn, ne, ee, hh, vv, ww) of the covariance's upper triangle; `null` without one.
@@ -82,10 +98,11 @@ impl View {
     pub fn record(&mut self, arrival: &Arrival) -> Option<Arc<str>> {
         let name = arrival.payload.to_string();
         let payload = self.payloads.entry(name.clone()).or_default();
+        payload.clock.heard(arrival.publish_time, arrival.arrived);
         let data = &arrival.data[..];
         match arrival.channel.schema_name.as_str() {
             // The smoother's and the paper's states have schemas of the same name and other topics.
-            "windhover.TargetState" if arrival.channel.topic.ends_with("/state") => {
+            "windhover.TargetState" if topic::is_target_now(&arrival.channel.topic) => {
                 payload.estimate(&name, wh::TargetState::decode(data).ok()?, arrival.live)
             }
             "windhover.Ownship" => payload.ownship(&name, &wh::Ownship::decode(data).ok()?),
@@ -128,7 +145,7 @@ impl View {
     }
 
     /// Takes how the link does; gives the message for the pages. `passed_s` is the time since the last call.
-    pub fn link(&mut self, status: &[PayloadStatus], passed_s: f64) -> Arc<str> {
+    pub fn link(&mut self, status: &[PayloadStatus], passed_s: f64, now: Instant) -> Arc<str> {
         let payloads: Vec<Value> = status
             .iter()
             .map(|s| {
@@ -138,14 +155,17 @@ impl View {
                 payload.live_hz = grown(s.live, payload.live.0) / passed_s.max(0.1);
                 payload.kbps = grown(s.bytes, payload.live.1) * 8e-3 / passed_s.max(0.1);
                 payload.live = (s.live, s.bytes);
-                json!({"name": s.name, "up": s.connected, "address": s.address.to_string(),
+                let (at, utc_ms) = (payload.clock.at(now).map(ms), payload.clock.utc_minus_host_ms());
+                json!({"name": s.name, "up": s.connected, "now": at, "utc_ms": utc_ms, "address": s.address.to_string(),
                     "rtt_ms": s.rtt_ms, "silent_ms": s.silent.as_millis() as u64, "software": s.software,
                     "received": s.progress.received, "missing": s.progress.missing,
                     "overdue": s.progress.overdue,
                     "gone": s.progress.gone, "live_hz": payload.live_hz, "kbps": payload.kbps})
             })
             .collect();
-        json!({"k": "link", "payloads": payloads}).to_string().into()
+        let text: Arc<str> = json!({"k": "link", "payloads": payloads}).to_string().into();
+        self.link = Some(Arc::clone(&text));
+        text
     }
 
     /// Takes something the station itself has to tell about a payload.
@@ -166,18 +186,25 @@ impl View {
             all.extend(payload.notices.iter().cloned());
             all.extend(payload.thumbnail.iter().map(|(text, _)| Arc::clone(text)));
         }
+        // Last: it tells how old all the rest is.
+        all.extend(self.link.clone());
         all
     }
 
-    /// Every vehicle whose position was ever known.
-    pub fn vehicles(&self) -> Vec<Vehicle> {
+    /// Every vehicle whose position was ever known, as it is now.
+    pub fn vehicles(&self, now: Instant) -> Vec<Vehicle> {
         let of = |(payload, p): (&String, &Payload)| -> Vec<Vehicle> {
             let known = |(target, t): (&String, &Target)| {
                 let places = t.places.iter();
+                let (state, latest) = (t.known.clone()?, t.latest.as_ref()?);
+                let at = |state: &wh::TargetState| host_time(state.timestamp.as_ref());
                 Some(Vehicle {
                     payload: payload.clone(),
                     target: target.clone(),
-                    state: t.known.clone()?,
+                    status: status_name(latest, p.clock.age(at(latest), now)),
+                    age: p.clock.age(at(&state), now),
+                    utc: p.clock.utc(at(&state)),
+                    state,
                     trail: places.map(|(ns, (lat, lon))| (MonoTime::from_ns(*ns), *lat, *lon)).collect(),
                 })
             };
@@ -187,7 +214,7 @@ impl View {
     }
 
     /// One line a payload, for a terminal.
-    pub fn line(&self, status: &PayloadStatus) -> String {
+    pub fn line(&self, status: &PayloadStatus, now: Instant) -> String {
         let payload = self.payloads.get(&status.name);
         let link = match (status.connected, status.silent.as_secs_f64()) {
             (false, _) => "down".to_owned(),
@@ -197,8 +224,14 @@ impl View {
         let mut line = format!("{:12} {link:10}", status.name);
         for (name, target) in payload.iter().flat_map(|p| &p.targets) {
             let Some(latest) = &target.latest else { continue };
-            line += &format!(" {name} {}", status_name(latest.status));
-            if latest.known {
+            let age_of = |state: &wh::TargetState| {
+                payload.map_or(Span::ZERO, |p| p.clock.age(host_time(state.timestamp.as_ref()), now))
+            };
+            let shown = status_name(latest, age_of(latest));
+            line += &format!(" {name} {shown}");
+            if let ("lost", Some(known)) = (shown, &target.known) {
+                line += &format!(", last known {:.0} s ago", age_of(known).s());
+            } else if latest.known {
                 line += &format!(
                     " N {:.2} E {:.2} m, {:.0}°, {:.2} m/s, {:.1}°/s",
                     latest.north_m,
@@ -227,7 +260,7 @@ impl Payload {
         let t = host_time(state.timestamp.as_ref());
         let target = self.targets.entry(state.target.clone()).or_default();
         let mut message = json!({"k": "est", "p": name, "target": state.target, "t": ms(t),
-            "status": status_name(state.status), "live": live});
+            "status": status_name(&state, Span::ZERO), "live": live});
         if state.known {
             let figures = json!({"lat": state.lat_deg, "lon": state.lon_deg, "n": state.north_m,
                 "e": state.east_m, "h": state.heading_rad, "v": state.speed_mps,
@@ -277,6 +310,9 @@ impl Payload {
 
     fn health(&mut self, name: &str, health: &wh::Health) -> Option<Arc<str>> {
         let t = host_time(health.timestamp.as_ref());
+        if let Some(ahead_ns) = health.utc_minus_host_ns {
+            self.clock.told_utc(Span::from_ns(ahead_ns));
+        }
         let sources: Vec<Value> = health
             .sources
             .iter()
@@ -320,13 +356,110 @@ impl Payload {
     }
 }
 
-/// UTC of a host time as `hhmmss.ss` and `ddmmyy`: host time is close to UTC where the payload's clock was
-/// set.
-pub fn nmea_time(t: MonoTime) -> (String, String) {
-    let civil = windhover_base::time::UtcTime::from_unix_ns(t.ns()).civil();
+/// UTC as `hhmmss.ss` and `ddmmyy`; empty where it is not known.
+pub fn nmea_time(utc: Option<UtcTime>) -> (String, String) {
+    let Some(civil) = utc.map(UtcTime::civil) else { return Default::default() };
     let hundredths = i64::from(civil.nanosecond) / (NS_PER_S / 100);
     (
         format!("{:02}{:02}{:02}.{hundredths:02}", civil.hour, civil.minute, civil.second),
         format!("{:02}{:02}{:02}", civil.day, civil.month, civil.year.rem_euclid(100)),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+    use crate::io::link::Channel;
+    use crate::io::proto::timestamp;
+
+    fn arrival(
+        (topic, schema_name): (&str, &str),
+        t: MonoTime,
+        message: &impl prost::Message,
+        arrived: Instant,
+    ) -> Arrival {
+        let (topic, schema_name) = (topic.to_owned(), schema_name.to_owned());
+        Arrival {
+            payload: "alpha".into(),
+            run: 1,
+            flight: "boot-1".into(),
+            number: 0,
+            channel: Arc::new(Channel { topic, schema_name, schema: Vec::new() }),
+            log_time: t,
+            publish_time: t,
+            data: message.encode_to_vec(),
+            live: true,
+            arrived,
+        }
+    }
+
+    fn at(s: f64) -> MonoTime {
+        MonoTime::from_ns(0) + Span::from_s(s)
+    }
+
+    fn state(s: f64, status: wh::TrackStatus, arrived: Instant) -> Arrival {
+        let state = wh::TargetState {
+            timestamp: Some(timestamp(at(s))),
+            target: "ugv".into(),
+            status: status.into(),
+            known: true,
+            lat_deg: 30.0,
+            lon_deg: -85.0,
+            ..Default::default()
+        };
+        arrival(("/target/ugv/state", "windhover.TargetState"), at(s), &state, arrived)
+    }
+
+    fn status() -> PayloadStatus {
+        PayloadStatus {
+            name: "alpha".into(),
+            connected: true,
+            address: ([127, 0, 0, 1], 7447).into(),
+            rtt_ms: 1.0,
+            silent: Duration::ZERO,
+            software: "windhover".into(),
+            live: 1,
+            bytes: 100,
+            progress: Default::default(),
+        }
+    }
+
+    #[test]
+    fn a_vehicle_that_nothing_more_is_heard_of_is_lost_in_every_output() {
+        let mut view = View::default();
+        let came = Instant::now();
+        view.record(&state(100.0, wh::TrackStatus::Tracking, came));
+        let line = view.line(&status(), came);
+        assert!(line.contains("ugv tracking N 0.00"), "{line}");
+        assert!(view.vehicles(came)[0].is_current());
+        // When nothing comes any more, whatever the payload's clock says.
+        let now = came + Duration::from_secs(35);
+        let line = view.line(&status(), now);
+        assert!(line.contains("ugv lost, last known 35 s ago"), "{line}");
+        assert!(!line.contains("N 0.00"), "{line}");
+        let vehicle = &view.vehicles(now)[0];
+        assert_eq!((vehicle.status, vehicle.is_current(), vehicle.age.s().round()), ("lost", false, 35.0));
+        // A page that is opened then is told how old all of it is.
+        let told: Value = serde_json::from_str(&view.link(&[status()], 1.0, now)).expect("JSON");
+        assert_eq!(told["payloads"][0]["now"].as_f64().map(f64::round), Some(135_000.0));
+        assert_eq!(view.history().last().map(|text| text.contains("\"k\":\"link\"")), Some(true));
+    }
+
+    #[test]
+    fn a_camera_that_dies_makes_the_vehicle_old_while_health_goes_on() {
+        let mut view = View::default();
+        let came = Instant::now();
+        view.record(&state(100.0, wh::TrackStatus::Tracking, came));
+        let utc_minus_host_ns = Some(1_795_000_000_000_000_000);
+        let health =
+            wh::Health { timestamp: Some(timestamp(at(110.0))), utc_minus_host_ns, ..Default::default() };
+        view.record(&arrival(("/health", "windhover.Health"), at(110.0), &health, came));
+        let vehicle = &view.vehicles(came)[0];
+        assert_eq!((vehicle.status, vehicle.age.s().round()), ("lost", 10.0));
+        assert_eq!(vehicle.utc.map(UtcTime::unix_ns), Some(1_795_000_100_000_000_000));
+        let told: Value = serde_json::from_str(&view.link(&[status()], 1.0, came)).expect("JSON");
+        assert_eq!(told["payloads"][0]["utc_ms"], json!(1_795_000_000_000.0));
+    }
 }

@@ -4,7 +4,6 @@
 //! cookie. Names other than addresses and `localhost` are refused on loopback, so that no page of the
 //! Internet can point its own name here.
 
-use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -17,7 +16,9 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use tokio::sync::broadcast;
+use tokio::time::Instant;
 
+use super::door::Door;
 use super::feeds;
 use super::view::View;
 
@@ -186,11 +187,11 @@ async fn thumbnail(State(web): State<Web>, Path(payload): Path<String>) -> Respo
 }
 
 async fn geojson(State(web): State<Web>) -> Response {
-    text("application/geo+json", feeds::geojson(&web.view().vehicles()))
+    text("application/geo+json", feeds::geojson(&web.view().vehicles(Instant::now())))
 }
 
 async fn kml(State(web): State<Web>) -> Response {
-    text("application/vnd.google-earth.kml+xml", feeds::kml(&web.view().vehicles()))
+    text("application/vnd.google-earth.kml+xml", feeds::kml(&web.view().vehicles(Instant::now())))
 }
 
 #[derive(serde::Deserialize)]
@@ -227,7 +228,7 @@ fn deepest_tiles(dir: &std::path::Path) -> u32 {
 
 /// Serves until the program ends.
 pub async fn serve(listener: tokio::net::TcpListener, web: Web) -> std::io::Result<()> {
-    axum::serve(listener, web.router().into_make_service_with_connect_info::<SocketAddr>()).await
+    axum::serve(Door::new(listener, "page"), web.router()).await
 }
 
 #[cfg(test)]

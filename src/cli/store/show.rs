@@ -8,7 +8,7 @@ use crate::io::store::inspect::{self, Dropout};
 use crate::io::store::summary::TopicStats;
 use crate::io::store::volume::Volume;
 use crate::io::store::wear;
-use windhover_base::time::UtcTime;
+use windhover_base::time::{Civil, UtcTime};
 
 /// Silences shorter than this are not worth a line.
 const GAP_SHOWN_NS: u64 = 1_000_000_000;
@@ -88,8 +88,11 @@ pub(super) fn show(root: &Path, name: &str, json: bool) -> CliResult {
     let marks = marks(&info, present.as_deref());
     println!("{name}{}{marks}", if marks.is_empty() { "" } else { ": " });
     println!("  size       {} in {} segments", size(info.bytes), info.segments);
+    let clock = FlightClock::of(&info);
+    let stamp = |ns| clock.stamp(ns);
     if let Some((first, last)) = info.span_ns() {
-        println!("  duration   {}, from {} to {}", span(last - first), stamp(first), stamp(last));
+        let (length, from, to) = (span(last - first), stamp(first), stamp(last));
+        println!("  duration   {length}, from {from} to {to} {}", clock.name());
     }
     match info.estimates() {
         Some(e) => println!("  estimates  {}, from {} to {}", e.count, stamp(e.first_ns), stamp(e.last_ns)),
@@ -98,20 +101,20 @@ pub(super) fn show(root: &Path, name: &str, json: bool) -> CliResult {
     for (key, value) in &info.metadata {
         println!("  {key:<10} {value}");
     }
-    show_topics(&info);
-    show_dropouts(&dropouts);
+    show_topics(&info, &clock);
+    show_dropouts(&dropouts, &clock);
     show_wear(&info, capacity);
     Ok(())
 }
 
-fn show_topics(info: &FlightInfo) {
+fn show_topics(info: &FlightInfo, clock: &FlightClock) {
     if info.topics.is_empty() {
         return;
     }
     println!("\n  {:<28} {:>9} {:>8} {:>12}", "TOPIC", "MESSAGES", "HZ", "LONGEST GAP");
     for (topic, stats) in &info.topics {
         let gap = if stats.gap_ns >= GAP_SHOWN_NS {
-            format!("{:.1} s at {}", stats.gap_ns as f64 * 1e-9, stamp(stats.gap_from_ns))
+            format!("{:.1} s at {}", stats.gap_ns as f64 * 1e-9, clock.stamp(stats.gap_from_ns))
         } else {
             format!("{:.0} ms", stats.gap_ns as f64 * 1e-6)
         };
@@ -124,7 +127,7 @@ fn rate_hz(stats: &TopicStats) -> f64 {
     if seconds > 0.0 { (stats.count - 1) as f64 / seconds } else { 0.0 }
 }
 
-fn show_dropouts(dropouts: &[Dropout]) {
+fn show_dropouts(dropouts: &[Dropout], clock: &FlightClock) {
     println!();
     if dropouts.is_empty() {
         println!("  nothing was dropped");
@@ -136,7 +139,7 @@ fn show_dropouts(dropouts: &[Dropout]) {
         println!(
             "  dropped {count} messages ({}) in {length:.1} s from {} on {}: {}",
             size(d.bytes),
-            stamp(d.from_ns),
+            clock.stamp(d.from_ns),
             topics.join(" "),
             d.reason
         );
@@ -180,8 +183,66 @@ fn span(ns: u64) -> String {
     }
 }
 
-/// Host time for people: close to UTC where the computer's clock was right.
-fn stamp(ns: u64) -> String {
-    let text = UtcTime::from_unix_ns(i64::try_from(ns).unwrap_or(i64::MAX)).to_string();
-    text.get(11..23).unwrap_or(&text).to_owned()
+/// Times of a flight for people. A flight that has its date is named after the UTC of its start, as the receiver told it;
+/// of any other only host time is known.
+struct FlightClock {
+    /// UTC less host time, to a second.
+    utc_minus_host_ns: Option<i64>,
+}
+
+impl FlightClock {
+    fn of(info: &FlightInfo) -> Self {
+        let first_ns = info.span_ns().and_then(|(first, _)| i64::try_from(first).ok());
+        let start = utc_of_name(&info.name);
+        Self { utc_minus_host_ns: start.zip(first_ns).map(|(utc, first_ns)| utc.unix_ns() - first_ns) }
+    }
+
+    fn name(&self) -> &'static str {
+        if self.utc_minus_host_ns.is_some() { "UTC" } else { "host time" }
+    }
+
+    /// The time of day: of UTC to a second, of host time to a millisecond.
+    fn stamp(&self, ns: u64) -> String {
+        let ns = i64::try_from(ns).unwrap_or(i64::MAX);
+        let (ahead_ns, end) = self.utc_minus_host_ns.map_or((0, 23), |ahead_ns| (ahead_ns, 19));
+        let text = UtcTime::from_unix_ns(ns.saturating_add(ahead_ns)).to_string();
+        text.get(11..end).unwrap_or(&text).to_owned()
+    }
+}
+
+/// UTC of the start of a flight named `YYYYMMDDTHHMMSSZ`, with `-N` behind it or not.
+fn utc_of_name(name: &str) -> Option<UtcTime> {
+    let date = name.get(..16).filter(|date| date.is_ascii() && date.ends_with('Z'))?;
+    let number = |from: usize, to: usize| date[from..to].parse::<u8>().ok();
+    let civil = Civil {
+        year: date[..4].parse().ok()?,
+        month: number(4, 6)?,
+        day: number(6, 8)?,
+        hour: number(9, 11)?,
+        minute: number(11, 13)?,
+        second: number(13, 15)?,
+        nanosecond: 0,
+    };
+    UtcTime::from_civil(civil)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn utc_is_that_of_the_flights_name_and_host_time_is_called_so() {
+        let stats =
+            TopicStats { count: 2, first_ns: 1_000_000_000, last_ns: 62_500_000_000, ..Default::default() };
+        let topics: std::collections::BTreeMap<String, TopicStats> =
+            [("/gps/serial".to_owned(), stats)].into();
+        let named =
+            |name: &str| FlightInfo { name: name.into(), topics: topics.clone(), ..FlightInfo::default() };
+        let dated = FlightClock::of(&named("20261118T235930Z-2"));
+        assert_eq!((dated.name(), dated.stamp(62_500_000_000)), ("UTC", "00:00:31".to_owned()));
+        for name in ["boot-7", "20261399T000000Z", "20261118T2359é0Z"] {
+            let clock = FlightClock::of(&named(name));
+            assert_eq!((clock.name(), clock.stamp(62_500_000_000)), ("host time", "00:01:02.500".to_owned()));
+        }
+    }
 }

@@ -18,6 +18,9 @@ use windhover_base::time::{MonoTime, Span};
 /// Frames that wait for the task, as in a driver's buffers; the player waits while so many do.
 const WAITING: usize = 12;
 
+/// The next image is read this share of a frame time after one was delivered.
+const READ_AFTER: f64 = 0.25;
+
 /// A recorded frame and when it was delivered, both on the recording's own clock.
 struct Recorded {
     t_recv: MonoTime,
@@ -97,6 +100,8 @@ impl Player {
                 if self.delivered.blocking_send(Played::Frame(frame)).is_err() {
                     return Ok(());
                 }
+                // A driver takes no processor from those who handle its frame; reading the next one does.
+                self.wait_until(began + played + Span::from_s(self.frame_time.s() * READ_AFTER));
             }
             if first.is_none() {
                 return Err(Fault::new(FaultKind::Unsuitable, &self.path, "holds no camera frame"));

@@ -2,11 +2,13 @@
 
 mod avi;
 mod folder;
+mod samples;
 mod serial_log;
 mod stamp;
 mod video;
 mod y4m;
 
+pub use samples::{Samples, read_attitude, read_inertial};
 pub use serial_log::read_serial_log;
 pub use stamp::parse_time;
 pub use video::{VideoSource, open_video};

@@ -28,7 +28,7 @@ pub fn downlink_class(name: &str) -> Option<Class> {
         topic::HEALTH => Some(Class::Health),
         topic::OWNSHIP => Some(Class::Ownship),
         topic::GPS_FIX | topic::CAMERA_CALIBRATION | topic::SOURCE_EVENT => Some(Class::Later),
-        _ if name.starts_with("/target/") && name.ends_with("/state") => Some(Class::Estimate),
+        _ if topic::is_target_now(name) => Some(Class::Estimate),
         _ => None,
     }
 }

@@ -6,26 +6,29 @@
 
 pub mod messages;
 pub mod packet;
+mod stations;
+mod vehicle;
 
-use std::net::{SocketAddr, ToSocketAddrs as _, UdpSocket};
+pub use stations::{Found, Station, StationNews, look_up};
+
 use std::path::{Path, PathBuf};
 
 use crate::config::MavlinkConfig;
 use crate::io::link::keys::{KeyError, read_private};
 use windhover_base::geo::Geodetic;
-use windhover_base::msg::{EstimatorOutput, Output, SensorReading, TargetEstimate, TrackStatus};
+use windhover_base::msg::{EstimatorOutput, Output, SensorReading, TargetState, TrackStatus};
 use windhover_base::settings::{GroundConfig, TargetConfig};
 use windhover_base::time::{MonoTime, Span, UtcTime};
 
 use messages::VehicleMessages;
 use packet::{Refused, Sender, SigningKey};
+use stations::Stations;
+use vehicle::{Limits, Said, Vehicle};
 
 /// MAV_COMP_ID_AUTOPILOT1: ground stations draw vehicles for this component only.
 const COMPONENT: u8 = 1;
 /// Heartbeats, as the protocol wants them.
 const HEARTBEAT_EVERY: Span = Span::from_ns(1_000_000_000);
-/// Names of stations are looked up again after this long where that failed.
-const RESOLVE_EVERY: Span = Span::from_ns(10_000_000_000);
 /// A signature older than this is a replay (message signing guide: one minute).
 const REPLAY_WINDOW: u64 = 6_000_000;
 
@@ -43,42 +46,39 @@ pub enum MavlinkError {
     NotAKey(PathBuf),
 }
 
-/// Counts for the health line.
+/// What came in.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct MavlinkCounts {
-    /// Datagrams sent.
-    pub sent: u64,
-    /// Datagrams the system would not take.
-    pub failed: u64,
     /// Signed datagrams heard.
     pub heard: u64,
     /// Datagrams refused: unsigned, of another key, replayed, no MAVLink.
     pub refused: u64,
 }
 
-/// IPv4 addresses of stations by their names. Blocks while they are looked up.
-pub fn look_up(names: &[String]) -> Vec<SocketAddr> {
-    let v4 = |name: &String| name.to_socket_addrs().ok()?.find(SocketAddr::is_ipv4);
-    names.iter().filter_map(v4).collect()
+/// One target, and how far its system id has counted.
+#[derive(Clone, Debug)]
+struct System {
+    vehicle: Vehicle,
+    reference_m: f64,
+    sequence: u8,
 }
 
 /// Sends the vehicles. Nothing here blocks.
 pub struct MavlinkSender {
-    socket: UdpSocket,
-    names: Vec<String>,
-    addresses: Vec<SocketAddr>,
-    resolved: Option<MonoTime>,
+    stations: Stations,
     system_id: u8,
-    references_m: Vec<f64>,
+    systems: Vec<System>,
+    limits: Limits,
+    /// Time between two rounds of positions.
+    period: Span,
     key: Option<(SigningKey, u8)>,
     elevation_msl_m: Option<f64>,
     datum: Option<Geodetic>,
     geoid_m: Option<f64>,
-    latest: Vec<Option<TargetEstimate>>,
     utc_from_host_ns: Option<i64>,
     started: Option<MonoTime>,
     heartbeat: Option<MonoTime>,
-    sequence: u8,
+    positions: Option<MonoTime>,
     stamp: u64,
     heard_stamp: u64,
     counts: MavlinkCounts,
@@ -91,8 +91,6 @@ impl MavlinkSender {
         targets: &[TargetConfig],
         ground: &GroundConfig,
     ) -> Result<Self, MavlinkError> {
-        let socket = UdpSocket::bind("0.0.0.0:0").map_err(MavlinkError::Socket)?;
-        socket.set_nonblocking(true).map_err(MavlinkError::Socket)?;
         let key = match &mavlink.signing_key {
             Some(path) => {
                 let path = Path::new(path);
@@ -102,22 +100,29 @@ impl MavlinkSender {
             }
             None => None,
         };
+        let system = |t: &TargetConfig| System {
+            vehicle: Vehicle::default(),
+            reference_m: t.reference_m,
+            sequence: 0,
+        };
         Ok(Self {
-            socket,
-            names: mavlink.send_to.clone(),
-            addresses: Vec::new(),
-            resolved: None,
+            stations: Stations::open(&mavlink.send_to).map_err(MavlinkError::Socket)?,
             system_id: mavlink.system_id,
-            references_m: targets.iter().map(|t| t.reference_m).collect(),
+            systems: targets.iter().map(system).collect(),
+            limits: Limits {
+                max_age: Span::from_s(mavlink.max_age_s),
+                max_sigma_m: mavlink.max_sigma_m,
+                coast: Span::from_s(mavlink.coast_s),
+            },
+            period: Span::from_s(1.0 / mavlink.rate_hz),
             key,
             elevation_msl_m: ground.elevation_msl_m,
             datum: None,
             geoid_m: None,
-            latest: vec![None; targets.len()],
             utc_from_host_ns: None,
             started: None,
             heartbeat: None,
-            sequence: 0,
+            positions: None,
             stamp: 0,
             heard_stamp: 0,
             counts: MavlinkCounts::default(),
@@ -127,9 +132,9 @@ impl MavlinkSender {
     /// Takes what it needs of the pipeline's outputs.
     pub fn output(&mut self, output: &Output) {
         match output {
-            Output::Estimator(EstimatorOutput::Estimate(estimate)) => {
-                if let Some(latest) = self.latest.get_mut(estimate.target) {
-                    *latest = Some(*estimate);
+            Output::Estimator(EstimatorOutput::Estimate(estimate) | EstimatorOutput::Coasted(estimate)) => {
+                if let Some(system) = self.systems.get_mut(estimate.target) {
+                    system.vehicle.take(estimate);
                 }
             }
             Output::Datum(_, datum) => self.datum = Some(*datum),
@@ -143,20 +148,48 @@ impl MavlinkSender {
         }
     }
 
-    /// Counts so far.
+    /// What came in so far.
     pub fn counts(&self) -> MavlinkCounts {
         self.counts
     }
 
-    /// Altitude of level ground above mean sea level: as configured, else from datum and geoid. Where the
-    /// receiver tells no geoid, the height above the ellipsoid stands in.
-    fn ground_msl_m(&self) -> Option<f64> {
-        let of_datum = || self.datum.map(|datum| datum.height_m - self.geoid_m.unwrap_or(0.0));
-        self.elevation_msl_m.or_else(of_datum)
+    /// Where it goes, and how that goes.
+    pub fn stations(&self) -> &[Station] {
+        self.stations.all()
     }
 
-    /// Sends heartbeats once a second and the state of every vehicle that is known; call it at the
-    /// configured rate. Signed messages wait until the receiver told UTC, for signatures carry the time.
+    /// What became of stations since this was last asked.
+    pub fn news(&mut self) -> Vec<StationNews> {
+        self.stations.news()
+    }
+
+    /// Names of stations that are to be looked up at `now`.
+    pub fn unresolved(&mut self, now: MonoTime) -> Option<Vec<String>> {
+        self.stations.unresolved(now)
+    }
+
+    /// Takes what names were found to be.
+    pub fn found(&mut self, found: Vec<Found>) {
+        self.stations.found(found);
+    }
+
+    /// How often [`Self::send`] is to be called: at the rate of positions, and at that of heartbeats at least.
+    pub fn every(&self) -> Span {
+        self.period.min(HEARTBEAT_EVERY)
+    }
+
+    /// Altitude of the ground under a vehicle above mean sea level: of level ground as configured, else by the geoid,
+    /// higher or lower by what the terrain is there. Where the receiver tells no geoid, the height above the ellipsoid
+    /// stands in.
+    fn ground_msl_m(&self, state: &TargetState) -> Option<f64> {
+        let datum = self.datum?;
+        let level = self.elevation_msl_m.unwrap_or_else(|| datum.height_m - self.geoid_m.unwrap_or(0.0));
+        Some(level + state.height_m - datum.height_m)
+    }
+
+    /// Sends heartbeats once a second, and the state of every vehicle of which something may be said
+    /// (`vehicle.rs`); call it as often as [`Self::every`] says. Signed messages wait until the receiver told UTC,
+    /// for signatures carry the time.
     pub fn send(&mut self, now: MonoTime) {
         let utc = self.utc_from_host_ns.map(|ahead| UtcTime::from_unix_ns(now.ns().saturating_add(ahead)));
         let started = *self.started.get_or_insert(now);
@@ -164,71 +197,57 @@ impl MavlinkSender {
         if self.key.is_some() && utc.is_none() {
             return;
         }
-        let beat = self.heartbeat.is_none_or(|last| now - last >= HEARTBEAT_EVERY);
-        if beat {
-            self.heartbeat = Some(now);
-        }
-        for index in 0..self.latest.len() {
-            let system = self.system_id.saturating_add(u8::try_from(index).unwrap_or(u8::MAX));
-            let latest = self.latest[index];
-            let status = latest.map_or(TrackStatus::Lost, |estimate| estimate.status);
+        // A round that comes a little early is this one's all the same.
+        let early = Span::from_s(0.5 * self.every().s());
+        let due = |last: Option<MonoTime>, period| last.is_none_or(|last| now - last + early >= period);
+        let (beat, positions) = (due(self.heartbeat, HEARTBEAT_EVERY), due(self.positions, self.period));
+        for index in 0..self.systems.len() {
+            let said = self.systems[index].vehicle.said(now, &self.limits);
             if beat {
-                self.put(system, messages::HEARTBEAT, &messages::heartbeat(status), utc);
+                self.put(index, messages::HEARTBEAT, &messages::heartbeat(status(&said)), utc);
             }
-            let (Some(alt_msl_m), Some(TargetEstimate { t_valid, state: Some(state), .. })) =
-                (self.ground_msl_m(), latest)
-            else {
-                continue;
-            };
-            let time_boot_ms = messages::since_start_ms(started, t_valid);
-            let vehicle =
-                VehicleMessages { time_boot_ms, state, alt_msl_m, reference_m: self.references_m[index] };
-            if status == TrackStatus::Lost || !vehicle.is_finite() {
-                continue;
+            if let Said::Seen(t, state) | Said::Predicted(t, state) = said
+                && positions
+            {
+                self.put_state(index, messages::since_start_ms(started, t), &state, utc);
             }
-            self.put(system, messages::GLOBAL_POSITION_INT, &vehicle.global_position_int(), utc);
-            self.put(system, messages::ATTITUDE, &vehicle.attitude(), utc);
-            self.put(system, messages::FOLLOW_TARGET, &vehicle.follow_target(), utc);
         }
+        self.heartbeat = if beat { Some(now) } else { self.heartbeat };
+        self.positions = if positions { Some(now) } else { self.positions };
     }
 
-    fn put(&mut self, system: u8, kind: packet::Kind, payload: &[u8], utc: Option<UtcTime>) {
+    fn put_state(&mut self, index: usize, time_boot_ms: u64, state: &TargetState, utc: Option<UtcTime>) {
+        let Some(alt_msl_m) = self.ground_msl_m(state) else { return };
+        let reference_m = self.systems[index].reference_m;
+        let vehicle = VehicleMessages { time_boot_ms, state: *state, alt_msl_m, reference_m };
+        if !vehicle.is_finite() {
+            return;
+        }
+        self.put(index, messages::GLOBAL_POSITION_INT, &vehicle.global_position_int(), utc);
+        self.put(index, messages::ATTITUDE, &vehicle.attitude(), utc);
+        self.put(index, messages::FOLLOW_TARGET, &vehicle.follow_target(), utc);
+    }
+
+    /// Sends a message of a target to every station.
+    fn put(&mut self, index: usize, kind: packet::Kind, payload: &[u8], utc: Option<UtcTime>) {
+        let system = self.system_id.saturating_add(u8::try_from(index).unwrap_or(u8::MAX));
         let sender = Sender { system, component: COMPONENT };
-        let mut bytes = packet::encode(self.sequence, sender, kind, payload, self.key.is_some());
-        self.sequence = self.sequence.wrapping_add(1);
+        let sequence = &mut self.systems[index].sequence;
+        let mut bytes = packet::encode(*sequence, sender, kind, payload, self.key.is_some());
+        *sequence = sequence.wrapping_add(1);
         if let (Some((key, link_id)), Some(utc)) = (&self.key, utc) {
             // Never the same or an earlier stamp, whatever the clock does.
             self.stamp = packet::time_stamp(utc).max(self.stamp + 1);
             packet::sign(&mut bytes, key, *link_id, self.stamp);
         }
-        for address in &self.addresses {
-            match self.socket.send_to(&bytes, address) {
-                Ok(_) => self.counts.sent += 1,
-                Err(_) => self.counts.failed += 1,
-            }
-        }
+        self.stations.send(&bytes);
     }
 
-    /// Names of stations that are to be looked up at `now`: all, until each has an address.
-    pub fn unresolved(&mut self, now: MonoTime) -> Option<Vec<String>> {
-        let whole = self.addresses.len() == self.names.len();
-        if whole || self.resolved.is_some_and(|last| now - last < RESOLVE_EVERY) {
-            return None;
-        }
-        self.resolved = Some(now);
-        Some(self.names.clone())
-    }
-
-    /// Sends to these addresses from now on.
-    pub fn send_to(&mut self, addresses: Vec<SocketAddr>) {
-        self.addresses = addresses;
-    }
-
-    /// Empties the socket: without a key nothing is even looked at.
+    /// Empties the sockets: without a key nothing is even looked at.
     fn listen(&mut self, utc: Option<UtcTime>) {
         let mut buffer = [0; 512];
         for _ in 0..64 {
-            let Ok((length, _)) = self.socket.recv_from(&mut buffer) else { return };
+            let Some(length) = self.stations.receive(&mut buffer) else { return };
             let Some((key, _)) = &self.key else { continue };
             let verdict = packet::verify(&buffer[..length], key).and_then(|(_, _, stamp)| {
                 let now = utc.map_or(0, packet::time_stamp);
@@ -245,3 +264,16 @@ impl MavlinkSender {
         }
     }
 }
+
+/// The track that a heartbeat tells: it is active while positions of a vehicle in sight go out, critical while
+/// predicted ones do, and on standby where none do.
+fn status(said: &Said) -> TrackStatus {
+    match said {
+        Said::Seen(..) => TrackStatus::Tracking,
+        Said::Predicted(..) => TrackStatus::Coasting,
+        Said::Nothing => TrackStatus::Lost,
+    }
+}
+
+#[cfg(test)]
+mod tests;

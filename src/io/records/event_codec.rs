@@ -2,11 +2,16 @@
 
 use std::sync::Arc;
 
+use nalgebra::Vector3;
 use prost::{DecodeError, Message as _};
 
+use super::output_messages::{attitude, inertial};
 use super::{Record, Schema, topic, warm_message};
 use crate::io::proto::{foxglove, host_time, timestamp, windhover};
-use windhover_base::msg::{Delivery, Event, EventBody, FrameEncoding, FramePayload, Source};
+use windhover_base::geo::Tilt;
+use windhover_base::msg::{
+    AttitudeSample, Delivery, Event, EventBody, FrameEncoding, FramePayload, InertialSample, Source,
+};
 use windhover_base::time::MonoTime;
 
 /// Frame of reference of images.
@@ -47,7 +52,9 @@ pub fn topic_of_event(body: &EventBody) -> Option<&'static str> {
         EventBody::Dropped { .. } | EventBody::Pulse | EventBody::SourceUp(_) | EventBody::SourceDown(_) => {
             Some(topic::SOURCE_EVENT)
         }
-        EventBody::Bytes { source, .. } => Some(source.topic()),
+        EventBody::Bytes { source, .. }
+        | EventBody::Inertial { source, .. }
+        | EventBody::Attitude { source, .. } => Some(source.topic()),
         EventBody::Frame(_) => Some(Source::Camera.topic()),
     }
 }
@@ -67,6 +74,8 @@ pub fn of_event(event: &Event) -> Option<Record> {
             let (schema, data) = image(frame);
             (schema, frame.t_exposure, data)
         }
+        EventBody::Inertial { sample, .. } => (Schema::Inertial, t, inertial(t, sample).encode_to_vec()),
+        EventBody::Attitude { sample, .. } => (Schema::Attitude, t, attitude(t, t, sample).encode_to_vec()),
         EventBody::Warm(state) => (Schema::WarmState, t, warm_message::message(t, state).encode_to_vec()),
         EventBody::Dropped { source, count } => {
             (Schema::SourceEvent, t, of_source(t, *source, "dropped", *count))
@@ -115,12 +124,31 @@ impl EventDecoder {
                 self.next_frame = index.saturating_add(1);
                 to_frame(message, index).map(EventBody::Frame)
             }
+            Delivery::Inertial => {
+                let sample = to_inertial(&windhover::Inertial::decode(message.data)?);
+                Ok(EventBody::Inertial { source, sample })
+            }
+            Delivery::Attitude => {
+                let sample = to_attitude(&windhover::Attitude::decode(message.data)?);
+                Ok(EventBody::Attitude { source, sample })
+            }
         }
     }
 }
 
 fn serial(t: MonoTime, bytes: &[u8]) -> Vec<u8> {
     windhover::SerialBytes { timestamp: Some(timestamp(t)), data: bytes.to_vec() }.encode_to_vec()
+}
+
+fn to_inertial(message: &windhover::Inertial) -> InertialSample {
+    let three = |figures: &[f64]| <[f64; 3]>::try_from(figures).ok().map(Vector3::from);
+    InertialSample { rate_rps: three(&message.rate_rps), force_mps2: three(&message.force_mps2) }
+}
+
+/// An attitude out of its message.
+pub fn to_attitude(message: &windhover::Attitude) -> AttitudeSample {
+    let tilt = message.pitch_rad.zip(message.roll_rad).map(|(pitch, roll)| Tilt { pitch, roll });
+    AttitudeSample { heading: message.heading_rad, heading_is_true: message.heading_is_true, tilt }
 }
 
 fn of_source(t: MonoTime, source: Source, what: &str, count: u32) -> Vec<u8> {
@@ -231,8 +259,22 @@ mod tests {
         for &source in Source::ALL {
             all.push(EventBody::Dropped { source, count: 3 });
             all.extend([EventBody::SourceUp(source), EventBody::SourceDown(source)]);
-            if source.delivers() == Delivery::Bytes {
-                all.push(EventBody::Bytes { source, data: vec![0, 255, 10] });
+            match source.delivers() {
+                Delivery::Bytes => all.push(EventBody::Bytes { source, data: vec![0, 255, 10] }),
+                Delivery::Frames => {}
+                Delivery::Inertial => {
+                    all.extend([(true, true), (true, false), (false, true)].map(|(rate, force)| {
+                        let three = |there: bool| there.then(|| Vector3::new(0.1, -2.0, 9.8));
+                        let sample = InertialSample { rate_rps: three(rate), force_mps2: three(force) };
+                        EventBody::Inertial { source, sample }
+                    }))
+                }
+                Delivery::Attitude => {
+                    let tilt = Some(Tilt { pitch: 0.1, roll: -0.2 });
+                    let sample = AttitudeSample { heading: Some(1.5), heading_is_true: true, tilt };
+                    all.push(EventBody::Attitude { source, sample });
+                    all.push(EventBody::Attitude { source, sample: AttitudeSample { tilt: None, ..sample } });
+                }
             }
         }
         let encodings = RAW_ENCODINGS.iter().chain(&COMPRESSED_ENCODINGS).map(|(encoding, _)| *encoding);

@@ -5,8 +5,8 @@ use prost_types::Timestamp;
 
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
 use windhover_base::msg::{
-    FeatureTrack, FixKind, Health, MarkerDetection, MarkerId, MisfitWords, Notice, NoticeKind, Ownship,
-    SourceHealth, TargetEstimate, TrackStatus,
+    AttitudeSample, FeatureTrack, FixKind, Health, InertialSample, MarkerDetection, MarkerId, MisfitWords,
+    Notice, NoticeKind, Ownship, SourceHealth, TargetEstimate, TrackStatus,
 };
 use windhover_base::time::MonoTime;
 
@@ -140,6 +140,28 @@ pub(super) fn annotations(
     overlay
 }
 
+/// An attitude as a device put it, true at `t`.
+pub(super) fn attitude(t: MonoTime, heard: MonoTime, sample: &AttitudeSample) -> wh::Attitude {
+    wh::Attitude {
+        timestamp: stamp(t),
+        heading_rad: sample.heading,
+        heading_is_true: sample.heading_is_true,
+        pitch_rad: sample.tilt.map(|t| t.pitch),
+        roll_rad: sample.tilt.map(|t| t.roll),
+        heard: stamp(heard),
+    }
+}
+
+/// Rates and forces as a sensor put them, heard at `t`.
+pub(super) fn inertial(t: MonoTime, sample: &InertialSample) -> wh::Inertial {
+    let figures = |value: Option<Vector3<f64>>| value.map_or(Vec::new(), |v| v.as_slice().to_vec());
+    wh::Inertial {
+        timestamp: stamp(t),
+        rate_rps: figures(sample.rate_rps),
+        force_mps2: figures(sample.force_mps2),
+    }
+}
+
 /// The helicopter's own state, as a message.
 pub fn ownship(own: &Ownship) -> wh::Ownship {
     let q = own.ned_from_body.quaternion();
@@ -198,6 +220,8 @@ pub fn target_state(estimate: &TargetEstimate, name: &str) -> wh::TargetState {
         message.yaw_rate_radps = s.yaw_rate_radps;
         message.lat_deg = s.lat_deg;
         message.lon_deg = s.lon_deg;
+        message.height_m = s.height_m;
+        message.relative_sigma_m = s.relative_sigma_m;
         if let Some(p) = &s.covariance {
             message.covariance = upper_triangle(p);
         }
@@ -263,6 +287,7 @@ pub fn health(now: &Health, names: &[String]) -> wh::Health {
         fix: fix_number(now.fix),
         sats: now.sats.unwrap_or(0),
         clock_sigma_ms: now.clock_sigma.map_or(-1.0, |s| s.ms()),
+        utc_minus_host_ns: now.utc_minus_host.map(|ahead| ahead.ns()),
         misfits: now.misfits.iter().map(misfit).collect(),
         dispositions: now.dispositions.iter().map(|(d, n)| (d.name().to_owned(), *n)).collect(),
         ..Default::default()

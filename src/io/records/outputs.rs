@@ -6,7 +6,8 @@ use nalgebra::{UnitQuaternion, Vector3};
 use prost::Message;
 
 use super::output_messages::{
-    annotations, detections, fix_number, health, log_message, ownship, rtk, stamp, target_state, transform,
+    annotations, attitude, detections, fix_number, health, log_message, ownship, rtk, stamp, target_state,
+    transform,
 };
 use super::{Record, Schema, topic};
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
@@ -51,7 +52,6 @@ pub fn opening(camera: &CameraConfig, t: MonoTime) -> Vec<Record> {
 /// Turns outputs into records.
 pub struct OutputEncoder {
     targets: Vec<String>,
-    datum_height_m: f64,
     /// What the next health message tells of the daemon.
     pub figures: DaemonFigures,
 }
@@ -61,7 +61,6 @@ impl OutputEncoder {
     pub fn new(targets: &[TargetConfig]) -> Self {
         Self {
             targets: targets.iter().map(|target| target.name.clone()).collect(),
-            datum_height_m: 0.0,
             figures: DaemonFigures::default(),
         }
     }
@@ -70,7 +69,6 @@ impl OutputEncoder {
     pub fn output(&mut self, output: &Output, log: MonoTime, out: &mut Vec<Record>) {
         match output {
             Output::Datum(t, datum) => {
-                self.datum_height_m = datum.height_m;
                 let message = wh::Datum {
                     timestamp: Some(timestamp(*t)),
                     lat_deg: datum.lat_deg,
@@ -80,7 +78,7 @@ impl OutputEncoder {
                 out.push(record(topic::DATUM.into(), Schema::Datum, log, *t, &message));
             }
             Output::Reading(SensorReading::Gnss(epoch)) => fix(epoch, log, out),
-            Output::Reading(SensorReading::Attitude(sample)) => out.push(attitude(sample, log)),
+            Output::Reading(SensorReading::Attitude(sample)) => out.push(attitude_record(sample, log)),
             Output::Detections { frame, t_valid, markers, features } => {
                 let whole = detections(*frame, *t_valid, markers, features);
                 out.push(record(topic::CAMERA_DETECTIONS.into(), Schema::Detections, log, *t_valid, &whole));
@@ -109,7 +107,14 @@ impl OutputEncoder {
                 let tf = transform(own.t_valid, "ned", "body", own.position_ned_m, &own.ned_from_body);
                 out.push(record(topic::TF.into(), Schema::FrameTransform, log, own.t_valid, &tf));
             }
-            EstimatorOutput::Estimate(estimate) => self.estimate(estimate, log, out),
+            EstimatorOutput::Estimate(e) => {
+                self.state(topic::target_state(self.name(e)), e, log, out);
+                self.place(e, log, out);
+            }
+            EstimatorOutput::Coasted(e) => {
+                self.state(topic::target_coasting(self.name(e)), e, log, out);
+                self.place(e, log, out);
+            }
             EstimatorOutput::Smoothed(e) => self.state(topic::target_smoothed(self.name(e)), e, log, out),
             EstimatorOutput::Fusion(result) => out.push(fusion(result, log)),
             // The pipeline's notice tells of these.
@@ -129,8 +134,8 @@ impl OutputEncoder {
         out.push(record(topic, Schema::TargetState, log, estimate.t_valid, &message));
     }
 
-    fn estimate(&self, estimate: &TargetEstimate, log: MonoTime, out: &mut Vec<Record>) {
-        self.state(topic::target_state(self.name(estimate)), estimate, log, out);
+    /// Where a target is, for maps and for viewers of transforms.
+    fn place(&self, estimate: &TargetEstimate, log: MonoTime, out: &mut Vec<Record>) {
         let Some(state) = &estimate.state else { return };
         let name = self.name(estimate);
         let t = estimate.t_valid;
@@ -148,7 +153,7 @@ impl OutputEncoder {
             frame_id: format!("target/{name}"),
             latitude: state.lat_deg,
             longitude: state.lon_deg,
-            altitude: self.datum_height_m,
+            altitude: state.height_m,
             position_covariance: covariance,
             position_covariance_type: known.into(),
             ..Default::default()
@@ -203,16 +208,8 @@ fn fix(epoch: &Stamped<GnssEpoch>, log: MonoTime, out: &mut Vec<Record>) {
     out.push(record(topic::GPS_FIX.into(), Schema::LocationFix, log, t, &location));
 }
 
-fn attitude(sample: &Stamped<AttitudeSample>, log: MonoTime) -> Record {
-    let s = &sample.value;
-    let message = wh::Attitude {
-        timestamp: stamp(sample.t_valid),
-        heading_rad: s.heading,
-        heading_is_true: s.heading_is_true,
-        pitch_rad: s.tilt.map(|t| t.pitch),
-        roll_rad: s.tilt.map(|t| t.roll),
-        heard: stamp(sample.t_recv),
-    };
+fn attitude_record(sample: &Stamped<AttitudeSample>, log: MonoTime) -> Record {
+    let message = attitude(sample.t_valid, sample.t_recv, &sample.value);
     record(topic::COMPASS_ATTITUDE.into(), Schema::Attitude, log, sample.t_valid, &message)
 }
 

@@ -35,6 +35,8 @@ pub enum Schema {
     GnssEpoch,
     /// `windhover.Attitude`
     Attitude,
+    /// `windhover.Inertial`
+    Inertial,
     /// `windhover.Fusion`
     Fusion,
     /// `windhover.Health`
@@ -62,6 +64,7 @@ impl Schema {
             Self::Detections => "windhover.Detections",
             Self::GnssEpoch => "windhover.GnssEpoch",
             Self::Attitude => "windhover.Attitude",
+            Self::Inertial => "windhover.Inertial",
             Self::Fusion => "windhover.Fusion",
             Self::Health => "windhover.Health",
             Self::WarmState => "windhover.WarmState",
@@ -70,7 +73,7 @@ impl Schema {
 
     /// The schema of that full name.
     pub fn named(name: &str) -> Option<Self> {
-        const ALL: [Schema; 18] = [
+        const ALL: [Schema; 19] = [
             Schema::SerialBytes,
             Schema::SourceEvent,
             Schema::CompressedImage,
@@ -86,6 +89,7 @@ impl Schema {
             Schema::Detections,
             Schema::GnssEpoch,
             Schema::Attitude,
+            Schema::Inertial,
             Schema::Fusion,
             Schema::Health,
             Schema::WarmState,

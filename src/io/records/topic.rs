@@ -39,6 +39,16 @@ pub fn target_state(name: &str) -> String {
     format!("/target/{name}/state")
 }
 
+/// `/target/NAME/coasting`: predicted, while no frame comes.
+pub fn target_coasting(name: &str) -> String {
+    format!("/target/{name}/coasting")
+}
+
+/// Whether a topic says where a target is now: of a frame, or predicted while none comes.
+pub fn is_target_now(topic: &str) -> bool {
+    topic.starts_with("/target/") && (topic.ends_with("/state") || topic.ends_with("/coasting"))
+}
+
 /// `/target/NAME/smoothed`: from the fixed-lag smoother.
 pub fn target_smoothed(name: &str) -> String {
     format!("/target/{name}/smoothed")

@@ -1,6 +1,7 @@
 //! Tells a wrong line speed by what arrives: text read at the wrong speed is not text, and holds no sound sentence.
 
 use super::garmin::bodies;
+use windhover_decode::holds_ubx_packet;
 
 /// Counts bytes that have no place in a text protocol, and looks for what only the right speed gives.
 #[derive(Debug, Default)]
@@ -8,7 +9,8 @@ pub(super) struct TextShare {
     heard: Vec<u8>,
     /// Windows without anything sound since the last that had something.
     unsound: u32,
-    was_sound: bool,
+    /// Windows that mixed what is no text with something sound.
+    mixed: u32,
 }
 
 /// Bytes judged at a time: about a second of NMEA at 4800 baud.
@@ -19,6 +21,8 @@ const GARBLED_PERCENT: usize = 25;
 /// Windows that a device which was understood may fill with binary packets of its own between two sentences:
 /// raw measurements of a second.
 const UNSOUND_MAX: u32 = 20;
+/// Mixed windows from which on a device is known to mix: a burst of rubbish after good sentences makes one.
+const MIXES: u32 = 2;
 /// Longest that a packet or sentence over the end of a window is waited for.
 const KEPT: usize = 1_100;
 
@@ -36,40 +40,32 @@ impl TextShare {
         let odd =
             self.heard.iter().filter(|byte| !matches!(byte, b' '..=b'~' | b'\r' | b'\n' | b'\t')).count();
         let percent = odd * 100 / self.heard.len();
-        if percent >= GARBLED_PERCENT && holds_anything_sound(&self.heard) {
-            (self.was_sound, self.unsound) = (true, 0);
+        let is_packets = percent >= GARBLED_PERCENT && holds_packets(&self.heard);
+        if is_packets || percent >= GARBLED_PERCENT && holds_a_sentence(&self.heard) {
+            (self.mixed, self.unsound) = (self.mixed.saturating_add(1), 0);
         } else {
             self.unsound += 1;
         }
         self.heard.clear();
-        let is_mixed = self.was_sound && self.unsound <= UNSOUND_MAX;
+        let is_mixed = is_packets || self.mixed >= MIXES && self.unsound <= UNSOUND_MAX;
         (percent >= GARBLED_PERCENT && !is_mixed).then_some(percent)
     }
 }
 
-fn holds_anything_sound(bytes: &[u8]) -> bool {
-    bodies(&String::from_utf8_lossy(bytes)).next().is_some() || holds_a_packet(bytes)
+fn holds_a_sentence(bytes: &[u8]) -> bool {
+    bodies(&String::from_utf8_lossy(bytes)).next().is_some()
 }
 
-/// Whether there is a packet of u-blox receivers: two marks, class and identity, length, payload, and the
-/// Fletcher sum over all but the marks.
-fn holds_a_packet(bytes: &[u8]) -> bool {
-    bytes.windows(6).enumerate().any(|(at, head)| {
-        let &[0xB5, 0x62, _, _, low, high] = head else { return false };
-        let end = at + 6 + usize::from(u16::from_le_bytes([low, high]));
-        let sum = bytes.get(at + 2..end).map(|summed| {
-            summed.iter().fold((0u8, 0u8), |(a, b), byte| {
-                let a = a.wrapping_add(*byte);
-                (a, b.wrapping_add(a))
-            })
-        });
-        sum.zip(bytes.get(end..end + 2)).is_some_and(|((a, b), told)| told == [a, b])
-    })
+/// Whether this is packets of a u-blox receiver: a whole one, or the marks of one beside a sound sentence.
+fn holds_packets(bytes: &[u8]) -> bool {
+    let is_marked = bytes.windows(2).any(|pair| pair == [0xB5, 0x62]);
+    is_marked && (holds_ubx_packet(bytes) || holds_a_sentence(bytes))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use windhover_decode::ubx_framed;
 
     #[test]
     fn text_passes_and_noise_does_not() {
@@ -82,16 +78,24 @@ mod tests {
         assert!(share.garbled(&line[..40]).is_none(), "a window starts anew after it was judged");
     }
 
+    #[test]
+    fn rubbish_after_good_sentences_is_garbled() {
+        let line = b"$GPRMC,162254.00,A,3723.02837,N,12159.39853,W,0.820,188.36,110706,,,A*74\r\n";
+        for ahead in 0..12 {
+            let mut share = TextShare::default();
+            assert!((0..ahead).all(|_| share.garbled(line).is_none()));
+            let is_reported = [0xff; 900].chunks(61).any(|read| share.garbled(read).is_some());
+            assert!(is_reported, "{ahead} sentences before");
+            let mut share = TextShare::default();
+            assert!((0..ahead).all(|_| share.garbled(line).is_none()));
+            assert!(share.garbled(&[0xff; 900]).is_some(), "in one read, {ahead} sentences before");
+        }
+    }
+
     /// A packet of u-blox with a payload that is no text.
     fn packet(length: u16) -> Vec<u8> {
-        let mut packet = vec![1, 7];
-        packet.extend_from_slice(&length.to_le_bytes());
-        packet.extend((0..length).map(|n| n.wrapping_mul(91) as u8));
-        let sum = packet.iter().fold((0u8, 0u8), |(a, b), byte| {
-            let a = a.wrapping_add(*byte);
-            (a, b.wrapping_add(a))
-        });
-        [&[0xB5, 0x62], packet.as_slice(), &[sum.0, sum.1]].concat()
+        let payload: Vec<u8> = (0..length).map(|n| n.wrapping_mul(91) as u8).collect();
+        ubx_framed(1, 7, &payload)
     }
 
     #[test]

@@ -188,16 +188,20 @@ fn garmin_at(mut far: File, mut own: u32, mut binary: bool) {
     });
 }
 
+/// What a receiver's configuration came to.
+fn configured(report: Report) -> Option<String> {
+    match report {
+        Report::Note(NoteKind::Configured, _, text) => Some(text),
+        _ => None,
+    }
+}
+
 #[test]
 fn a_receiver_at_another_speed_is_brought_to_the_configured_one() {
     let (far, name) = pty();
     garmin_at(far, 19_200, false);
     let line = Line::start(&name, true);
     line.up();
-    let configured = |report| match report {
-        Report::Note(NoteKind::Configured, _, text) => Some(text),
-        _ => None,
-    };
     let text = line.wait(configured);
     assert!(text.contains("spoke at 19200 baud"), "{text}");
     assert_eq!(line.wait(configured), "7 settings accepted", "then it is configured at the new speed");
@@ -210,10 +214,6 @@ fn a_receiver_left_in_binary_mode_is_told_to_speak_nmea() {
     garmin_at(far, 38_400, true);
     let line = Line::start(&name, true);
     line.up();
-    let configured = |report| match report {
-        Report::Note(NoteKind::Configured, _, text) => Some(text),
-        _ => None,
-    };
     let text = line.wait(configured);
     assert!(text.contains("was in binary mode"), "{text}");
     line.wait(|r| matches!(r, Report::Bytes(_, bytes) if bytes.starts_with(b"$GPRMC")).then_some(()));

@@ -319,3 +319,50 @@ fn what_a_daemon_far_behind_records_is_read_in_the_order_it_was_handled() {
     assert_eq!(times.len(), 300);
     assert!(times.is_sorted(), "{times:?}");
 }
+
+#[test]
+fn a_flight_that_is_removed_while_it_is_written_is_told_and_begun_anew() {
+    // Given a flight on the card.
+    let dir = tempfile::tempdir().unwrap();
+    let clock = HostClock::start();
+    let (store, notices) =
+        Store::start_on(Volume::new(dir.path()), &config(dir.path()), "[gps]\n".into(), clock);
+    let handle = store.handle();
+    handle.event(&gps(&clock, 1));
+    wait_for_commits(&handle, 1);
+    let flights = dir.path().join(FLIGHTS);
+    // When its directory is removed, then that is told, with the next that is written.
+    std::fs::remove_dir_all(&flights).unwrap();
+    handle.event(&gps(&clock, 2));
+    let StoreNotice::Stopped { reason } = expect_notice(&notices, "recording_stopped") else {
+        unreachable!()
+    };
+    assert!(reason.contains("removed or replaced"), "{reason}");
+    // Then another flight is begun, and what was lost is counted.
+    expect_notice(&notices, "recording_resumed");
+    handle.event(&gps(&clock, 3));
+    wait_for_commits(&handle, 1);
+    store.stop();
+    let words = handle.status().outcome().expect("the end is on the card");
+    assert!(words.starts_with("written, but for 1 messages"), "{words}");
+    let name = flight::flight_names(dir.path()).unwrap().pop().expect("a flight");
+    assert_eq!(events_of(&flights.join(name)).0, [b"$GPGGA,3\r\n"]);
+}
+
+#[test]
+fn an_end_that_reaches_nobody_is_no_end_that_is_written() {
+    let dir = tempfile::tempdir().unwrap();
+    let clock = HostClock::start();
+    let (store, _notices) =
+        Store::start_on(Volume::new(dir.path()), &config(dir.path()), "[gps]\n".into(), clock);
+    let handle = store.handle();
+    handle.event(&gps(&clock, 1));
+    wait_for_commits(&handle, 1);
+    assert_eq!(handle.status().outcome(), Ok("everything is written".into()));
+    // When the flight's files are put elsewhere at the very end.
+    std::fs::rename(dir.path().join(FLIGHTS), dir.path().join("ELSEWHERE")).unwrap();
+    handle.event(&gps(&clock, 2));
+    store.stop();
+    let why = handle.status().outcome().expect_err("nothing of the end is where it belongs");
+    assert!(why.contains("removed or replaced"), "{why}");
+}

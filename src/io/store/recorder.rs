@@ -372,14 +372,21 @@ impl Recorder {
     }
 
     fn end(&mut self) {
-        let Some(flight) = &mut self.flight else { return };
+        self.shared.status().unwritten.clone_from(&self.trouble);
+        let Some(flight) = &mut self.flight else {
+            self.shared.status().unwritten.get_or_insert("no flight was begun".into());
+            return;
+        };
         let session = flight.session();
         let finished = flight.finish();
         self.shared.status().bytes_written = flight.bytes();
         match finished {
             Ok(Some(segment)) => self.send(Message::SegmentDone { session, segment }),
             Ok(None) => {}
-            Err(error) => self.shared.notice(StoreNotice::Failed { reason: error.to_string() }),
+            Err(error) => {
+                self.shared.status().unwritten.get_or_insert(error.to_string());
+                self.shared.notice(StoreNotice::Failed { reason: error.to_string() });
+            }
         }
         self.shared.status().recording = Recording::Off;
     }

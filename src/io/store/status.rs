@@ -45,6 +45,19 @@ pub struct StoreStatus {
     pub last_commit_ns: i64,
     /// Whether the index answers.
     pub index_ready: bool,
+    /// After the end: why the last of the flight is not on the card; `None` where it is.
+    pub unwritten: Option<String>,
+}
+
+impl StoreStatus {
+    /// After the end: what was done, in words, and whether the end of the flight is on the card.
+    pub fn outcome(&self) -> Result<String, String> {
+        match (&self.unwritten, self.dropped_messages) {
+            (Some(reason), _) => Err(reason.clone()),
+            (None, 0) => Ok("everything is written".into()),
+            (None, lost) => Ok(format!("written, but for {lost} messages that were lost on the way")),
+        }
+    }
 }
 
 /// Something an operator should know.

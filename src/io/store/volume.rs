@@ -225,6 +225,16 @@ impl Volume {
     }
 }
 
+/// Whether an open file is still the file of its path: its device and inode, and a name at all.
+pub fn same_file(file: &File, path: &Path) -> std::io::Result<()> {
+    let open = file.metadata()?;
+    let named = std::fs::metadata(path);
+    if open.nlink() > 0 && named.is_ok_and(|named| (named.dev(), named.ino()) == (open.dev(), open.ino())) {
+        return Ok(());
+    }
+    Err(std::io::Error::other("it was removed or replaced while it was written"))
+}
+
 /// A file that only grows. After a failed append it is as long as before it.
 #[derive(Debug)]
 pub struct AppendFile {
@@ -287,9 +297,11 @@ impl AppendFile {
         Ok(())
     }
 
-    /// Makes everything appended durable.
+    /// Makes everything appended durable. A file that is no longer the one of its path is an error: what is written to
+    /// it then reaches nobody, whatever the system says.
     pub fn sync(&mut self) -> StoreResult<()> {
         self.file.sync_data().map_err(|e| StoreError::new("sync", &self.path, e))?;
+        same_file(&self.file, &self.path).map_err(|e| StoreError::new("go on writing", &self.path, e))?;
         if let Some(journal) = &self.journal {
             journal.note(Op::Sync(self.id));
         }

@@ -23,7 +23,7 @@ impl GpsLine {
     pub(super) fn new(config: &GpsConfig) -> Self {
         let latency = Span::from_ms(config.latency_ms);
         Self {
-            decoder: GnssDecoder::new(),
+            decoder: GnssDecoder::new().of_format(config.format),
             heard: Vec::new(),
             clock: GnssClock::new(latency),
             clock_sigma: None,

@@ -1,12 +1,15 @@
-//! Sources that deliver bytes: bytes in, stamped measurements out. One file a line, one row in [`SourceLines::of`].
+//! What sources deliver, put in time: bytes or samples in, stamped measurements out. One file a line; one that takes bytes
+//! has a row in [`SourceLines::of`].
 
 mod compass;
 mod gps;
+mod samples;
 
 pub(super) use compass::CompassLine;
 pub(super) use gps::GpsLine;
+pub(super) use samples::{Sample, SampleLine};
 
-use windhover_base::msg::{SensorReading, Source};
+use windhover_base::msg::{Delivery, SensorReading, Source};
 use windhover_base::settings::Rig;
 use windhover_base::time::{MonoTime, Span};
 use windhover_decode::DecodeCounts;
@@ -30,11 +33,18 @@ pub(super) trait SourceLine {
 pub(super) struct SourceLines {
     pub(super) gps: GpsLine,
     pub(super) compass: CompassLine,
+    pub(super) imu: Option<SampleLine>,
+    pub(super) attitude: Option<SampleLine>,
 }
 
 impl SourceLines {
     pub(super) fn new(rig: &Rig) -> Self {
-        Self { gps: GpsLine::new(&rig.gps), compass: CompassLine::new(&rig.compass) }
+        Self {
+            gps: GpsLine::new(&rig.gps),
+            compass: CompassLine::new(&rig.compass),
+            imu: rig.imu.map(|imu| SampleLine::new(imu.latency_ms)),
+            attitude: rig.attitude.map(|attitude| SampleLine::new(attitude.latency_ms)),
+        }
     }
 
     /// The line of a source; `None` where it does not deliver bytes, or is not configured.
@@ -42,7 +52,25 @@ impl SourceLines {
         match source {
             Source::Gps => Some(&mut self.gps),
             Source::Compass => Some(&mut self.compass),
-            Source::Camera => None,
+            Source::Camera | Source::Imu | Source::Attitude => None,
+        }
+    }
+
+    /// The line of a source of samples; `None` where it delivers something else, or is not configured.
+    pub(super) fn samples(&mut self, source: Source) -> Option<&mut SampleLine> {
+        match source {
+            Source::Imu => self.imu.as_mut(),
+            Source::Attitude => self.attitude.as_mut(),
+            Source::Gps | Source::Compass | Source::Camera => None,
+        }
+    }
+
+    /// Whether something is to come from a source.
+    pub(super) fn awaits(&mut self, source: Source) -> bool {
+        match source.delivers() {
+            Delivery::Bytes => self.of(source).is_some(),
+            Delivery::Frames => true,
+            Delivery::Inertial | Delivery::Attitude => self.samples(source).is_some(),
         }
     }
 }

@@ -100,33 +100,37 @@ impl Tile {
         Self::new((south + 1.0, west), [step; 2], (side, side), heights)
     }
 
-    /// Missing heights become the mean of known neighbours, ring by ring.
+    /// Missing heights become the mean of known neighbours, ring by ring from the known ones inwards. Each is looked
+    /// at a few times, however large the void is.
     fn fill_voids(&mut self) {
-        let mut missing: Vec<usize> =
-            (0..self.heights_m.len()).filter(|k| !self.heights_m[*k].is_finite()).collect();
-        while !missing.is_empty() {
+        let is_missing = |tile: &Self, k: usize| !tile.heights_m[k].is_finite();
+        let mut ring: Vec<usize> = (0..self.heights_m.len())
+            .filter(|k| is_missing(self, *k) && self.mean_around(*k).is_some())
+            .collect();
+        let mut listed = vec![false; self.heights_m.len()];
+        while !ring.is_empty() {
             let filled: Vec<(usize, f32)> =
-                missing.iter().filter_map(|k| Some((*k, self.mean_around(*k)?))).collect();
-            if filled.is_empty() {
-                return;
+                ring.iter().filter_map(|k| Some((*k, self.mean_around(*k)?))).collect();
+            filled.iter().for_each(|(k, h)| self.heights_m[*k] = *h);
+            ring.clear();
+            for (k, _) in filled {
+                let next = self.around(k).filter(|k| is_missing(self, *k));
+                ring.extend(next.filter(|k| !std::mem::replace(&mut listed[*k], true)));
             }
-            filled.into_iter().for_each(|(k, h)| self.heights_m[k] = h);
-            missing.retain(|k| !self.heights_m[*k].is_finite());
         }
     }
 
+    /// A height and its neighbours, by their places in the list.
+    fn around(&self, k: usize) -> impl Iterator<Item = usize> + use<> {
+        let (row, column, columns) = (k / self.columns, k % self.columns, self.columns);
+        let beside = |at: usize, count: usize| at.saturating_sub(1)..=(at + 1).min(count - 1);
+        let across = beside(column, columns);
+        beside(row, self.rows).flat_map(move |r| across.clone().map(move |c| r * columns + c))
+    }
+
     fn mean_around(&self, k: usize) -> Option<f32> {
-        let (row, column) = (k / self.columns, k % self.columns);
-        let (mut sum, mut n) = (0.0, 0u8);
-        for r in row.saturating_sub(1)..=(row + 1).min(self.rows - 1) {
-            for c in column.saturating_sub(1)..=(column + 1).min(self.columns - 1) {
-                let h = self.heights_m[r * self.columns + c];
-                if h.is_finite() {
-                    sum += h;
-                    n += 1;
-                }
-            }
-        }
+        let known = self.around(k).map(|k| self.heights_m[k]).filter(|h| h.is_finite());
+        let (sum, n) = known.fold((0.0, 0u8), |(sum, n), h| (sum + h, n + 1));
         (n > 0).then(|| sum / f32::from(n))
     }
 
@@ -301,6 +305,23 @@ mod tests {
         assert!((level - 75.0).abs() < 0.05, "{level}");
         assert!(terrain.intersect(&origin, &-Vector3::x(), 0.0).is_none());
         assert!(terrain.intersect(&Vector3::new(0.0, 0.0, 1.0), &Vector3::z(), 0.0).is_none());
+    }
+
+    #[test]
+    fn a_void_is_filled_from_its_border_inwards_however_large_it_is() {
+        // Given a tile of the finest kind, half of it missing on one side, and a hole in the other.
+        let side = 1201;
+        let is_void = |r: usize, c: usize| c < side / 2 || (r == 600 && c == 900);
+        let height = |k: usize| if is_void(k / side, k % side) { f32::NAN } else { (k / side) as f32 };
+        let step = 1.0 / (side - 1) as f64;
+        let heights = (0..side * side).map(height).collect();
+        let tile = Tile::new((1.0, 0.0), [step; 2], (side, side), heights).expect("half of it is there");
+        let at = |r: usize, c: usize| tile.heights_m[r * side + c];
+        assert!(tile.heights_m.iter().all(|h| h.is_finite()));
+        assert_eq!((at(600, 900), at(300, 700)), (600.0, 300.0));
+        // The first ring is the mean of its neighbours, and so is the next: along a ramp these are the ramp's.
+        assert_eq!((at(600, side / 2 - 1), at(600, side / 2 - 2), at(0, side / 2 - 1)), (600.0, 600.0, 0.5));
+        assert!((at(600, 0) - 600.0).abs() < 1.0, "{}", at(600, 0));
     }
 
     #[test]

@@ -144,8 +144,13 @@ pub struct TargetState {
     pub lat_deg: f64,
     /// Longitude of the reference point, degrees.
     pub lon_deg: f64,
+    /// Height of the ground under it above the ellipsoid, metres.
+    pub height_m: f64,
     /// Covariance of (north, east, heading, speed, yaw rate); `None` from the paper's estimator.
     pub covariance: Option<SMatrix<f64, 5, 5>>,
+    /// One-sigma of the horizontal position relative to the helicopter, larger axis, metres; `None` where the
+    /// estimator does not tell it (the smoother's and the paper's do not).
+    pub relative_sigma_m: Option<f64>,
 }
 
 /// A target's estimate at one frame.
@@ -283,6 +288,8 @@ pub struct MarkerPair {
 pub enum EstimatorOutput {
     /// A target at a frame, as known when the frame had been looked at.
     Estimate(TargetEstimate),
+    /// A target at a tick, while no frame comes: predicted, and lost in its time. `frame` is that of the last estimate.
+    Coasted(TargetEstimate),
     /// A target at an earlier frame, with what was measured up to the smoother's lag after it.
     Smoothed(TargetEstimate),
     /// The helicopter at a frame, or between frames.

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::{Source, WarmState};
+use super::{AttitudeSample, InertialSample, Source, WarmState};
 use crate::time::MonoTime;
 
 /// One thing heard, in the order it was heard.
@@ -28,6 +28,20 @@ pub enum EventBody {
     },
     /// One camera frame.
     Frame(FramePayload),
+    /// A sample of rates and forces, in the sensor's axes.
+    Inertial {
+        /// Whose.
+        source: Source,
+        /// It.
+        sample: InertialSample,
+    },
+    /// A sample of attitude.
+    Attitude {
+        /// Whose.
+        source: Source,
+        /// It.
+        sample: AttitudeSample,
+    },
     /// Time passed and nothing arrived. It follows from the times of the events around it, so it is not kept.
     Tick,
     /// Something was lost before it could be recorded.
@@ -51,7 +65,9 @@ impl EventBody {
     /// The source that delivered it; `None` for what no source delivers.
     pub const fn delivered_by(&self) -> Option<Source> {
         match self {
-            Self::Bytes { source, .. } => Some(*source),
+            Self::Bytes { source, .. } | Self::Inertial { source, .. } | Self::Attitude { source, .. } => {
+                Some(*source)
+            }
             Self::Frame(_) => Some(Source::Camera),
             _ => None,
         }

@@ -51,6 +51,8 @@ pub struct Health {
     pub sats: Option<u32>,
     /// One-sigma of the fit from UTC to host time.
     pub clock_sigma: Option<Span>,
+    /// UTC less host time, by the receiver; `None` until it told both with a fix.
+    pub utc_minus_host: Option<Span>,
     /// Targets, in the order of the configuration.
     pub targets: Vec<TargetHealth>,
     /// Measurements by what became of them, since the start.

@@ -9,6 +9,10 @@ pub enum Delivery {
     Bytes,
     /// Camera frames.
     Frames,
+    /// Samples of rates and forces.
+    Inertial,
+    /// Samples of attitude.
+    Attitude,
 }
 
 /// What is the same for a source in every recording and every run.
@@ -54,6 +58,10 @@ sources! {
     Compass: "compass", Bytes, "/compass/serial", silent after 1500 ms;
     /// Camera.
     Camera: "camera", Frames, "/camera/image", silent after 1500 ms;
+    /// Gyros and accelerometers.
+    Imu: "imu", Inertial, "/imu/samples", silent after 1500 ms;
+    /// Second source of attitude.
+    Attitude: "attitude", Attitude, "/attitude/samples", silent after 1500 ms;
 }
 
 impl Source {

@@ -51,11 +51,11 @@ pub struct EstimatorConfig {
     pub tilt_rate_walk: f64,
     /// Random walk of the aircraft's yaw rate, rad/s per √s.
     pub yaw_rate_walk: f64,
-    /// One-sigma of the specific force across the rotor axis (drag, gusts), m/s².
+    /// One-sigma of the force of gusts, an axis over the mass, m/s².
     pub side_force_mps2: f64,
-    /// One-sigma of the thrust about the weight, m/s².
+    /// One-sigma of the thrust beyond the weight, m/s².
     pub thrust_mps2: f64,
-    /// Correlation time of both forces, seconds.
+    /// Correlation time of the gusts, seconds.
     pub force_tau_s: f64,
     /// Random walk of the ground vehicle's speed, m/s per √s.
     pub target_speed_walk: f64,
@@ -79,11 +79,11 @@ impl Default for EstimatorConfig {
             features: 8,
             feature_sigma_factor: 2.0,
             marker_noise_px: 0.1,
-            tilt_rate_walk: 0.4,
-            yaw_rate_walk: 0.15,
-            side_force_mps2: 0.7,
-            thrust_mps2: 0.7,
-            force_tau_s: 10.0,
+            tilt_rate_walk: 1.0,
+            yaw_rate_walk: 0.3,
+            side_force_mps2: 0.5,
+            thrust_mps2: 1.0,
+            force_tau_s: 3.0,
             target_speed_walk: 0.5,
             target_yaw_rate_walk: 0.25,
             target_slip_walk: 0.01,

@@ -15,7 +15,7 @@ pub use inertial::{AttitudeConfig, ImuConfig};
 pub use montecarlo::{Distribution, MonteCarloConfig};
 pub use rig::Rig;
 pub use sensors::{
-    CameraConfig, CameraMount, CompassConfig, CompassFormat, Datum, Declination, GpsConfig, GroundConfig,
-    GroundSource, PixelFormat, TiltKind,
+    CameraConfig, CameraMount, CompassConfig, CompassFormat, Datum, Declination, GpsConfig, GpsFormat,
+    GroundConfig, GroundSource, PixelFormat, TiltKind,
 };
 pub use target::{Brightness, MarkerConfig, MarkerKind, TargetConfig, TargetModel};

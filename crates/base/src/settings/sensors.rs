@@ -13,6 +13,9 @@ pub struct GpsConfig {
     pub device: String,
     /// Line speed, bits a second.
     pub baud: u32,
+    /// What the receiver speaks: sentences ("nmea"), u-blox's packets ("ubx"), or either ("auto").
+    #[serde(default)]
+    pub format: GpsFormat,
     /// Antenna in the body frame, forward-right-down, metres.
     #[serde(default)]
     pub antenna_position_m: [f64; 3],
@@ -40,6 +43,19 @@ pub struct GpsConfig {
     /// Pulse-per-second device (`/dev/pps0`) that marks the receiver's seconds.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pps_device: Option<String>,
+}
+
+/// What a receiver speaks.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum GpsFormat {
+    /// Sentences and packets, as they come.
+    #[default]
+    Auto,
+    /// NMEA 0183, with Garmin's own sentences.
+    Nmea,
+    /// u-blox's packets.
+    Ubx,
 }
 
 /// `[compass]`
@@ -197,6 +213,10 @@ pub struct CameraConfig {
     /// Added to the driver's stamp to reach mid-exposure, ms.
     #[serde(default)]
     pub exposure_offset_ms: f64,
+    /// Rolling shutter: from the exposure of the first row to that of the last, ms; 0 where all are exposed together. The
+    /// driver's stamp with `exposure_offset_ms` is then the middle row's mid-exposure.
+    #[serde(default)]
+    pub readout_ms: f64,
     /// The lens.
     pub intrinsics: CameraModel,
     /// How it is mounted.

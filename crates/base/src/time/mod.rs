@@ -8,12 +8,14 @@
 mod fit;
 #[cfg(test)]
 mod fit_tests;
+mod frames;
 mod jitter;
 mod pulse;
 mod steady;
 mod utc;
 
 pub use fit::{ClockFit, GnssClock};
+pub use frames::FrameClock;
 pub use pulse::PulseTrouble;
 pub use steady::SteadyClock;
 pub use utc::{Civil, EARLIEST_UTC, UtcTime, days_in_month};

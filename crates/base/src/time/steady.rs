@@ -102,6 +102,19 @@ impl SteadyClock {
         Some(Span::from_ms(self.fit.at(self.index as f64 * period_s).1))
     }
 
+    /// The arrivals that the line is fitted over, the last one last: time of the count, s, and arrival against it, ms. None
+    /// while the rate is not known.
+    pub(super) fn counted(&self) -> impl DoubleEndedIterator<Item = Point> + Clone + '_ {
+        self.points.iter().copied()
+    }
+
+    /// Where among [`Self::counted`] this arrival is; `None` where it was not counted.
+    pub(super) fn deviation_of(&self, arrival: MonoTime) -> Option<Point> {
+        let since_s = (arrival - self.reference).s();
+        let last = self.points.back()?;
+        self.period_s.map(|_| *last).filter(|(t_s, ms)| ((since_s - t_s) * 1e3 - ms).abs() < 1e-6)
+    }
+
     fn forget(&mut self) {
         self.period_s = None;
         self.recent.clear();

@@ -105,7 +105,7 @@ impl TextInput {
         out: &mut Vec<HeardAttitude>,
     ) {
         let Self { lines, sentence: read, bare, has_checksums, together } = self;
-        lines.push(bytes, t_recv, counts, |line, counts| {
+        lines.push(bytes, 0, t_recv, counts, |line, counts| {
             if line.text.contains(&b'*') {
                 *has_checksums = true;
             } else if *has_checksums || bare.is_none() {

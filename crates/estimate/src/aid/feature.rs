@@ -5,7 +5,7 @@ use nalgebra::{Matrix2, Vector2, Vector3};
 use windhover_base::msg::{Disposition, FusionSource};
 
 use super::Aid;
-use super::pixel::{self, PoseColumns};
+use super::pixel::{self, CameraColumns, Moment};
 use crate::core::Core;
 use crate::fitted::blend_factor;
 use crate::measurement::Measurement;
@@ -37,7 +37,8 @@ impl Aid for FeaturePixel {
         let curvature = pixel::curvature_px2(&state.cov, models);
         let noise = Matrix2::identity() * (known * state.learnt.feature_factor + curvature);
         z.begin(2);
-        PoseColumns::touch(z).set_point(z, 0, &self.px, &view, &noise);
+        let moment = Moment::of(&state.own, models, &view, &Vector3::zeros(), &self.px);
+        CameraColumns::touch(z).set_point(z, 0, &self.px, &state.own, &view, &moment, &noise);
         let north = view.d_point * Vector3::new(1.0, 0.0, slope_n);
         let east = view.d_point * Vector3::new(0.0, 1.0, slope_e);
         z.block(state.layout().feature(self.slot), &Matrix2::from_columns(&[north, east]));

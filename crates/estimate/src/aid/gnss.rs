@@ -53,12 +53,18 @@ impl GpsVelocity {
 /// Fuses one epoch: velocity, then position.
 pub(crate) fn fuse(core: &mut Core, epoch: &GnssEpoch) {
     match velocity(epoch) {
-        Some(velocity) if velocity.is_credible() => velocity.fuse(core),
+        Some(velocity) if velocity.is_credible() => {
+            core.watch_tilt(velocity.ned_mps.xy());
+            velocity.fuse(core);
+        }
         Some(_) => core.refuse(FusionSource::GpsVelocity, Disposition::Invalid),
         None => {}
     }
     match position(epoch, &core.models) {
-        Some(position) if position.is_credible() => position.fuse(core),
+        Some(position) if position.is_credible() => {
+            core.sense_fix(epoch.fix);
+            position.fuse(core);
+        }
         Some(_) => core.refuse(FusionSource::GpsPosition, Disposition::Invalid),
         None => {}
     }

@@ -1,7 +1,7 @@
 //! GPS position: `z = p + R l + b − vₐ τ + ½ a τ²`, with the velocity vₐ of the antenna at l and the delay τ.
 //!
 //! Left out of the Jacobian, since it is small beside a fix's metre of noise (`jacobians.rs` holds the bounds): what
-//! τ and ½ τ² make of attitude (0.25 m/rad), rate (0.12 m per rad/s), force (0.01 m per m/s²) and drag
+//! τ and ½ τ² make of attitude and trim (0.25 m/rad), rate (0.12 m per rad/s), forces (0.01 m per m/s²) and drag
 //! (0.09 m per 1/s), and ½ τ² c of velocity (0.5 %), at 0.15 s, 8 m/s, 1 rad/s and 0.8 m of lever arm.
 
 use nalgebra::{Matrix3, Vector3};
@@ -13,6 +13,7 @@ use super::{Aid, counted, gps_velocity};
 use crate::blocks::own;
 use crate::core::Core;
 use crate::fitted::blend_factor;
+use crate::force::Force;
 use crate::measurement::Measurement;
 use crate::models::Models;
 use crate::state::State;
@@ -35,15 +36,15 @@ impl Aid for GpsPosition {
         let arm = own.ned_from_body * models.antenna_at;
         let velocity = own.velocity_of(&models.antenna_at);
         let tau = own.gps_delay_s;
-        let expected =
-            own.position + arm + own.gps_bias - velocity * tau + own.acceleration() * (0.5 * tau * tau);
-        let noise_var = models.gps_noise_var * state.learnt.gps_factor;
+        let acceleration = Force::of(own).acceleration();
+        let expected = own.position + arm + own.gps_bias - velocity * tau + acceleration * (0.5 * tau * tau);
+        let noise_var = state.senses.gps_noise_var * state.learnt.gps_factor;
         z.begin(if self.has_height { 3 } else { 2 });
         z.block(own::POSITION, &Matrix3::identity());
         z.block(own::VELOCITY, &Matrix3::from_diagonal_element(-tau));
         z.block(own::ATTITUDE, &-skew(&arm));
         z.block(own::GPS_BIAS, &Matrix3::identity());
-        z.block(own::GPS_DELAY, &(-velocity + own.acceleration() * tau));
+        z.block(own::GPS_DELAY, &(-velocity + acceleration * tau));
         for i in 0..z.m {
             z.residual[i] = self.ned_m[i] - expected[i];
             z.noise[i][i] = noise_var * if i == 2 { HEIGHT_FACTOR } else { 1.0 };

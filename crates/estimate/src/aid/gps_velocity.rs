@@ -1,7 +1,4 @@
-//! GPS velocity: `z = v + R (ω × l) − a τ`, with the antenna at l, the acceleration a = R f + g − c v and the delay τ.
-//!
-//! Left out of the Jacobian: `c τ` of velocity, beside one (6 % at 0.4 /s and 0.15 s: 3 mm/s where velocity is known to
-//! 0.05 m/s).
+//! GPS velocity: `z = v + R (ω × l) − a τ`, with the antenna at l, the acceleration a (`force.rs`) and the delay τ.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -12,6 +9,7 @@ use super::{Aid, counted};
 use crate::blocks::own;
 use crate::core::Core;
 use crate::fitted::blend_factor;
+use crate::force::{D_WIND, Force};
 use crate::measurement::Measurement;
 use crate::models::Models;
 use crate::state::State;
@@ -35,17 +33,20 @@ impl Aid for GpsVelocity {
     fn linearise(&self, state: &State, models: &Models, z: &mut Measurement) -> Result<(), Disposition> {
         let own = &state.own;
         let tau = own.gps_delay_s;
-        let acceleration = own.acceleration();
+        let force = Force::of(own);
+        let acceleration = force.acceleration();
         let expected = own.velocity_of(&models.antenna_at) - acceleration * tau;
         let swing = own.ned_from_body * own.rate.cross(&models.antenna_at);
-        let pushed = skew(&(own.ned_from_body * own.force));
         z.begin(if self.has_down { 3 } else { 2 });
-        z.block(own::VELOCITY, &Matrix3::identity());
-        z.block(own::ATTITUDE, &(-skew(&swing) + pushed * tau));
+        z.block(own::VELOCITY, &Matrix3::from_diagonal_element(1.0 + own.drag_per_s * tau));
+        z.block(own::ATTITUDE, &(-skew(&swing) - force.d_attitude * tau));
         z.block(own::RATE, &(-own.rotation() * skew(&models.antenna_at)));
-        z.block(own::FORCE, &(-own.rotation() * tau));
+        z.block(own::GUST, &(D_WIND * -tau));
+        z.block(own::THRUST, &(force.d_thrust * -tau));
+        z.block(own::WIND, &(D_WIND * -tau));
+        z.block(own::TRIM, &(force.d_trim * -tau));
         z.block(own::GPS_DELAY, &-acceleration);
-        z.block(own::DRAG, &(own.velocity * tau));
+        z.block(own::DRAG, &(force.d_drag * -tau));
         for i in 0..z.m {
             z.residual[i] = self.ned_mps[i] - expected[i];
             z.noise[i][i] = models.gps_velocity_var * state.learnt.gps_velocity_factor;

@@ -12,6 +12,8 @@ pub(crate) mod gps_position;
 pub(crate) mod gps_velocity;
 pub(crate) mod heading;
 pub(crate) mod pixel;
+pub(crate) mod rate;
+pub(crate) mod specific_force;
 pub(crate) mod tag;
 pub(crate) mod tilt;
 
@@ -44,7 +46,7 @@ impl Core {
     /// Fuses, without gate or report, what a prior was just made from.
     pub(crate) fn fuse_aid_as_it_is<A: Aid>(&mut self, aid: &A) {
         if self.expect_aid(aid) {
-            self.fuse(None);
+            self.fuse(A::SOURCE, None);
         }
     }
 

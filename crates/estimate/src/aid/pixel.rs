@@ -48,31 +48,71 @@ pub(crate) fn target_point(
     (turned + Vector3::new(north, east, down), derivatives)
 }
 
-/// The columns of the camera's pose in a measurement of pixels.
-#[derive(Clone, Copy)]
-pub(crate) struct PoseColumns {
-    pub(crate) position: Columns<3>,
-    attitude: Columns<3>,
+/// When the row of a point is exposed against the middle of its frame, and how it moves through the picture.
+///
+/// A row at the share `s` of the frame's height, −½ at the top, is exposed `τ = s r` after the middle one, with `r` from the
+/// first row to the last. So a point appears at `π(x) + τ π̇(x)`: over some milliseconds its way through the picture is
+/// straight.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Moment {
+    /// `τ`, s.
+    pub(crate) after_s: f64,
+    /// `π̇`, px/s.
+    flow: Vector2<f64>,
 }
 
-impl PoseColumns {
+impl Moment {
+    /// Of a point that moves with this velocity (NED), seen at `px`.
+    pub(crate) fn of(
+        own: &Own,
+        models: &Models,
+        view: &PointView,
+        velocity: &Vector3<f64>,
+        px: &Vector2<f64>,
+    ) -> Self {
+        let share = px.y / (models.image_px.1 - 1.0) - 0.5;
+        let flow = view.d_point * (velocity - own.velocity) + view.d_attitude * (own.rotation() * own.rate);
+        Self { after_s: share * models.readout_s, flow }
+    }
+}
+
+/// The columns of a measurement of pixels that concern the camera: its pose and motion.
+#[derive(Clone, Copy)]
+pub(crate) struct CameraColumns {
+    position: Columns<3>,
+    velocity: Columns<3>,
+    attitude: Columns<3>,
+    rate: Columns<3>,
+}
+
+impl CameraColumns {
     /// Adds them to a measurement.
     pub(crate) fn touch(z: &mut Measurement) -> Self {
-        Self { position: z.touch(own::POSITION), attitude: z.touch(own::ATTITUDE) }
+        Self {
+            position: z.touch(own::POSITION),
+            velocity: z.touch(own::VELOCITY),
+            attitude: z.touch(own::ATTITUDE),
+            rate: z.touch(own::RATE),
+        }
     }
 
-    /// Writes point `i`, seen at `px`, with what concerns the camera's pose.
+    /// Writes point `i`, seen at `px`, with what concerns the camera.
     pub(crate) fn set_point(
         self,
         z: &mut Measurement,
         i: usize,
         px: &Vector2<f64>,
+        own: &Own,
         view: &PointView,
+        moment: &Moment,
         noise: &Matrix2<f64>,
     ) {
-        let residual = px - view.px;
+        let residual = px - view.px - moment.flow * moment.after_s;
+        let after_s = moment.after_s;
         z.set(2 * i, self.position, &-view.d_point);
+        z.set(2 * i, self.velocity, &(view.d_point * -after_s));
         z.set(2 * i, self.attitude, &view.d_attitude);
+        z.set(2 * i, self.rate, &(view.d_attitude * own.rotation() * after_s));
         for r in 0..2 {
             z.residual[2 * i + r] = residual[r];
             for c in 0..2 {

@@ -1,11 +1,11 @@
 //! A tag on a vehicle: its four corners at once, each through lens, mount, lever arms and the ground under the vehicle.
 
-use nalgebra::{Matrix2, Matrix2x3, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix2x5, Vector2, Vector3};
 
 use windhover_base::msg::{Disposition, FusionSource};
 
 use super::Aid;
-use super::pixel::{self, PoseColumns};
+use super::pixel::{self, CameraColumns, Moment};
 use crate::blocks::own;
 use crate::core::Core;
 use crate::fitted::blend_factor;
@@ -56,15 +56,24 @@ pub(super) fn linearise_points<'a>(
     let curvature = pixel::curvature_px2(&state.cov, models);
     let factor = state.learnt.marker_factor[target];
     z.begin(2 * seen.len());
-    let camera = PoseColumns::touch(z);
-    let pose = z.touch(state.layout().target(target).pose());
+    let camera = CameraColumns::touch(z);
+    let vehicle = z.touch(state.layout().target(target).all());
+    let [_, _, heading, speed, yaw_rate] = *mean;
+    let (s, c) = heading.sin_cos();
     for (i, Sighting { point, px, cov_px2 }) in seen.enumerate() {
         let (world, derivatives) = pixel::target_point(mean, models, point);
         let view = pixel::view(&state.own, models, &world).ok_or(Disposition::Invalid)?;
         let known = cov_px2 + Matrix2::identity() * models.marker_var_px2;
         let noise = known * factor + Matrix2::identity() * curvature;
-        camera.set_point(z, i, px, &view, &noise);
-        z.set(2 * i, pose, &Matrix2x3::from_columns(&derivatives.map(|d| view.d_point * d)));
+        // The point's velocity and its derivatives by speed, yaw rate and heading.
+        let [north, east, turn] = derivatives;
+        let ahead = north * c + east * s;
+        let moment = Moment::of(&state.own, models, &view, &(ahead * speed + turn * yaw_rate), px);
+        camera.set_point(z, i, px, &state.own, &view, &moment, &noise);
+        let later = moment.after_s;
+        let sideways = (east * c - north * s) * (speed * later);
+        let by = [north, east, turn + sideways, ahead * later, turn * later];
+        z.set(2 * i, vehicle, &Matrix2x5::from_columns(&by.map(|d| view.d_point * d)));
     }
     Ok(())
 }

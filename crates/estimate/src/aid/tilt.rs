@@ -1,7 +1,9 @@
-//! Compass tilt: `z = k (−d₁, d₂) + b`, where d is down in the body frame and k how much of the tilt the
-//! sensor reads: 1 on the ground, little on a rotorcraft, whose tilt sensor feels specific force.
+//! Tilt of the compass, or of the second source of attitude: `z = k (−w₁, w₂) + b + e` with a constant bias b and a slow error e. What w is depends on what the
+//! sensor feels (`kind.rs`): down in the body frame `d = Rᵀ e_D` where it tells attitude, or a share k of it; against the
+//! specific force, `u = −Rᵀ f/|f|`, where it feels that. In steady flight the two are the same; only acceleration parts
+//! them. A sensor of unknown kind is taken as one that tells attitude, with an error e that covers the others.
 
-use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix3, SMatrix, Vector2, Vector3};
 
 use windhover_base::geo::skew;
 use windhover_base::msg::{Disposition, FusionSource};
@@ -11,13 +13,16 @@ use super::{Aid, counted};
 use crate::blocks::own;
 use crate::core::Core;
 use crate::fitted::blend_noise;
+use crate::force::{D_WIND, Force};
+use crate::kind::Felt;
 use crate::measurement::Measurement;
 use crate::models::Models;
+use crate::own::{Own, PLACES, SECOND};
 use crate::state::State;
 
-/// Down in the body frame as the sensor has it.
+/// Down in the body frame as the sensor of the compass (0) or of the second source of attitude (1) has it.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct TiltReading {
+pub(crate) struct TiltReading<const WHICH: usize> {
     pub(crate) down: Vector3<f64>,
 }
 
@@ -27,66 +32,87 @@ const SIGNS: [f64; 2] = [-1.0, 1.0];
 /// Limits of the fitted variance, as factors on that configured.
 const LIMITS: (f64, f64) = (0.25, 400.0);
 
-/// Readings over which the product of the errors of gain and tilt stays what it is: two seconds of a
-/// 30 Hz compass. Its variance counts so many times, since it does not average out.
-const UNTIED: f64 = 60.0;
-
-impl Aid for TiltReading {
-    const SOURCE: FusionSource = FusionSource::CompassTilt;
+impl<const WHICH: usize> Aid for TiltReading<WHICH> {
+    const SOURCE: FusionSource =
+        if WHICH == SECOND { FusionSource::AttitudeTilt } else { FusionSource::CompassTilt };
 
     fn linearise(&self, state: &State, _models: &Models, z: &mut Measurement) -> Result<(), Disposition> {
-        let own = &state.own;
-        let body_from_ned: Matrix3<f64> = own.rotation().transpose();
-        let d = body_from_ned.column(2).into_owned();
-        let d_attitude = body_from_ned * skew(&Vector3::z());
-        let k = own.tilt_gain;
+        let (own, places, errors) = (&state.own, &PLACES[WHICH], state.own.errors_of(WHICH));
+        let gain = errors.tilt_gain;
         z.begin(2);
-        z.block(own::ATTITUDE, &Matrix2x3::from_fn(|i, j| k * SIGNS[i] * d_attitude[(i, j)]));
-        z.block(own::TILT_GAIN, &Vector2::from_fn(|i, _| SIGNS[i] * d[i]));
-        z.block(own::TILT_BIAS, &Matrix2::identity());
+        let felt = match state.tilt[WHICH].felt {
+            Felt::Force => set_force(own, gain, z),
+            Felt::Undecided | Felt::Attitude | Felt::Share => set_down(own, gain, z),
+        };
+        z.block(places.tilt_gain, &Vector2::from_fn(|i, _| SIGNS[i] * felt[i]));
+        z.block(places.tilt_bias, &Matrix2::identity());
+        z.block(places.tilt_error, &Matrix2::identity());
         for (i, sign) in SIGNS.into_iter().enumerate() {
-            z.residual[i] = sign * self.down[i] - k * sign * d[i] - own.tilt_bias[i];
-            z.noise[i][i] = state.learnt.tilt_var + UNTIED * product_var(state, i, &d_attitude);
+            let error = errors.tilt_bias[i] + errors.tilt_error[i];
+            z.residual[i] = sign * (self.down[i] - gain * felt[i]) - error;
+            z.noise[i][i] = state.learnt.tilt_var[WHICH];
         }
         Ok(())
     }
 }
 
-impl TiltReading {
-    /// Fuses it; after too many outside the gate the sensor is trusted less, and its gain unknown again.
+/// Writes what down in the body frame depends on, and gives it.
+fn set_down(own: &Own, gain: f64, z: &mut Measurement) -> Vector3<f64> {
+    let body_from_ned: Matrix3<f64> = own.rotation().transpose();
+    z.block(own::ATTITUDE, &in_reading(gain, &(body_from_ned * skew(&Vector3::z()))));
+    body_from_ned.column(2).into_owned()
+}
+
+/// Writes what the direction against the specific force depends on, and gives it:
+/// `∂u = −(I − u uᵀ)/|f| Rᵀ (∂f + f × ∂δ)`.
+fn set_force(own: &Own, gain: f64, z: &mut Measurement) -> Vector3<f64> {
+    let force = Force::of(own);
+    let size = force.ned.norm().max(LEAST_FORCE);
+    let body_from_ned: Matrix3<f64> = own.rotation().transpose();
+    let felt = -(body_from_ned * force.ned) / size;
+    let d_force = (felt * felt.transpose() - Matrix3::identity()) / size * body_from_ned;
+    z.block(own::ATTITUDE, &in_reading(gain, &(d_force * (force.d_attitude + skew(&force.ned)))));
+    z.block(own::VELOCITY, &in_reading(gain, &(d_force * -own.drag_per_s)));
+    z.block(own::GUST, &in_reading(gain, &(d_force * D_WIND)));
+    z.block(own::THRUST, &in_reading(gain, &(d_force * force.d_thrust)));
+    z.block(own::WIND, &in_reading(gain, &(d_force * D_WIND)));
+    z.block(own::TRIM, &in_reading(gain, &(d_force * force.d_trim)));
+    z.block(own::DRAG, &in_reading(gain, &(d_force * force.d_drag)));
+    felt
+}
+
+/// A force smaller than this has no direction, m/s²: nothing flies so for long.
+const LEAST_FORCE: f64 = 1.0;
+
+/// The derivative of a reading from that of the direction it reads.
+fn in_reading<const N: usize>(gain: f64, d: &SMatrix<f64, 3, N>) -> SMatrix<f64, 2, N> {
+    SMatrix::from_fn(|i, j| gain * SIGNS[i] * d[(i, j)])
+}
+
+impl<const WHICH: usize> TiltReading<WHICH> {
+    /// Fuses it. While no marker is seen, the second one in a row outside the gate shows a helicopter that turns faster
+    /// than was thought: it is no outlier. After too many the sensor is trusted less.
     pub(crate) fn fuse(&self, core: &mut Core) {
-        let Some(outcome) = core.fuse_aid(self) else { return };
+        if !core.expect_aid(self) {
+            return;
+        }
+        core.wake_own(core.state.rejections.tilt[WHICH]);
+        let outcome = core.fuse_gated(Self::SOURCE);
         if core.teaches(&outcome) {
-            let start = core.learning.start.tilt_var;
+            let start = core.learning.start.tilt_var[WHICH];
             let gain = 0.5 * SAMPLE_GAIN_S / core.learning.over_s;
             let limits = (LIMITS.0 * start, LIMITS.1 * start);
-            let value = &mut core.state.learnt.tilt_var;
+            let value = &mut core.state.learnt.tilt_var[WHICH];
             for (residual, innovation_var) in core.z.residual.into_iter().zip(outcome.innovation_var).take(2)
             {
                 blend_noise(value, residual, innovation_var, gain, limits);
             }
         }
         let state = &mut core.state;
-        state.rejections.tilt = counted(state.rejections.tilt, outcome.ratio);
-        if state.rejections.tilt >= 6 * core.restart_after {
-            state.rejections.tilt = 0;
-            state.learnt.tilt_var *= 16.0;
-            state.renew(own::TILT_GAIN, &[0.25]);
+        state.rejections.tilt[WHICH] = counted(state.rejections.tilt[WHICH], outcome.ratio);
+        if state.rejections.tilt[WHICH] >= 6 * core.restart_after {
+            state.rejections.tilt[WHICH] = 0;
+            state.learnt.tilt_var[WHICH] *= 16.0;
         }
     }
-}
-
-/// Variance of the product of the errors of tilt gain and of `d_i`, which the linear model leaves out:
-/// as long as the gain is unknown, a reading near zero does not prove that the aircraft is level.
-fn product_var(state: &State, i: usize, d_attitude: &Matrix3<f64>) -> f64 {
-    let attitude = state.cov.block(own::ATTITUDE, own::ATTITUDE);
-    let with_gain = state.cov.block(own::ATTITUDE, own::TILT_GAIN);
-    let (mut tilt_var, mut mixed) = (0.0, 0.0);
-    for a in 0..3 {
-        for b in 0..3 {
-            tilt_var += d_attitude[(i, a)] * d_attitude[(i, b)] * attitude[(a, b)];
-        }
-        mixed += d_attitude[(i, a)] * with_gain[a];
-    }
-    (state.cov.var(own::TILT_GAIN) * tilt_var + mixed * mixed).max(0.0)
 }

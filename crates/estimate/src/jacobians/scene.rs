@@ -7,7 +7,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use windhover_base::geo::{Geodetic, Ground, LocalFrame, Terrain, Tile, ned_from_body_321};
-use windhover_base::settings::{EstimatorConfig, Rig};
+use windhover_base::settings::{AttitudeConfig, EstimatorConfig, ImuConfig, Rig};
 use windhover_base::time::MonoTime;
 
 use crate::Site;
@@ -86,7 +86,8 @@ position_m = [0.0, 0.0, 0.0]
 pub(crate) mod most {
     pub(crate) const SPEED: f64 = 8.0;
     pub(crate) const RATE: f64 = 1.0;
-    pub(crate) const FORCE: f64 = super::GRAVITY + 3.0;
+    /// Thrust over mass, by its derivative toward tilt.
+    pub(crate) const FORCE: f64 = 1.3 * (super::GRAVITY + 1.5);
     pub(crate) const DELAY_S: f64 = 0.15;
     pub(crate) const DRAG: f64 = 0.4;
     pub(crate) const ARM: f64 = 0.8;
@@ -133,7 +134,9 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
     own.position = vector(20.0);
     own.velocity = vector(most::SPEED / 3f64.sqrt());
     own.rate = vector(most::RATE / 3f64.sqrt());
-    own.force = Vector3::new(0.0, 0.0, -GRAVITY) + vector(3.0 / 3f64.sqrt());
+    (own.gust, own.wind) = (vector(1.0).xy(), vector(1.5).xy());
+    (own.trim, own.tilt_error) = (vector(0.1).xy(), vector(0.05).xy());
+    own.thrust = vector(1.5).x;
     own.gps_bias = vector(2.0);
     own.heading_bias = within(0.1);
     own.tilt_gain = 0.6 + within(0.5);
@@ -155,6 +158,20 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
     core
 }
 
+/// The same filter with gyros, accelerometers and a second source of attitude besides.
+pub(crate) fn with_every_sensor(core: Core) -> Core {
+    let mut rig: Rig = toml::from_str(RIG).expect("the rig is valid");
+    (rig.imu, rig.attitude) = (Some(ImuConfig::default()), Some(AttitudeConfig::default()));
+    let mut other = Core::new(&rig, &EstimatorConfig::default(), &site(Ground::Flat { down_m: 0.0 }));
+    other.state.own = core.state.own;
+    other.state.own.rate_bias = Vector3::new(0.01, -0.02, 0.03);
+    other.state.own.force_bias = Vector3::new(0.1, -0.2, 0.3);
+    other.state.own.second.heading_bias = 0.05;
+    other.state.own.second.tilt_bias = Vector2::new(0.01, -0.02);
+    (other.state.alive, other.state.t) = (true, core.state.t);
+    other
+}
+
 /// The state moved by a step along one column.
 pub(crate) fn moved(core: &Core, column: usize, by: f64) -> Core {
     let mut core = core.clone();
@@ -171,16 +188,15 @@ pub(crate) fn difference(to: &State, from: &State) -> Vec<f64> {
     let mut put = |columns: std::ops::Range<usize>, value: &[f64]| dx[columns].copy_from_slice(value);
     let (a, b) = (&to.own, &from.own);
     let turn = (a.ned_from_body * b.ned_from_body.inverse()).scaled_axis();
-    let vectors: [(Block<3>, Vector3<f64>); 5] = [
+    let vectors: [(Block<3>, Vector3<f64>); 4] = [
         (own::POSITION, a.position - b.position),
         (own::VELOCITY, a.velocity - b.velocity),
         (own::ATTITUDE, turn),
         (own::RATE, a.rate - b.rate),
-        (own::FORCE, a.force - b.force),
     ];
     vectors.iter().for_each(|(block, vector)| put(block.range(), vector.as_slice()));
     let less = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a - b).collect::<Vec<_>>();
-    put(own::SLOW.range(), &less(&a.slow(), &b.slow()));
+    put(layout.slow(), &less(&a.slow(), &b.slow())[..layout.slow().len()]);
     for i in 0..layout.targets {
         put(layout.target(i).all().range(), &less(&to.targets[i].mean, &from.targets[i].mean));
     }

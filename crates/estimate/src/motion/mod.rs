@@ -17,6 +17,7 @@ use super::blocks::{TARGET, TargetBlock};
 use super::delayed;
 use super::matrix::Grid;
 use super::models::Models;
+use super::own::Terms;
 use super::state::State;
 
 use ackermann::Ackermann;
@@ -110,12 +111,14 @@ impl State {
     }
 
     fn step(&mut self, dt: f64, models: &Models) {
-        let step = Step::new(&self.own, dt, models);
+        let terms = Terms { models, learnt: &self.learnt, senses: &self.senses };
+        let step = Step::new(&self.own, self.layout(), dt, &terms);
         self.carry(&step, models, true);
         // P Fᵀ is done; F (P Fᵀ) is the same on the rows of its transpose.
         self.cov.transpose();
         self.carry(&step, models, false);
-        step.add_noise(models, &self.learnt, &mut self.cov);
+        let terms = Terms { models, learnt: &self.learnt, senses: &self.senses };
+        step.add_noise(&terms, &mut self.cov);
         for i in 0..self.targets.len() {
             if self.targets[i].life.is_held() {
                 let (walks, at) = (self.intensities(i, models), self.layout().target(i));

@@ -1,6 +1,8 @@
 //! The estimator on simulated flights, as values: neither bytes nor pixels.
 
+mod blind;
 mod filter;
 mod ground;
 mod honesty;
 mod ownship;
+mod time;

@@ -1,7 +1,7 @@
 // The page: takes the station's messages, keeps the last minutes, draws.
 "use strict";
 const $ = id => document.getElementById(id);
-const KEEP = 9000, PLOT_S = 60, STALE_MS = 1500;
+const KEEP = 9000, PLOT_S = 60, STALE_MS = 1500, OLD_MS = 3000;
 const fleet = new Map();
 let chosen = null, socket = null, dirty = true, heardAt = 0;
 const map = new FieldMap($("map"));
@@ -9,7 +9,7 @@ map.moved = () => { dirty = true; };
 
 function payload(name) {
   if (!fleet.has(name)) {
-    fleet.set(name, { name, targets: new Map(), ownTrail: [], own: null, health: null, link: null, events: [], thumb: null, image: new Image(), datum: null });
+    fleet.set(name, { name, targets: new Map(), ownTrail: [], own: null, health: null, link: null, events: [], thumb: null, image: new Image(), datum: null, clock: null });
     if (!chosen) chosen = name;
     tabs();
   }
@@ -26,6 +26,15 @@ function tabs() {
   }));
 }
 
+// The payload's time now, as the station tells it, and how old something of that time is; null while that is not known.
+const clockNow = p => p && p.clock ? p.clock.now + performance.now() - p.clock.at : null;
+function age(p, t) { const now = clockNow(p); return now == null || t == null ? null : Math.max(0, now - t); }
+// A time of the payload in words: UTC where its receiver told it, else the time of its computer, called so.
+function stamp(p, t, from, to) {
+  const known = p && p.utc != null, text = new Date(t + (known ? p.utc : 0)).toISOString().replace("T", " ").slice(from, to);
+  return [text, known ? "UTC" : "host time"];
+}
+
 // Puts a point where its time belongs: what is sent again comes late.
 function insert(list, point) {
   let at = list.length;
@@ -40,13 +49,15 @@ const handlers = {
   hello(m) { map.tiles = m.tiles; },
   est(m, p) {
     let target = p.targets.get(m.target);
-    if (!target) p.targets.set(m.target, target = { name: m.target, trail: [], last: null, at: 0 });
+    if (!target) p.targets.set(m.target, target = { name: m.target, trail: [], last: null });
     if (m.lat != null) {
       const position = mercator(m.lat, m.lon);
       insert(target.trail, { ...position, t: m.t, v: m.v, w: m.w, sv: m.cov && Math.sqrt(m.cov[4]), sw: m.cov && Math.sqrt(m.cov[5]) });
       m.position = position;
     }
-    if (!target.last || m.t >= target.last.t) { target.last = m; target.at = performance.now(); if (m.position) target.known = m; }
+    if (!target.last || m.t >= target.last.t) { target.last = m; if (m.position) target.known = m; }
+    // What comes live tells the payload's time until the station says it again.
+    if (m.live && (clockNow(p) == null || m.t > clockNow(p))) p.clock = { now: m.t, at: performance.now() };
   },
   own(m, p) {
     m.position = mercator(m.lat, m.lon);
@@ -57,7 +68,14 @@ const handlers = {
   health(m, p) { if (!p.health || m.t >= p.health.t) p.health = m; if (p.name === chosen) panels(); },
   thumb(m, p) { p.thumb = m; p.image.onload = () => { dirty = true; }; p.image.src = `thumbnail/${encodeURIComponent(m.p)}?frame=${m.frame}`; },
   event(m, p) { p.events.push(m); p.events.sort((a, b) => b.t - a.t); p.events.length = Math.min(p.events.length, 60); if (p.name === chosen) events(p); },
-  link(m) { for (const l of m.payloads) { payload(l.name).link = l; } tabs(); panels(); },
+  link(m) {
+    for (const l of m.payloads) {
+      const p = payload(l.name);
+      p.link = l; p.utc = l.utc_ms;
+      p.clock = l.now == null ? null : { now: l.now, at: performance.now() };
+    }
+    tabs(); panels();
+  },
 };
 
 function connect() {
@@ -68,7 +86,7 @@ function connect() {
     if (handler) handler(m, m.p == null ? null : payload(m.p));
     dirty = true;
   };
-  socket.onopen = () => { heardAt = performance.now(); chip($("server"), "live", "good"); };
+  socket.onopen = () => { heardAt = performance.now(); };
   socket.onclose = () => { chip($("server"), "station gone", "bad"); setTimeout(connect, 1000); };
 }
 
@@ -78,7 +96,7 @@ const number = (x, digits) => x == null || !isFinite(x) ? "–" : x.toFixed(digi
 function numbers(p) {
   const target = p && [...p.targets.values()][0], e = target && target.last, k = target && target.known;
   $("target-name").textContent = target ? target.name : "vehicle";
-  const old = target ? performance.now() - target.at : Infinity, fresh = old < STALE_MS;
+  const old = e ? age(p, e.t) : null, fresh = old != null && old < STALE_MS;
   const status = e ? (fresh ? e.status : "no news") : "no data";
   chip($("target-status"), status, status === "tracking" ? "good" : status === "lost" || !fresh ? "bad" : "warn");
   const c = k && k.cov, deg = 180 / Math.PI, s = v => c ? `±${v}` : "";
@@ -90,7 +108,8 @@ function numbers(p) {
   $("heading-sigma").textContent = c ? s(`${(Math.sqrt(c[3]) * deg).toFixed(1)}°`) : "";
   $("yaw-rate-sigma").textContent = c ? s((Math.sqrt(c[5]) * deg).toFixed(1)) : "";
   $("coordinates").textContent = k ? `${k.lat.toFixed(7)}, ${k.lon.toFixed(7)}` : "";
-  $("age").textContent = !e ? "" : fresh ? `${e.t ? new Date(e.t).toISOString().replace("T", " ").slice(0, 21) : ""} UTC` : `last heard ${(old / 1000).toFixed(0)} s ago`;
+  $("age").textContent = !e ? "" : fresh ? stamp(p, e.t, 0, 21).join(" ") : old == null ? "age not known" : `last known ${(age(p, (k || e).t) / 1000).toFixed(0)} s ago`;
+  if (socket && socket.readyState === 1 && performance.now() - heardAt <= 4000) chip($("server"), fresh ? "live" : "no news", fresh ? "good" : "warn");
   const note = $("map-note"), down = p && p.link && !p.link.up, cut = p && p.link && p.link.silent_ms > 2000;
   note.style.display = e && (!fresh || down) ? "block" : "none";
   note.textContent = down ? "payload not connected" : cut ? `link silent for ${(p.link.silent_ms / 1000).toFixed(0)} s` : "no new estimates";
@@ -109,15 +128,21 @@ function panels() {
   const p = fleet.get(chosen);
   if (p && p.health) {
     const h = p.health, table = document.createElement("table");
+    // Health comes once a second: what is older says nothing of now.
+    const since = age(p, h.t), old = since == null || since > OLD_MS, dot = kind => old ? "bad" : kind;
+    const quiet = s => s.age_ms < 0 || s.age_ms + (since || 0) > 2000;
     const list = h.sources.map(s => {
-      const silent = s.age_ms < 0 || s.age_ms > 2000;
       const extra = [s.refused ? `${s.refused} refused` : "", s.dropped ? `${s.dropped} dropped` : ""].filter(Boolean).join(", ");
-      return [s.name, `${s.rate_hz.toFixed(1)}/s${extra ? `, ${extra}` : ""}`, silent ? "bad" : s.dropped ? "warn" : "good"];
+      return [s.name, `${s.rate_hz.toFixed(1)}/s${extra ? `, ${extra}` : ""}`, quiet(s) ? "bad" : s.dropped ? "warn" : "good"];
     });
-    list.push(["fix", `${h.fix === 3 ? "3D" : h.fix === 2 ? "2D" : "none"}, ${h.sats} satellites`, h.fix ? "good" : "bad"]);
-    if (h.clock_sigma_ms >= 0) list.push(["UTC", `±${h.clock_sigma_ms.toFixed(1)} ms`, "good"]);
-    for (const m of h.misfits) list.push([m.source, `${m.cause} (${m.figure}): ${m.advice}`, "warn"]);
-    for (const [name, word] of Object.entries(h.words)) list.push([name, word, /fail|full|none|lost|error/i.test(word) ? "bad" : "good"]);
+    const gps = h.sources.find(s => s.name === "gps"), silent = !gps || quiet(gps);
+    const fix = silent ? "none, receiver silent" : `${h.fix === 3 ? "3D" : h.fix === 2 ? "2D" : "none"}, ${h.sats} satellites`;
+    list.push(["fix", fix, dot(h.fix && !silent ? "good" : "bad")]);
+    if (p.utc == null) list.push(["UTC", "not known; times are the payload's own", "warn"]);
+    else if (h.clock_sigma_ms >= 0) list.push(["UTC", `±${h.clock_sigma_ms.toFixed(1)} ms`, dot("good")]);
+    for (const m of h.misfits) list.push([m.source, `${m.cause} (${m.figure}): ${m.advice}`, dot("warn")]);
+    for (const [name, word] of Object.entries(h.words)) list.push([name, word, dot(/fail|full|none|lost|error|stopped|cannot/i.test(word) ? "bad" : "good")]);
+    if (old) list.unshift(["all of this", since == null ? "age not known" : `${(since / 1000).toFixed(0)} s old`, "bad"]);
     rows(table, list); $("sensors").replaceChildren(table);
   }
   if (p && p.link) {
@@ -143,7 +168,7 @@ function panels() {
 function events(p) {
   $("events").replaceChildren(...p.events.map(e => {
     const li = document.createElement("li"), t = document.createElement("time"), text = document.createElement("span");
-    t.textContent = new Date(e.t).toISOString().slice(11, 19);
+    [t.textContent, t.title] = stamp(p, e.t, 11, 19);
     text.textContent = e.text; text.className = e.level >= 4 ? "bad" : e.level === 3 ? "warn" : "";
     li.append(t, text);
     return li;
@@ -210,12 +235,12 @@ function draw() {
     own: p && p.own && { position: p.own.position, heading: p.own.heading, above: p.own.above },
     vehicles: targets.map(t => ({
       name: t.name, trail: t.trail, position: t.known && t.known.position, heading: t.known && t.known.h,
-      cov: t.known && t.known.cov, fresh: now - t.at < STALE_MS && t.last.status !== "lost",
+      cov: t.known && t.known.cov, fresh: age(p, t.last.t) != null && age(p, t.last.t) < STALE_MS && t.last.status !== "lost",
     })),
   });
   numbers(p); camera(p);
   const trail = targets[0] ? targets[0].trail : [], deg = 180 / Math.PI;
-  const end = trail.length ? trail[trail.length - 1].t + Math.min(now - targets[0].at, 600000) : 0;
+  const last = trail.length ? trail[trail.length - 1].t : 0, end = last + Math.min(age(p, last) || 0, 600000);
   plot($("plot-speed"), trail, end, q => q.v, q => q.sv, 0.5);
   plot($("plot-yaw"), trail, end, q => q.w * deg, q => q.sw && q.sw * deg, 5);
 }

@@ -1,0 +1,269 @@
+//! u-blox's binary packets (UBX), among sentences or alone.
+//!
+//! Packet: B5 62, class, identity, u16 length, payload, Fletcher sum over all between; little-endian. The `ublox`
+//! crate knows the payloads; only its plain fields are used, since what it maps flags to may not exist.
+//!
+//! | packet | what is used |
+//! |---|---|
+//! | NAV-PVT | time and date where valid, kind of fix, position, both heights, velocity, accuracies, satellites |
+//! | NAV-TIMEUTC | the date, where UTC is valid |
+//!
+//! Others are passed over. Source: u-blox's interface descriptions.
+
+use nalgebra::Vector3;
+use ublox::UbxProtocol;
+use ublox::proto31::{PacketRef, Proto31};
+
+use super::counts::{DecodeCounts, Refusal};
+use super::lines::LineSpan;
+use super::report::{Date, Kind, Report};
+use windhover_base::msg::FixKind;
+use windhover_base::time::{MonoTime, NS_PER_S};
+
+/// Marks, class, identity, length.
+const HEAD: usize = 6;
+/// Bytes around a payload.
+const AROUND: usize = HEAD + 2;
+/// Longest payload waited for: raw measurements of every satellite there is.
+const PAYLOAD_MAX: usize = 4_096;
+/// Classes there are. Two marks before anything else are chance.
+const CLASSES: [u8; 15] =
+    [0x01, 0x02, 0x04, 0x05, 0x06, 0x09, 0x0A, 0x0B, 0x0D, 0x10, 0x13, 0x21, 0x27, 0x28, 0x29];
+
+/// What a stream is made of.
+pub(super) enum Piece<'a> {
+    /// Bytes outside packets, and how many of the read follow.
+    Outside(&'a [u8], usize),
+    /// A whole packet and where in time it lies.
+    Packet(&'a [u8], LineSpan),
+}
+
+/// Takes packets out of a stream.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Splitter {
+    packet: Vec<u8>,
+    began: MonoTime,
+    first_read_bytes: usize,
+}
+
+enum Held {
+    Whole,
+    Begun,
+    NoPacket,
+    Damaged,
+}
+
+impl Splitter {
+    /// Takes the bytes of one read, of which `after` more follow, and hands its pieces to `sink`.
+    pub(super) fn push(
+        &mut self,
+        bytes: &[u8],
+        after: usize,
+        t_recv: MonoTime,
+        counts: &mut DecodeCounts,
+        sink: &mut impl FnMut(Piece<'_>, &mut DecodeCounts),
+    ) {
+        let mut rest = bytes;
+        while !rest.is_empty() {
+            if self.packet.is_empty() {
+                let at = rest.iter().position(|byte| *byte == 0xB5).unwrap_or(rest.len());
+                let (outside, packet) = rest.split_at(at);
+                if !outside.is_empty() {
+                    sink(Piece::Outside(outside, packet.len() + after), counts);
+                }
+                (self.began, self.first_read_bytes) = (t_recv, packet.len() + after);
+                self.packet.extend(packet.first());
+                rest = packet.get(1..).unwrap_or_default();
+                continue;
+            }
+            self.packet.push(rest[0]);
+            rest = &rest[1..];
+            match self.held() {
+                Held::Begun => {}
+                Held::Whole => {
+                    let span = LineSpan {
+                        t_first: self.began,
+                        first_read_bytes: self.first_read_bytes,
+                        t_last: t_recv,
+                        bytes_after: rest.len() + after,
+                        bytes: self.packet.len(),
+                    };
+                    sink(Piece::Packet(&self.packet, span), counts);
+                    self.packet.clear();
+                }
+                broken => {
+                    if matches!(broken, Held::Damaged) {
+                        counts.refuse(Refusal::BadChecksum);
+                    }
+                    // Its mark is noise; what follows may be anything.
+                    let held = std::mem::take(&mut self.packet);
+                    sink(Piece::Outside(&held[..1], held.len() - 1 + rest.len() + after), counts);
+                    self.push(&held[1..], rest.len() + after, t_recv, counts, sink);
+                }
+            }
+        }
+    }
+
+    fn held(&self) -> Held {
+        let packet = &self.packet[..];
+        let length = match *packet {
+            [_, mark, ..] if mark != 0x62 => return Held::NoPacket,
+            [_, _, class, ..] if !CLASSES.contains(&class) => return Held::NoPacket,
+            [_, _, _, _, low, high, ..] => usize::from(u16::from_le_bytes([low, high])),
+            _ => return Held::Begun,
+        };
+        if length > PAYLOAD_MAX {
+            return Held::NoPacket;
+        }
+        if packet.len() < length + AROUND {
+            return Held::Begun;
+        }
+        if packet.ends_with(&checksum(&packet[2..packet.len() - 2])) { Held::Whole } else { Held::Damaged }
+    }
+}
+
+/// Fletcher sum of 8 bits over class, identity, length and payload.
+fn checksum(summed: &[u8]) -> [u8; 2] {
+    let (a, b) = summed.iter().fold((0u8, 0u8), |(a, b), byte| {
+        let a = a.wrapping_add(*byte);
+        (a, b.wrapping_add(a))
+    });
+    [a, b]
+}
+
+/// A whole packet on the wire. Payloads have 65,535 bytes at the most; the rest of a longer one is left out.
+pub fn ubx_framed(class: u8, identity: u8, payload: &[u8]) -> Vec<u8> {
+    let length = u16::try_from(payload.len()).unwrap_or(u16::MAX);
+    let mut packet = vec![0xB5, 0x62, class, identity];
+    packet.extend_from_slice(&length.to_le_bytes());
+    packet.extend_from_slice(&payload[..usize::from(length)]);
+    let sum = checksum(&packet[2..]);
+    packet.extend_from_slice(&sum);
+    packet
+}
+
+/// Whether bytes hold a whole packet of any class, its checksum sound.
+pub fn holds_ubx_packet(bytes: &[u8]) -> bool {
+    bytes.windows(HEAD).enumerate().any(|(at, head)| {
+        let &[0xB5, 0x62, _, _, low, high] = head else { return false };
+        let end = at + HEAD + usize::from(u16::from_le_bytes([low, high]));
+        let sum = bytes.get(at + 2..end).map(checksum);
+        sum.is_some_and(|sum| bytes.get(end..end + 2) == Some(&sum[..]))
+    })
+}
+
+/// Name of a packet, for the order of a burst.
+pub(super) fn address(packet: &[u8]) -> String {
+    format!("U{:02X}{:02X}", packet[2], packet[3])
+}
+
+fn packet_ref(packet: &[u8]) -> Result<PacketRef<'_>, Refusal> {
+    let payload = &packet[HEAD..packet.len() - 2];
+    Proto31::match_packet(packet[2], packet[3], payload).map_err(|_| Refusal::Malformed)
+}
+
+/// What a packet says of a fix; `None` where it says nothing.
+pub(super) fn read(packet: &[u8]) -> Result<Option<Report>, Refusal> {
+    if (packet[2], packet[3]) == (0x01, 0x07) && packet.len() == PVT_OLD + AROUND {
+        // The seventh generation ends before what is not used here.
+        let mut longer = packet[..HEAD + PVT_OLD].to_vec();
+        longer.resize(HEAD + PVT_NEW + 2, 0);
+        return position(&packet_ref(&longer)?).transpose();
+    }
+    if !matches!((packet[2], packet[3]), (0x01, 0x07 | 0x21)) {
+        return Ok(None);
+    }
+    position(&packet_ref(packet)?).transpose()
+}
+
+/// Payloads of NAV-PVT up to the seventh generation, and since.
+const PVT_OLD: usize = 84;
+const PVT_NEW: usize = 92;
+
+fn position(packet: &PacketRef<'_>) -> Option<Result<Report, Refusal>> {
+    match packet {
+        PacketRef::NavPvt(pvt) => {
+            let clock = Clock {
+                time: [pvt.hour(), pvt.min(), pvt.sec()],
+                nanoseconds: pvt.nanosec(),
+                date: (pvt.year(), pvt.month(), pvt.day()),
+            };
+            let valid = pvt.valid_raw();
+            let mut report = Report::new(Kind::Pvt);
+            if let Err(why) = clock.fill(&mut report, valid & 2 != 0, valid & 1 != 0) {
+                return Some(Err(why));
+            }
+            let ok = pvt.flags_raw() & 1 != 0;
+            // Dead reckoning alone (1) and time alone (5) are no fixes.
+            let fix = match pvt.fix_type_raw() {
+                2 if ok => FixKind::TwoD,
+                3 | 4 if ok => FixKind::ThreeD,
+                _ => FixKind::None,
+            };
+            (report.fix, report.valid) = (Some(fix), Some(fix != FixKind::None));
+            report.sats = Some(u32::from(pvt.num_satellites()));
+            if fix == FixKind::None {
+                return Some(Ok(report));
+            }
+            let (lat, lon) = (pvt.latitude(), pvt.longitude());
+            if !(-90.0..=90.0).contains(&lat) || !(-180.0..=180.0).contains(&lon) {
+                return Some(Err(Refusal::OutOfRange));
+            }
+            report.position_deg = Some((lat, lon));
+            report.alt_msl_m = Some(pvt.height_msl());
+            report.geoid_m = Some(pvt.height_above_ellipsoid() - pvt.height_msl());
+            report.vel_ned_mps = Some(Vector3::new(pvt.vel_north(), pvt.vel_east(), pvt.vel_down()));
+            report.speed_mps = Some(pvt.ground_speed_2d());
+            report.course_deg = Some(pvt.heading_motion().rem_euclid(360.0));
+            (report.hpe_m, report.vpe_m) = (Some(pvt.horizontal_accuracy()), Some(pvt.vertical_accuracy()));
+            Some(Ok(report))
+        }
+        PacketRef::NavTimeUTC(utc) => {
+            let clock = Clock {
+                time: [utc.hour(), utc.min(), utc.sec()],
+                nanoseconds: utc.nanos(),
+                date: (utc.year(), utc.month(), utc.day()),
+            };
+            let mut report = Report::new(Kind::Zda);
+            let is_valid = utc.valid_raw() & 4 != 0;
+            Some(clock.fill(&mut report, is_valid, is_valid).map(|()| report))
+        }
+        _ => Some(Err(Refusal::Malformed)),
+    }
+}
+
+/// Date and time as the packets have them.
+struct Clock {
+    time: [u8; 3],
+    nanoseconds: i32,
+    date: (u16, u8, u8),
+}
+
+/// Times of epochs are told to so many nanoseconds: what is beside them is the receiver's clock.
+const EPOCH_STEP_NS: i64 = 1_000_000;
+/// The same of sentences, where that is near.
+const SENTENCE_STEP_NS: i64 = 10_000_000;
+
+impl Clock {
+    fn fill(&self, report: &mut Report, has_time: bool, has_date: bool) -> Result<(), Refusal> {
+        let [hour, minute, second] = self.time.map(i64::from);
+        if !has_time {
+            return Ok(());
+        }
+        if hour > 23 || minute > 59 || second > 60 {
+            return Err(Refusal::OutOfRange);
+        }
+        let exact_ns = (hour * 3600 + minute * 60 + second) * NS_PER_S + i64::from(self.nanoseconds);
+        let rounded = |step: i64| (exact_ns + step / 2).div_euclid(step) * step;
+        let coarse_ns = rounded(SENTENCE_STEP_NS);
+        let near = (coarse_ns - exact_ns).abs() <= EPOCH_STEP_NS;
+        let time_ns = if near { coarse_ns } else { rounded(EPOCH_STEP_NS) };
+        // A whole second before midnight may be told as a little less than midnight's.
+        report.time_of_day_ns = Some(time_ns.max(0));
+        if has_date {
+            let (year, month, day) = self.date;
+            report.date = Date::new(i32::from(year), month, day);
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,166 @@
+//! Packets of u-blox as receivers send them, alone and among sentences.
+
+use proptest::prelude::*;
+
+use super::gnss::{GnssDecoder, HeardEpoch};
+use super::sentence::framed;
+use super::ubx::ubx_framed;
+use super::{DecodeCounts, Refusal};
+use windhover_base::msg::FixKind;
+use windhover_base::settings::GpsFormat;
+use windhover_base::time::MonoTime;
+
+/// NAV-PVT of 2026-11-18 15:04:`second`, `nanoseconds` beside it, with this fix type and flags.
+fn pvt(second: u8, nanoseconds: i32, fix: u8, flags: u8) -> Vec<u8> {
+    let mut payload = vec![0; 92];
+    payload[4..11].copy_from_slice(&[0xEA, 0x07, 11, 18, 15, 4, second]);
+    payload[11] = 0b111;
+    payload[16..20].copy_from_slice(&nanoseconds.to_le_bytes());
+    payload[20..22].copy_from_slice(&[fix, flags]);
+    payload[23] = 17;
+    for (at, value) in [
+        (24, -91_833_333), // longitude, 1e-7 degrees
+        (28, 387_033_333), // latitude
+        (32, 93_000),      // height above the ellipsoid, mm
+        (36, 43_000),      // above mean sea level
+        (40, 800),         // horizontal accuracy
+        (44, 1_200),       // vertical
+        (48, -1_500),      // velocity north, mm/s
+        (52, 2_000),       // east
+        (56, -250),        // down
+        (60, 2_500),       // ground speed
+        (64, -5_313_000),  // heading of motion, 1e-5 degrees
+    ] {
+        payload[at..at + 4].copy_from_slice(&i32::to_le_bytes(value));
+    }
+    ubx_framed(1, 7, &payload)
+}
+
+fn decode(format: GpsFormat, bytes: &[u8]) -> (Vec<HeardEpoch>, DecodeCounts) {
+    let (mut decoder, mut out) = (GnssDecoder::patient().of_format(format), Vec::new());
+    decoder.push(bytes, MonoTime::default(), &mut out);
+    decoder.flush(&mut out);
+    (out, decoder.counts().clone())
+}
+
+#[test]
+fn a_position_has_everything() {
+    let (epochs, counts) = decode(GpsFormat::Ubx, &pvt(5, 200_000_123, 3, 1));
+    let epoch = epochs[0].epoch;
+    assert_eq!((epochs.len(), counts.used), (1, 1), "{counts}");
+    assert_eq!(epoch.utc.expect("dated").to_string(), "2026-11-18T15:04:05.200Z");
+    assert_eq!((epoch.fix, epoch.sats, epoch.alt_msl_m), (FixKind::ThreeD, Some(17), Some(43.0)));
+    assert_eq!((epoch.hpe_m, epoch.vpe_m, epoch.vel_has_down), (Some(0.8), Some(1.2), true));
+    let near = |value: Option<f64>, wanted: f64| (value.expect("given") - wanted).abs() < 1e-9;
+    assert!(
+        near(epoch.lat_deg, 38.703_333_3) && near(epoch.lon_deg, -9.183_333_3) && near(epoch.geoid_m, 50.0)
+    );
+    assert!(near(epoch.speed_mps, 2.5) && near(epoch.course_deg, 306.87));
+    let velocity = epoch.vel_ned_mps.expect("given");
+    assert_eq!((velocity.x, velocity.y, velocity.z), (-1.5, 2.0, -0.25));
+}
+
+#[test]
+fn what_is_no_fix_is_none() {
+    let kind = |fix, flags| decode(GpsFormat::Auto, &pvt(5, 0, fix, flags)).0[0].epoch.fix;
+    assert_eq!((kind(3, 1), kind(2, 1), kind(4, 1)), (FixKind::ThreeD, FixKind::TwoD, FixKind::ThreeD));
+    for (fix, flags) in [(0, 1), (1, 1), (5, 1), (3, 0), (9, 1), (255, 0xFF)] {
+        let (epochs, _) = decode(GpsFormat::Auto, &pvt(5, 0, fix, flags));
+        assert_eq!((epochs[0].epoch.fix, epochs[0].epoch.utc), (FixKind::None, None), "{fix} {flags}");
+    }
+}
+
+#[test]
+fn sentences_beside_it_are_of_the_same_epoch() {
+    let sentences = |second: u8| {
+        let time = format!("1504{second:02}.00");
+        [
+            "GNRMC,TIME,A,3842.20000,N,00911.00000,W,4.86,306.9,181126,,,A,V",
+            "GNGGA,TIME,3842.20000,N,00911.00000,W,1,17,0.6,43.0,M,50.0,M,,",
+        ]
+        .map(|body| framed(&body.replace("TIME", &time)) + "\r\n")
+        .concat()
+        .into_bytes()
+    };
+    for packet_first in [true, false] {
+        // The packet's nanoseconds are the receiver's clock: the time is the sentences'.
+        let burst = |second| {
+            let (packet, text) = (pvt(second, -300_000, 3, 1), sentences(second));
+            if packet_first { [packet, text].concat() } else { [text, packet].concat() }
+        };
+        let bytes: Vec<u8> = (5..12).flat_map(burst).collect();
+        let (epochs, counts) = decode(GpsFormat::Auto, &bytes);
+        assert_eq!((epochs.len(), counts.used, counts.refused_total()), (7, 21, 0), "{counts}");
+        for heard in &epochs {
+            assert_eq!((heard.epoch.hdop, heard.epoch.hpe_m), (Some(0.6), Some(0.8)));
+            assert!((heard.epoch.lat_deg.expect("given") - 38.703_333_3).abs() < 1e-9);
+        }
+        let (of_text, counts) = decode(GpsFormat::Nmea, &bytes);
+        assert!(of_text.iter().all(|heard| heard.epoch.hpe_m.is_none()), "{counts}");
+        assert_eq!(decode(GpsFormat::Ubx, &bytes).0.len(), 7);
+    }
+}
+
+#[test]
+fn other_packets_are_passed_over_and_damage_is_counted() {
+    let mut damaged = pvt(6, 0, 3, 1);
+    damaged[40] ^= 4;
+    let bytes = [
+        ubx_framed(1, 0x35, &[7; 300]),
+        pvt(5, 0, 3, 1),
+        damaged,
+        ubx_framed(2, 0x15, &[0xB5; 900]),
+        pvt(7, 0, 3, 1),
+    ]
+    .concat();
+    let (epochs, counts) = decode(GpsFormat::Auto, &bytes);
+    assert_eq!((epochs.len(), counts.used, counts.ignored), (2, 2, 2), "{counts}");
+    assert_eq!(counts.refused(Refusal::BadChecksum), 1, "{counts}");
+    let wrong_length = ubx_framed(1, 7, &[0; 20]);
+    assert_eq!(decode(GpsFormat::Auto, &wrong_length).1.refused(Refusal::Malformed), 1);
+}
+
+#[test]
+fn the_seventh_generation_is_read() {
+    let long = pvt(5, 0, 3, 1);
+    let (epochs, counts) = decode(GpsFormat::Auto, &ubx_framed(1, 7, &long[6..90]));
+    assert_eq!((epochs.len(), epochs[0].epoch.fix), (1, FixKind::ThreeD), "{counts}");
+}
+
+proptest! {
+    #[test]
+    fn any_payload_is_survived(
+        which in 0usize..4,
+        payload in prop::collection::vec(any::<u8>(), 0..120),
+        sized: bool,
+    ) {
+        let (class, identity, length) = [(1, 7, 92), (1, 0x21, 20), (1, 0x3C, 64), (1, 7, 84)][which];
+        let mut payload = payload;
+        if sized {
+            payload.resize(length, 0xFF);
+        }
+        let bytes = ubx_framed(class, identity, &payload);
+        for heard in decode(GpsFormat::Auto, &bytes).0 {
+            prop_assert!(heard.epoch.lat_deg.is_none_or(|lat| (-90.0..=90.0).contains(&lat)));
+            prop_assert!(heard.epoch.course_deg.is_none_or(|course| (0.0..=360.0).contains(&course)));
+        }
+    }
+
+    #[test]
+    fn sentences_survive_whatever_looks_like_a_packet(
+        noise in prop::collection::vec(prop_oneof![Just(0xB5u8), Just(0x62), Just(1), any::<u8>()], 0..60),
+        sizes in prop::collection::vec(1usize..40, 1..20),
+    ) {
+        let line = framed("GPRMC,150405.0,A,3842.2,N,00911.0,W,0.1,,181126,,,A") + "\r\n";
+        let bytes = [noise.as_slice(), b"\r\n", line.as_bytes(), &[0; 4200]].concat();
+        let (mut decoder, mut out) = (GnssDecoder::patient(), Vec::new());
+        let (mut rest, mut sizes) = (&bytes[..], sizes.iter().cycle());
+        while !rest.is_empty() {
+            let (read, after) = rest.split_at((*sizes.next().expect("endless")).min(rest.len()));
+            decoder.push(read, MonoTime::default(), &mut out);
+            rest = after;
+        }
+        decoder.flush(&mut out);
+        prop_assert_eq!(out.len(), 1, "{}", decoder.counts());
+    }
+}

@@ -1,0 +1,49 @@
+//! Which states a measurement does not move: slow errors of force and sensors that own motion alone would explain its
+//! misfits with.
+//!
+//! A real rotorcraft answers gusts with tilt, so that "thrust along the axis" is wrong by some 0.3 m/s² at every time scale.
+//! Whatever slow state GPS and compass may move takes that up: the scale of tilt falls by a fifth, the receiver's delay
+//! wanders by 0.2 s. So without a marker in view GPS and compass count what is not known of these states, and leave them.
+//! Markers, and ground features, see tilt itself: they move everything, and for two seconds after one GPS and compass do.
+
+use windhover_base::msg::FusionSource;
+
+use super::blocks::own;
+use super::kind::{Felt, TiltWatch};
+use super::state::State;
+use super::update::Held;
+
+/// The share of the tilt that is read: a product with tilt, never found out by one linear step.
+const ALWAYS: Held = Held::NONE.and(own::TILT_GAIN).and(own::SECOND_TILT_GAIN);
+/// All slow errors of force, tilt reading and IMU, and the receiver's delay.
+const BLIND: Held = ALWAYS
+    .and(own::GPS_DELAY)
+    .and(own::DRAG)
+    .and(own::TRIM)
+    .and(own::TILT_BIAS)
+    .and(own::TILT_ERROR)
+    .and(own::RATE_BIAS)
+    .and(own::FORCE_BIAS)
+    .and(own::SECOND_TILT_BIAS)
+    .and(own::SECOND_TILT_ERROR);
+/// Heading too: a tilt known to some degrees only is no regressor of heading.
+const WITHOUT_TILT: Held = BLIND.and(own::TURN).and(own::HEADING_BIAS).and(own::SECOND_HEADING_BIAS);
+
+impl State {
+    /// The states that a measurement of this source leaves as they are.
+    pub(crate) fn held(&self, source: FusionSource) -> Held {
+        // One that was never heard tells nothing.
+        let tells = |watch: &TiltWatch| {
+            watch.last_down().is_some() && matches!(watch.felt, Felt::Attitude | Felt::Share)
+        };
+        let poor_tilt = !self.tilt.iter().any(tells);
+        let held = match source {
+            FusionSource::Marker | FusionSource::Feature => Held::NONE,
+            _ if !self.is_blind() => ALWAYS,
+            FusionSource::CompassHeading | FusionSource::AttitudeHeading => BLIND,
+            _ if poor_tilt => WITHOUT_TILT,
+            _ => BLIND,
+        };
+        held.before(self.layout().own)
+    }
+}

@@ -1,0 +1,202 @@
+//! Whether what is measured fits what is said of it: for each source of own motion a running mean and spread of normalised
+//! innovations.
+//!
+//! Where model and noise are right, `νᵀ S⁻¹ ν / m` has a mean of one at most (less where a sensor's slow error is allowed
+//! for and small) and `ν/√S` one of zero. The scale of tilt does not show here (gusts take it up): see `kind.rs`.
+
+use windhover_base::msg::{FusionSource, MisfitCause};
+use windhover_base::time::MonoTime;
+
+use super::core::Core;
+use super::matrix::MAX_MEASURED;
+use super::own::{COMPASS, SECOND};
+use super::state::State;
+
+/// Time over which the means are taken, s.
+const OVER_S: f64 = 30.0;
+/// Longest that one innovation counts for, s.
+const LONGEST_S: f64 = 1.0;
+/// The most that one counts: a single wild measurement is no misfit.
+const MOST: f64 = 20.0;
+/// Mean square above which what is told is not believed, and above which that is said.
+const INFLATE: f64 = 1.3;
+const TELL: f64 = 2.0;
+/// Mean innovation over its spread that is said.
+const TELL_MEAN: f64 = 0.7;
+/// Nothing is said before so much was seen, s.
+const SEEN_S: f64 = 20.0;
+
+/// The sources that are looked at.
+pub(crate) const WATCHED: [FusionSource; 8] = [
+    FusionSource::GpsPosition,
+    FusionSource::GpsVelocity,
+    FusionSource::CompassHeading,
+    FusionSource::CompassTilt,
+    FusionSource::AttitudeHeading,
+    FusionSource::AttitudeTilt,
+    FusionSource::ImuRate,
+    FusionSource::ImuForce,
+];
+
+/// Where fixes stand among them.
+pub(crate) const WATCHED_POSITION: usize = 0;
+
+/// How one source fits.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(crate) struct Fit {
+    /// Mean of the normalised square of innovations, a component.
+    pub(crate) square: f64,
+    /// Mean of each component over its spread.
+    mean: [f64; 3],
+    last: Option<MonoTime>,
+    seen_s: f64,
+}
+
+impl Default for Fit {
+    fn default() -> Self {
+        Self { square: 1.0, mean: [0.0; 3], last: None, seen_s: 0.0 }
+    }
+}
+
+impl Fit {
+    /// Takes the innovation of a measurement of `m` components: its normalised square, and each component with its variance.
+    pub(crate) fn take(
+        &mut self,
+        t: MonoTime,
+        squared: f64,
+        innovation: &[f64; MAX_MEASURED],
+        var: &[f64; MAX_MEASURED],
+        m: usize,
+    ) {
+        let since_s = self.last.map_or(0.0, |last| (t - last).s().clamp(0.0, LONGEST_S));
+        self.last = Some(t);
+        if !squared.is_finite() {
+            return;
+        }
+        self.seen_s += since_s;
+        let gain = 1.0 - (-since_s / OVER_S).exp();
+        self.square += gain * ((squared / m as f64).min(MOST) - self.square);
+        for i in 0..m.min(3) {
+            let one = (innovation[i] / var[i].sqrt()).clamp(-MOST.sqrt(), MOST.sqrt());
+            self.mean[i] += gain * (one - self.mean[i]);
+        }
+    }
+
+    /// Factor on the variances that are told of what this source shows: one where it fits.
+    pub(crate) fn inflation(&self) -> f64 {
+        (self.square / INFLATE).max(1.0)
+    }
+
+    /// What is to be said of it; `noise_factor` is by how much its noise was already found larger than configured.
+    pub(crate) fn misfit(&self, noise_factor: f64) -> Option<(MisfitCause, f64)> {
+        if self.seen_s < SEEN_S {
+            return None;
+        }
+        let square = self.square * noise_factor.max(1.0);
+        let mean = self.mean.into_iter().max_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(0.0);
+        if square > TELL {
+            Some((MisfitCause::Noise, square))
+        } else if mean.abs() > TELL_MEAN {
+            Some((MisfitCause::Bias, mean))
+        } else {
+            None
+        }
+    }
+}
+
+impl State {
+    /// Factors on the variances that are told of position, velocity and attitude: one where their sources fit.
+    pub(crate) fn told_factors(&self) -> [f64; 3] {
+        let of = |sources: &[FusionSource]| {
+            let fits = WATCHED.iter().zip(&self.fits).filter(|(source, _)| sources.contains(source));
+            fits.map(|(_, fit)| fit.inflation()).fold(1.0, f64::max)
+        };
+        [
+            of(&[FusionSource::GpsPosition]),
+            of(&[FusionSource::GpsVelocity]),
+            of(&[
+                FusionSource::CompassHeading,
+                FusionSource::CompassTilt,
+                FusionSource::AttitudeHeading,
+                FusionSource::AttitudeTilt,
+            ]),
+        ]
+    }
+}
+
+impl Core {
+    /// Sources of own motion that do not fit what is said of them: what does not, and the figure that shows it.
+    pub(crate) fn misfits(&self) -> impl Iterator<Item = (FusionSource, MisfitCause, f64)> {
+        let Core { state, learning, .. } = self;
+        let (now, start) = (&state.learnt, &learning.start);
+        let noise_factors = [
+            now.gps_factor,
+            now.gps_velocity_factor,
+            now.heading_var[COMPASS] / start.heading_var[COMPASS],
+            now.tilt_var[COMPASS] / start.tilt_var[COMPASS],
+            now.heading_var[SECOND] / start.heading_var[SECOND],
+            now.tilt_var[SECOND] / start.tilt_var[SECOND],
+            1.0,
+            now.force_factor,
+        ];
+        let kinds = [FusionSource::CompassTilt, FusionSource::AttitudeTilt].into_iter().zip(&state.tilt);
+        let kinds = kinds.filter_map(|(source, watch)| {
+            let felt = watch.found().filter(|_| watch.is_misnamed())?;
+            Some((source, MisfitCause::TiltKind(felt), watch.slope()))
+        });
+        let fits = WATCHED.into_iter().zip(&state.fits).zip(noise_factors);
+        let noise = fits.filter_map(|((source, fit), factor)| {
+            fit.misfit(factor).map(|(cause, figure)| (source, cause, figure))
+        });
+        kinds.chain(noise)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use windhover_base::time::Span;
+
+    use super::*;
+
+    /// Feeds innovations of a sigma this large and a mean this large, at 5 Hz for a minute.
+    fn fed(sigma: f64, mean: f64) -> Fit {
+        let mut fit = Fit::default();
+        let mut innovation = [0.0; MAX_MEASURED];
+        for k in 0..300 {
+            // Two components of a deterministic sequence of unit variance.
+            let angle = 2.4 * f64::from(k);
+            innovation[0] = mean + sigma * 2f64.sqrt() * angle.sin();
+            innovation[1] = mean + sigma * 2f64.sqrt() * angle.cos();
+            let squared = innovation[0].powi(2) + innovation[1].powi(2);
+            let t = MonoTime::from_ns(1_000_000_000) + Span::from_s(0.2 * f64::from(k));
+            fit.take(t, squared, &innovation, &[1.0; MAX_MEASURED], 2);
+        }
+        fit
+    }
+
+    #[test]
+    fn what_fits_is_not_spoken_of() {
+        let fit = fed(1.0, 0.0);
+        assert!(fit.misfit(1.0).is_none() && fit.inflation() == 1.0, "{fit:?}");
+    }
+
+    #[test]
+    fn noise_and_bias_are_told_with_their_figures() {
+        let noisy = fed(2.0, 0.0);
+        let (cause, figure) = noisy.misfit(1.0).expect("twice the noise");
+        assert!(cause == MisfitCause::Noise && (3.0..4.2).contains(&figure), "{figure}");
+        assert!(noisy.inflation() > 2.0);
+        let (cause, figure) = fed(0.5, -1.0).misfit(1.0).expect("off to one side");
+        assert!(cause == MisfitCause::Bias && (-1.0..-0.8).contains(&figure), "{figure}");
+        // What the filter has found by itself counts too.
+        assert!(fed(1.0, 0.0).misfit(4.0).is_some());
+    }
+
+    #[test]
+    fn a_single_wild_measurement_says_nothing() {
+        let mut fit = fed(1.0, 0.0);
+        let t = MonoTime::from_ns(62_000_000_000);
+        fit.take(t, 1e9, &[1e4; MAX_MEASURED], &[1.0; MAX_MEASURED], 2);
+        assert!(fit.misfit(1.0).is_none(), "{fit:?}");
+    }
+}

@@ -1,0 +1,135 @@
+//! Own motion where no marker is in view: whether the scale of tilt holds, whether what is told covers the error, and
+//! whether a wrong word on the tilt sensor is found out.
+
+use nalgebra::Vector3;
+use windhover_base::geo::euler_321;
+use windhover_base::msg::{
+    EstimatorOutput, FeltTilt, FrameObservations, FusionSource, InertialSample, Misfit, MisfitCause, Ownship,
+    Stamped,
+};
+use windhover_base::settings::{EstimatorConfig, ImuConfig, TiltKind};
+use windhover_estimate::Estimator;
+use windhover_simulate::{HelicopterPath, Scenario};
+
+use super::filter::{Flight, Heard, fly};
+
+/// A minute around a circle in wind with gusts, 2.4 m/s² of acceleration; the compass reads a share of the tilt.
+fn circling(seed: u64, kind: TiltKind, share: f64) -> Flight {
+    fly("follow", 60.0, seed, |scenario: &mut Scenario| {
+        scenario.helicopter.path = HelicopterPath::Circle { radius_m: 15.0, speed_mps: 6.0 };
+        (scenario.wind.mean_mps, scenario.wind.gust_mps) = (4.0, 1.0);
+        scenario.compass.tilt_gain = share;
+        scenario.rig.compass.tilt = kind;
+    })
+}
+
+/// What the filter says without anything in its frames.
+fn blind(flight: &Flight) -> Vec<EstimatorOutput> {
+    let (mut filter, mut out) = (flight.filter(), Vec::new());
+    for heard in &flight.heard {
+        without_sight(heard).give(&mut filter, &mut out);
+    }
+    out
+}
+
+fn without_sight(heard: &Heard) -> Heard {
+    let mut heard = heard.clone();
+    if let Heard::Frame(frame) = &mut heard {
+        frame.value = FrameObservations { frame: frame.value.frame, ..FrameObservations::default() };
+    }
+    heard
+}
+
+/// Slope of estimated tilt over the true one, and mean square of tilt error over what is told, an axis, from a time on.
+fn tilt_of(flight: &Flight, out: &[EstimatorOutput], from_s: f64) -> (f64, f64) {
+    let (mut both, mut truth2, mut squares, mut n) = (0.0, 0.0, 0.0, 0.0);
+    for own in ownships(out).filter(|own| flight.world.seconds(own.t_valid) > from_s) {
+        let truth = flight.world.ownship(own.t_valid);
+        let estimated = own.ned_from_body.to_rotation_matrix();
+        let ((_, a, b), (_, c, d)) = (euler_321(&estimated), euler_321(&truth.ned_from_body));
+        both += a * c + b * d;
+        truth2 += c * c + d * d;
+        let error = (truth.ned_from_body * estimated.inverse()).scaled_axis();
+        let var = own.covariance.diagonal();
+        squares += error.x.powi(2) / var[6] + error.y.powi(2) / var[7];
+        n += 2.0;
+    }
+    (both / truth2, squares / n)
+}
+
+fn ownships(out: &[EstimatorOutput]) -> impl Iterator<Item = &Ownship> {
+    out.iter().filter_map(|o| if let EstimatorOutput::Ownship(own) = o { Some(own) } else { None })
+}
+
+fn misfits(out: &[EstimatorOutput]) -> impl Iterator<Item = &Misfit> {
+    out.iter().filter_map(|o| if let EstimatorOutput::Misfit(misfit) = o { Some(misfit) } else { None })
+}
+
+#[test]
+fn the_scale_of_tilt_holds_and_its_error_is_covered() {
+    for (kind, share) in [(TiltKind::Inertial, 1.0), (TiltKind::Auto, 1.0), (TiltKind::Auto, 0.15)] {
+        let flight = circling(2, kind, share);
+        let out = blind(&flight);
+        let (slope, square) = tilt_of(&flight, &out, 30.0);
+        let allowed = if share == 1.0 { 0.95..1.05 } else { 0.75..1.3 };
+        assert!(
+            allowed.contains(&slope) && square < 2.0,
+            "{kind:?}, {share}: slope {slope}, square {square}"
+        );
+        assert_eq!(misfits(&out).count(), 0, "{kind:?}, {share}: {:?}", misfits(&out).next());
+    }
+}
+
+#[test]
+fn a_wrong_word_on_the_tilt_sensor_is_found_out_told_and_not_believed() {
+    for (kind, share) in [(TiltKind::Inertial, 0.15), (TiltKind::Gravity, 1.0)] {
+        let flight = circling(3, kind, share);
+        let out = blind(&flight);
+        let told = misfits(&out).find(|m| matches!(m.cause, MisfitCause::TiltKind(_)));
+        let told = told.unwrap_or_else(|| panic!("{kind:?}, {share}: nothing is told"));
+        let MisfitCause::TiltKind(felt) = told.cause else { unreachable!("it was looked for") };
+        let right = match felt {
+            FeltTilt::Attitude => share == 1.0,
+            FeltTilt::Share(found) => (found - share).abs() < 0.05,
+            FeltTilt::Force => false,
+        };
+        assert!(right && told.source == FusionSource::CompassTilt, "{kind:?}: {told:?}");
+        assert!(flight.world.seconds(told.t) < 60.0, "{told:?}");
+        let found = out.iter().filter(|o| matches!(o, EstimatorOutput::TiltFelt { .. })).count();
+        assert_eq!(found, 1, "{kind:?}: it is decided once");
+        let (slope, square) = tilt_of(&flight, &out, 45.0);
+        assert!((0.7..1.35).contains(&slope) && square < 2.5, "{kind:?}: slope {slope}, square {square}");
+    }
+}
+
+#[test]
+fn rates_and_forces_that_vibrate_do_not_hurt() {
+    // Given gyros and accelerometers at 100 Hz with biases, and with vibration that is far from white.
+    let flight = circling(4, TiltKind::Inertial, 1.0);
+    let mut rig = flight.world.scenario().rig.clone();
+    rig.imu = Some(ImuConfig::default());
+    let mut filter = Estimator::new(&rig, &EstimatorConfig::default(), &flight.site);
+    let (mut out, mut imu_s) = (Vec::new(), 0.0);
+    for heard in &flight.heard {
+        while imu_s < flight.world.seconds(heard.t_recv()) {
+            let t = flight.world.time(imu_s);
+            let truth = flight.world.ownship(t);
+            let shaken = 2.0 * (150.0 * imu_s).sin() + (6.0 * imu_s).sin();
+            let force = truth.acceleration_ned_mps2 - Vector3::z() * 9.806_65;
+            let value = InertialSample {
+                rate_rps: Some(truth.body_rate_radps + Vector3::new(0.01, -0.015, 0.01)),
+                force_mps2: Some(truth.ned_from_body.inverse() * force + Vector3::repeat(0.5 * shaken)),
+            };
+            filter.inertial(&Stamped { t_valid: t, t_recv: t, seq: 0, value }, &mut out);
+            imu_s += 0.01;
+        }
+        without_sight(heard).give(&mut filter, &mut out);
+    }
+    // Then they are fused, and tilt is as good and as honest as without.
+    let fused = out.iter().filter(
+        |o| matches!(o, EstimatorOutput::Fusion(f) if f.source == FusionSource::ImuForce && f.test_ratio < 1.0),
+    );
+    assert!(fused.count() > 400);
+    let (slope, square) = tilt_of(&flight, &out, 15.0);
+    assert!((0.95..1.05).contains(&slope) && square < 2.0, "slope {slope}, square {square}");
+}

@@ -1,0 +1,72 @@
+//! Frames in time: stamps that jitter, rows that are exposed one after the other.
+
+use std::sync::Arc;
+
+use windhover_base::geo::{Ground, wrap_angle};
+use windhover_base::msg::{Stamped, TrackStatus};
+use windhover_base::settings::EstimatorConfig;
+use windhover_base::time::FrameClock;
+use windhover_estimate::{Estimator, EstimatorOutput, Site};
+use windhover_simulate::{Sample, Scenario, SensorSuite, World};
+
+/// Root mean squares of heading and speed errors from 6 s on, with pixels as sharp as rendered ones, over two seeds.
+fn errors(described: &str) -> [f64; 2] {
+    let (mut sums, mut n) = ([0.0; 2], 0.0);
+    for seed in 1..3 {
+        let mut scenario = Scenario::described(described).expect("known names, figures within limits");
+        scenario.duration_s = 20.0;
+        (scenario.camera.marker_noise_px, scenario.camera.feature_noise_px) = (0.03, 0.1);
+        let world = Arc::new(World::new(scenario, seed));
+        let declination_rad = world.scenario().declination_deg.to_radians();
+        let site = Site { frame: *world.frame(), ground: Ground::Flat { down_m: 0.0 }, declination_rad };
+        let mut filter = Estimator::new(&world.scenario().rig, &EstimatorConfig::default(), &site);
+        let (mut suite, mut out) = (SensorSuite::new(Arc::clone(&world)), Vec::new());
+        let mut exposures = FrameClock::default();
+        while let Some(sample) = suite.next() {
+            match &sample {
+                Sample::Gnss { stamped, .. } => filter.gnss(stamped, &mut out),
+                Sample::Attitude { stamped, .. } => filter.attitude(stamped, &mut out),
+                Sample::Frame { truth, seq } => {
+                    let value = suite.observations().clone();
+                    let (t_valid, t_recv) = (exposures.exposed(truth.t_stamp), truth.t_recv);
+                    filter.frame(&Stamped { t_valid, t_recv, seq: *seq, value }, &mut out);
+                }
+            }
+            for output in out.drain(..) {
+                let EstimatorOutput::Estimate(e) = output else { continue };
+                if world.seconds(e.t_valid) < 6.0 || e.status != TrackStatus::Tracking {
+                    continue;
+                }
+                let (state, truth) = (e.state.expect("tracked"), world.vehicle(0, e.t_valid));
+                sums[0] += wrap_angle(state.heading_rad - truth.heading_rad).powi(2);
+                sums[1] += (state.speed_mps - truth.speed_mps).powi(2);
+                n += 1.0;
+            }
+        }
+    }
+    sums.map(|sum: f64| (sum / n).sqrt())
+}
+
+#[test]
+fn a_rolling_shutter_that_is_told_costs_little() {
+    let (whole, told, untold) =
+        (errors("follow"), errors("follow+told-readout=25"), errors("follow+readout=25"));
+    for (k, what) in ["heading", "speed"].into_iter().enumerate() {
+        assert!(
+            told[k] < 1.3 * whole[k],
+            "{what}: {} told, {} where all rows are exposed together",
+            told[k],
+            whole[k]
+        );
+    }
+    assert!(untold[1] > 1.5 * told[1], "speed: {} untold, {} told", untold[1], told[1]);
+}
+
+#[test]
+fn stamps_that_jitter_cost_little() {
+    let steady = errors("follow");
+    for (jitter_ms, most) in [(1.0, 1.6), (3.0, 1.9), (10.0, 3.0)] {
+        let jittering = errors(&format!("follow+stamp-jitter={jitter_ms}"));
+        assert!(jittering[1] < most * steady[1], "{jitter_ms} ms: speed {} for {}", jittering[1], steady[1]);
+    }
+}

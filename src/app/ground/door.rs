@@ -1,0 +1,227 @@
+//! A door of the station: so many visitors at a time, and none for long that says nothing.
+//!
+//! Who is answered keeps the place. Who is not (a connection that is only opened, or asks word by word) has to leave
+//! after [`ASKING`], and at once where places are short. A failed accept (no descriptors left) ends nothing: it is told
+//! and tried again.
+
+use std::collections::VecDeque;
+use std::io;
+use std::net::SocketAddr;
+use std::pin::Pin;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::time::{Instant, Sleep};
+use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
+
+use crate::app::events::OperatorEvent;
+
+/// Visitors at a time; each costs a descriptor and some ten kilobytes.
+const PLACES: usize = 128;
+/// How long a visitor has for a question.
+const ASKING: Duration = Duration::from_secs(10);
+/// How long a visitor who was answered may stay without another word to or from him.
+const STAYING: Duration = Duration::from_secs(120);
+/// How long one may listen who hears nothing: a year.
+const LISTENING: Duration = Duration::from_secs(365 * 86_400);
+/// Pause after a connection could not be accepted.
+const PAUSE: Duration = Duration::from_millis(500);
+
+/// One visitor's place.
+#[derive(Debug)]
+struct Place {
+    answered: AtomicBool,
+    leave: CancellationToken,
+}
+
+/// Places that are taken, in the order in which they were.
+#[derive(Clone, Debug, Default)]
+struct Places(Arc<Mutex<VecDeque<Arc<Place>>>>);
+
+impl Places {
+    fn taken(&self) -> MutexGuard<'_, VecDeque<Arc<Place>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A place, if need be that of the one who has waited longest without an answer.
+    fn take(&self) -> Option<Arc<Place>> {
+        let mut taken = self.taken();
+        if taken.len() >= PLACES {
+            let silent = taken.iter().position(|place| !place.answered.load(Ordering::Relaxed))?;
+            taken.remove(silent)?.leave.cancel();
+        }
+        let place = Arc::new(Place { answered: AtomicBool::new(false), leave: CancellationToken::new() });
+        taken.push_back(Arc::clone(&place));
+        Some(place)
+    }
+}
+
+/// Where visitors come in.
+#[derive(Debug)]
+pub(super) struct Door {
+    listener: TcpListener,
+    /// What it leads to, for the operator.
+    name: &'static str,
+    places: Places,
+}
+
+impl Door {
+    /// The door to `name`.
+    pub(super) fn new(listener: TcpListener, name: &'static str) -> Self {
+        Self { listener, name, places: Places::default() }
+    }
+
+    /// The next visitor who gets a place.
+    pub(super) async fn next(&mut self) -> (Visitor, SocketAddr) {
+        loop {
+            match self.listener.accept().await {
+                Ok((stream, address)) => match self.places.take() {
+                    Some(place) => return (Visitor::new(stream, place, self.places.clone()), address),
+                    None => self.tell(&format!("{address} is turned away: {PLACES} visitors are here")),
+                },
+                Err(error) => {
+                    self.tell(&format!("cannot accept a connection: {error}"));
+                    tokio::time::sleep(PAUSE).await;
+                }
+            }
+        }
+    }
+
+    fn tell(&self, words: &str) {
+        OperatorEvent::LinkFault.emit(self.name, words);
+    }
+}
+
+impl axum::serve::Listener for Door {
+    type Io = Visitor;
+    type Addr = SocketAddr;
+
+    async fn accept(&mut self) -> (Visitor, SocketAddr) {
+        self.next().await
+    }
+
+    fn local_addr(&self) -> io::Result<SocketAddr> {
+        self.listener.local_addr()
+    }
+}
+
+/// A visitor's connection. It fails when the visitor has to leave.
+#[derive(Debug)]
+pub(super) struct Visitor {
+    stream: TcpStream,
+    place: Arc<Place>,
+    places: Places,
+    leave: Pin<Box<WaitForCancellationFutureOwned>>,
+    limit: Pin<Box<Sleep>>,
+}
+
+impl Visitor {
+    fn new(stream: TcpStream, place: Arc<Place>, places: Places) -> Self {
+        let leave = Box::pin(place.leave.clone().cancelled_owned());
+        Self { stream, place, places, leave, limit: Box::pin(tokio::time::sleep(ASKING)) }
+    }
+
+    /// The visitor only listens, and may do so for as long as he takes what he is given.
+    pub(super) fn listens(&mut self) {
+        self.stays(LISTENING);
+    }
+
+    fn stays(&mut self, long: Duration) {
+        self.place.answered.store(true, Ordering::Relaxed);
+        self.limit.as_mut().reset(Instant::now() + long);
+    }
+
+    /// Whether the visitor has to leave now.
+    fn has_to_leave(&mut self, context: &mut Context<'_>) -> Option<io::Error> {
+        if self.leave.as_mut().poll(context).is_ready() {
+            return Some(io::Error::new(io::ErrorKind::ConnectionAborted, "the place is needed"));
+        }
+        let over = self.limit.as_mut().poll(context).is_ready();
+        over.then(|| io::Error::new(io::ErrorKind::TimedOut, "nothing was said"))
+    }
+}
+
+impl Drop for Visitor {
+    fn drop(&mut self) {
+        self.places.taken().retain(|place| !Arc::ptr_eq(place, &self.place));
+    }
+}
+
+impl AsyncRead for Visitor {
+    fn poll_read(
+        self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        into: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        let me = self.get_mut();
+        if let Some(error) = me.has_to_leave(context) {
+            return Poll::Ready(Err(error));
+        }
+        Pin::new(&mut me.stream).poll_read(context, into)
+    }
+}
+
+impl AsyncWrite for Visitor {
+    fn poll_write(self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        let me = self.get_mut();
+        let written = Pin::new(&mut me.stream).poll_write(context, bytes);
+        match written {
+            Poll::Ready(Ok(_)) => me.stays(STAYING),
+            // One who takes nothing any more holds a place as well as one who says nothing.
+            Poll::Pending => {
+                if let Some(error) = me.has_to_leave(context) {
+                    return Poll::Ready(Err(error));
+                }
+            }
+            Poll::Ready(Err(_)) => {}
+        }
+        written
+    }
+
+    fn poll_flush(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.get_mut().stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.get_mut().stream).poll_shutdown(context)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+
+    use super::*;
+
+    #[tokio::test]
+    async fn who_says_nothing_makes_room_for_who_comes() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let address = listener.local_addr().expect("an address");
+        let mut door = Door::new(listener, "page");
+        // Given all places taken by connections that are only opened.
+        let (mut silent, mut inside) = (Vec::new(), Vec::new());
+        for _ in 0..PLACES {
+            silent.push(TcpStream::connect(address).await.expect("connected"));
+            inside.push(door.next().await.0);
+        }
+        // When the first is answered and one more comes, then the second has to leave, and who came is inside.
+        inside[0].write_all(b"answer").await.expect("written");
+        let mut late = TcpStream::connect(address).await.expect("connected");
+        let (mut visitor, _) = door.next().await;
+        late.write_all(b"question").await.expect("written");
+        let mut heard = [0; 8];
+        visitor.read_exact(&mut heard).await.expect("asked");
+        let left = inside[1].read(&mut heard).await.expect_err("the place is given away");
+        assert_eq!(left.kind(), io::ErrorKind::ConnectionAborted);
+        silent[0].write_all(b"more").await.expect("written");
+        assert_eq!(inside[0].read(&mut heard).await.expect("still inside"), 4);
+        // When visitors go, then their places are free.
+        inside.clear();
+        drop(visitor);
+        assert!(door.places.taken().is_empty());
+    }
+}

@@ -1,0 +1,74 @@
+//! The port at which plotters hear of the vehicles: RMC and GGA over TCP.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::sync::broadcast;
+use tokio::time::Instant;
+
+use super::door::{Door, Visitor};
+use super::view::View;
+use super::{feeds, lock};
+
+/// Sentences at most this often.
+const EVERY: Duration = Duration::from_millis(200);
+/// A plotter that takes nothing for this long is let go.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// Sentences that a plotter may be behind before it misses some.
+const QUEUE: usize = 64;
+
+/// Sends sentences of every vehicle whose state is new, and once a second of one that is lost, to every plotter.
+pub(super) async fn serve(mut door: Door, view: Arc<Mutex<View>>) -> std::io::Result<()> {
+    let sentences = broadcast::Sender::<Arc<str>>::new(QUEUE);
+    let accept = async {
+        loop {
+            let (mut plotter, _) = door.next().await;
+            plotter.listens();
+            tokio::spawn(attend(plotter, sentences.subscribe()));
+        }
+    };
+    tokio::select! {
+        () = produce(&sentences, &view) => Ok(()),
+        never = accept => never,
+    }
+}
+
+async fn produce(sentences: &broadcast::Sender<Arc<str>>, view: &Mutex<View>) {
+    let mut told = BTreeMap::new();
+    loop {
+        tokio::time::sleep(EVERY).await;
+        for vehicle in lock(view).vehicles(Instant::now()) {
+            let key = (vehicle.payload.clone(), vehicle.target.clone());
+            // A lost one's age in whole seconds tells when it is due again.
+            let lost = (!vehicle.is_current()).then(|| vehicle.age.s() as u64);
+            let now = (vehicle.state.timestamp, lost);
+            if told.insert(key, now) != Some(now) {
+                // Nobody may listen.
+                let _ = sentences.send(feeds::nmea(&vehicle).into());
+            }
+        }
+    }
+}
+
+/// Attends to one plotter until it goes, or takes nothing any more. What it says is not looked at.
+async fn attend(mut plotter: Visitor, mut news: broadcast::Receiver<Arc<str>>) {
+    let mut ignored = [0; 256];
+    loop {
+        tokio::select! {
+            said = plotter.read(&mut ignored) => if !matches!(said, Ok(1..)) { return },
+            text = news.recv() => match text {
+                Ok(text) => {
+                    let sent = tokio::time::timeout(PATIENCE, plotter.write_all(text.as_bytes())).await;
+                    if !matches!(sent, Ok(Ok(()))) {
+                        return;
+                    }
+                    plotter.listens();
+                }
+                Err(broadcast::error::RecvError::Lagged(_)) => {}
+                Err(broadcast::error::RecvError::Closed) => return,
+            },
+        }
+    }
+}

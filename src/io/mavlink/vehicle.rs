@@ -1,0 +1,138 @@
+//! What may be said of a vehicle: a state that is fresh, sure, and was seen a moment ago; nothing else.
+
+use windhover_base::msg::{TargetEstimate, TargetState, TrackStatus};
+use windhover_base::time::{MonoTime, Span};
+
+/// What a state must be to go out as a position.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Limits {
+    /// Greatest age of the estimate.
+    pub max_age: Span,
+    /// Greatest one-sigma of the position relative to the helicopter, metres.
+    pub max_sigma_m: f64,
+    /// Longest that a vehicle out of sight is predicted.
+    pub coast: Span,
+}
+
+/// What is said of a vehicle.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum Said {
+    /// It is seen, and here.
+    Seen(MonoTime, TargetState),
+    /// It was seen a moment ago, and should be here.
+    Predicted(MonoTime, TargetState),
+    /// Nothing: no position goes out.
+    Nothing,
+}
+
+/// A vehicle as the pipeline last told of it.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub struct Vehicle {
+    latest: Option<TargetEstimate>,
+    /// When it was last seen and settled.
+    seen: Option<MonoTime>,
+}
+
+impl Vehicle {
+    /// Takes an estimate; one that is older than what is known is left.
+    pub fn take(&mut self, estimate: &TargetEstimate) {
+        if self.latest.is_some_and(|latest| estimate.t_valid < latest.t_valid) {
+            return;
+        }
+        if estimate.status == TrackStatus::Tracking {
+            self.seen = Some(estimate.t_valid);
+        }
+        self.latest = Some(*estimate);
+    }
+
+    /// What is said of it at `now`.
+    pub fn said(&self, now: MonoTime, limits: &Limits) -> Said {
+        let Some(TargetEstimate { t_valid, status, state: Some(state), .. }) = self.latest else {
+            return Said::Nothing;
+        };
+        let fresh = (now - t_valid).abs() <= limits.max_age;
+        // What cannot be compared is not sure.
+        let sure = state.relative_sigma_m.is_some_and(|sigma_m| sigma_m <= limits.max_sigma_m);
+        let lately = self.seen.is_some_and(|seen| t_valid - seen <= limits.coast);
+        match status {
+            _ if !(fresh && sure) => Said::Nothing,
+            TrackStatus::Tracking => Said::Seen(t_valid, state),
+            TrackStatus::Coasting if lately => Said::Predicted(t_valid, state),
+            TrackStatus::Coasting | TrackStatus::Acquiring | TrackStatus::Lost => Said::Nothing,
+        }
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+
+    const LIMITS: Limits =
+        Limits { max_age: Span::from_ns(500_000_000), max_sigma_m: 2.0, coast: Span::from_ns(1_000_000_000) };
+
+    fn at(s: f64) -> MonoTime {
+        MonoTime::default() + Span::from_s(s)
+    }
+
+    /// A state at this height, known so well relative to the helicopter.
+    pub(in crate::io::mavlink) fn state_of(height_m: f64, relative_sigma_m: Option<f64>) -> TargetState {
+        TargetState {
+            north_m: 1.0,
+            east_m: 2.0,
+            heading_rad: 0.1,
+            speed_mps: 1.0,
+            yaw_rate_radps: 0.0,
+            lat_deg: 30.0,
+            lon_deg: -85.0,
+            height_m,
+            covariance: None,
+            relative_sigma_m,
+        }
+    }
+
+    fn estimate(s: f64, status: TrackStatus, relative_sigma_m: Option<f64>) -> TargetEstimate {
+        let state = state_of(6.0, relative_sigma_m);
+        TargetEstimate { t_valid: at(s), frame: 1, target: 0, status, state: Some(state) }
+    }
+
+    fn after(estimates: &[TargetEstimate], s: f64) -> &'static str {
+        let mut vehicle = Vehicle::default();
+        estimates.iter().for_each(|estimate| vehicle.take(estimate));
+        match vehicle.said(at(s), &LIMITS) {
+            Said::Seen(..) => "seen",
+            Said::Predicted(..) => "predicted",
+            Said::Nothing => "nothing",
+        }
+    }
+
+    #[test]
+    fn an_estimate_is_said_while_it_is_fresh_and_sure() {
+        use TrackStatus::{Acquiring, Lost, Tracking};
+        assert_eq!(after(&[], 1.0), "nothing");
+        let tracking = [estimate(1.0, Tracking, Some(0.1))];
+        assert_eq!(
+            (after(&tracking, 1.1), after(&tracking, 1.5), after(&tracking, 1.6)),
+            ("seen", "seen", "nothing")
+        );
+        for sigma_m in [None, Some(2.1), Some(f64::NAN), Some(f64::INFINITY)] {
+            assert_eq!(after(&[estimate(1.0, Tracking, sigma_m)], 1.0), "nothing", "{sigma_m:?}");
+        }
+        for status in [Acquiring, Lost] {
+            assert_eq!(after(&[estimate(1.0, status, Some(0.1))], 1.0), "nothing", "{status:?}");
+        }
+        // A state of the future is none of now.
+        assert_eq!(after(&tracking, 0.4), "nothing");
+    }
+
+    #[test]
+    fn a_vehicle_out_of_sight_is_predicted_for_a_moment() {
+        use TrackStatus::{Coasting, Tracking};
+        let seen = estimate(1.0, Tracking, Some(0.1));
+        let coasting = |s| [seen, estimate(s, Coasting, Some(0.2))];
+        assert_eq!(after(&coasting(1.9), 1.9), "predicted");
+        assert_eq!(after(&coasting(2.1), 2.1), "nothing", "however sure the filter is of it");
+        assert_eq!(after(&[estimate(1.0, Coasting, Some(0.1))], 1.0), "nothing", "never seen");
+        // What comes late changes nothing.
+        assert_eq!(after(&[coasting(1.9)[1], seen], 1.9), "nothing");
+    }
+}
