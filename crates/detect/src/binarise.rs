@@ -96,9 +96,9 @@ pub(super) enum Where {
 const SATURATED: u8 = 250;
 
 impl Binariser {
-    /// Measures the range around every tile of an image. Only ranges of at least `gate` count. Of a negative, contrast
-    /// is that of the picture it was made from.
-    pub fn measure(&mut self, image: ImageView<'_>, gate: u8, is_negative: bool, simd: Simd) {
+    /// Measures the range around every tile of an image. Only ranges of at least the first of `gates` count, and in
+    /// clear air of the second. Of a negative, contrast is that of the picture it was made from.
+    pub fn measure(&mut self, image: ImageView<'_>, gates: (u8, u8), is_negative: bool, simd: Simd) {
         let (across, down) = (image.width.div_ceil(TILE), image.height.div_ceil(TILE));
         self.tiles = (across, down);
         let Self { low, high, wide_low, wide_high, relative, .. } = self;
@@ -116,16 +116,19 @@ impl Binariser {
         }
         widen(&self.low, &mut self.wide_low, &mut self.scratch, across, u8::min);
         widen(&self.high, &mut self.wide_high, &mut self.scratch, across, u8::max);
-        self.weigh(gate, is_negative);
+        self.weigh(gates, is_negative);
     }
 
     /// Fills in `relative` and `least_relative`: see `BUSY_SHARE`.
-    fn weigh(&mut self, gate: u8, is_negative: bool) {
+    fn weigh(&mut self, (gate, clear_gate): (u8, u8), is_negative: bool) {
         let mut tiles = [0u32; 256];
         for ((r, &low), &high) in self.relative.iter_mut().zip(&self.wide_low).zip(&self.wide_high) {
             let range = high - low;
             let lightest = if is_negative { !low } else { high };
-            *r = if range >= gate { relative(range, lightest).max(1) } else { 0 };
+            *r = match range {
+                _ if range >= clear_gate => relative(range, lightest).max(1),
+                _ => u8::from(range >= gate),
+            };
             tiles[usize::from(*r)] += 1;
         }
         let budget = (BUSY_SHARE * self.wide_low.len() as f32) as u32;
@@ -263,7 +266,7 @@ mod tests {
             (12..22).for_each(|u| image.data[v * 40 + u] = 20);
         }
         let (mut binariser, mut bits) = (Binariser::default(), Bitmap::default());
-        binariser.measure(image.view(), 30, false, Simd::best());
+        binariser.measure(image.view(), (30, 30), false, Simd::best());
         binariser.mark(image.view(), 128, Where::Everywhere, &mut bits, Simd::best());
         for v in 0..30 {
             for u in 0..40 {
@@ -271,7 +274,7 @@ mod tests {
                 assert_eq!(dark, image.data[v * 40 + u] == 20, "({u}, {v})");
             }
         }
-        binariser.measure(image.view(), 190, false, Simd::best());
+        binariser.measure(image.view(), (190, 190), false, Simd::best());
         binariser.mark(image.view(), 128, Where::Everywhere, &mut bits, Simd::best());
         assert!((0..30).all(|v| bits.row(v)[0] == 0), "a gate above the contrast leaves nothing");
     }
@@ -287,7 +290,7 @@ mod tests {
         let pixels = (0..320 * 128).map(|i| light(i % 320, i / 320)).collect();
         let image = GrayImage::from_vec(320, 128, pixels).expect("size");
         let (mut binariser, mut bits) = (Binariser::default(), Bitmap::default());
-        binariser.measure(image.view(), 30, false, Simd::best());
+        binariser.measure(image.view(), (30, 30), false, Simd::best());
         assert!(binariser.is_busy());
         let marked = |bits: &Bitmap| -> Vec<bool> {
             (0..5).map(|word| (0..128).any(|v| bits.row(v)[word] != 0)).collect()

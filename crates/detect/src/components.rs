@@ -48,15 +48,13 @@ struct Sums {
     bottom: u16,
     /// Area in the lower half, runs in the upper.
     counts: u64,
-    /// Whether it was joined with others by corners.
-    has_grown: bool,
 }
 
 impl Sums {
     /// No pixel as yet, from row `v` on.
     #[inline(always)]
     fn from_row(v: u16) -> Self {
-        Self { left: u16::MAX, right: 0, top: v, bottom: v, counts: 0, has_grown: false }
+        Self { left: u16::MAX, right: 0, top: v, bottom: v, counts: 0 }
     }
 
     /// Adds a run of a row that is not above any before.
@@ -77,7 +75,7 @@ impl Sums {
     }
 
     fn component(&self) -> Component {
-        let &Self { left, right, top, bottom, counts, .. } = self;
+        let &Self { left, right, top, bottom, counts } = self;
         let (area, runs) = (counts as u32, (counts >> 32) as u32);
         Component { left, right: right - 1, top, bottom, area, runs }
     }
@@ -96,6 +94,13 @@ struct Marks {
 }
 
 impl Marks {
+    /// Runs that end before column `u`.
+    #[inline(always)]
+    fn ended_before(row: &[Self], u: u16) -> usize {
+        let m = &row[usize::from(u >> 6)];
+        m.ended as usize + (m.ends & ((1 << (u & 63)) - 1)).count_ones() as usize
+    }
+
     /// Runs that end at column `u` or before.
     #[inline(always)]
     fn ended_by(row: &[Self], u: u16) -> usize {
@@ -108,13 +113,6 @@ impl Marks {
     fn started_before(row: &[Self], u: u16) -> usize {
         let m = &row[usize::from(u >> 6)];
         m.started as usize + (m.starts & ((1 << (u & 63)) - 1)).count_ones() as usize
-    }
-
-    /// Runs that end before column `u`.
-    #[inline(always)]
-    fn ended_before(row: &[Self], u: u16) -> usize {
-        let m = &row[usize::from(u >> 6)];
-        m.ended as usize + (m.ends & ((1 << (u & 63)) - 1)).count_ones() as usize
     }
 
     /// Runs that start at column `u` or before.
@@ -141,32 +139,38 @@ pub(super) struct Labeller {
     /// Labels found to be of one component, and how many pairs there are.
     joins: Vec<(u32, u32)>,
     joined: usize,
-    /// Labels whose pixels touch by a corner, and how many pairs there are.
-    corners: Vec<(u32, u32)>,
-    cornered: usize,
     sums: Vec<Sums>,
-    /// Labels that are roots when sides alone join.
-    roots: Vec<u32>,
     /// Components kept and the labels of their roots.
     kept: Vec<(Component, u32)>,
+    /// Components kept before they were parted.
+    whole: Vec<(Component, u32)>,
     outlines: Vec<(u16, u16)>,
+    runs_found: usize,
 }
 
 impl Labeller {
-    /// Finds the components of a bitmap and outlines those that `keep` accepts: those of pixels that touch by their
-    /// sides, and where some of these touch by corners, what they are together. A thin border seen aslant holds
-    /// together by corners alone; two squares that touch by a corner are two. Bitmaps are less than 65 000 pixels
-    /// wide and high.
+    /// Finds the components of a bitmap (pixels that touch by a side or a corner) and outlines those that
+    /// `keep` accepts. Bitmaps are less than 65 000 pixels wide and high.
     pub fn label(&mut self, bits: &Bitmap, simd: Simd, keep: impl Fn(&Component) -> bool) {
-        self.kept.clear();
-        self.outlines.clear();
         simd.run(FindRuns { labeller: self, bits });
-        self.gather(&keep);
-        let words = bits.width.div_ceil(64);
-        simd.run(FindOutlines { labeller: self, words, from: 0 });
-        let from = self.kept.len();
-        self.gather_cornered(&keep);
-        simd.run(FindOutlines { labeller: self, words, from });
+        self.gather(keep);
+        simd.run(FindOutlines { labeller: self, words: bits.width.div_ceil(64) });
+    }
+
+    /// Labels the bitmap that was labelled last once more, pixels that touch by a corner alone taken for apart, and
+    /// keeps of what that parts the pieces that `keep` accepts: two squares that touch by a corner are two.
+    pub fn part(&mut self, bits: &Bitmap, simd: Simd, keep: impl Fn(&Component) -> bool) {
+        std::mem::swap(&mut self.whole, &mut self.kept);
+        simd.run(LabelBySides { labeller: self, bits });
+        let whole = std::mem::take(&mut self.whole);
+        self.gather(|c| keep(c) && !whole.iter().any(|(w, _)| w == c));
+        self.whole = whole;
+        simd.run(FindOutlines { labeller: self, words: bits.width.div_ceil(64) });
+    }
+
+    /// How many runs there are.
+    pub fn run_count(&self) -> usize {
+        self.runs_found
     }
 
     /// The kept components with their outlines.
@@ -188,13 +192,33 @@ impl Labeller {
         self.marks.resize((bits.height + 1) * marks, Marks::default());
         self.marks[..marks].fill(Marks::default());
         let (mut above, mut first) = (0, 0);
-        (self.count, self.joined, self.cornered) = (0, 0, 0);
+        (self.count, self.joined) = (0, 0);
         for v in 0..bits.height {
             self.rows.push(first as u32);
             let after = first + self.split_row(bits.row(v), first, (v + 1) * marks);
-            self.label_row(above, first..after, v as u16, v * marks..(v + 1) * marks);
+            self.label_row::<true>(above, first..after, v as u16, v * marks..(v + 1) * marks);
             (above, first) = (first, after);
         }
+        self.runs_found = first;
+        self.join();
+    }
+
+    /// Labels the runs that were found anew, by their sides alone.
+    #[inline(always)]
+    fn label_by_sides(&mut self, bits: &Bitmap) {
+        let marks = bits.width.div_ceil(64) + 1;
+        (self.count, self.joined) = (0, 0);
+        let mut above = 0;
+        for v in 0..bits.height {
+            let first = self.rows[v] as usize;
+            let after = self.rows.get(v + 1).map_or(self.runs_found, |&next| next as usize);
+            self.label_row::<false>(above, first..after, v as u16, v * marks..(v + 1) * marks);
+            above = first;
+        }
+        self.join();
+    }
+
+    fn join(&mut self) {
         for &(a, b) in &self.joins[..self.joined] {
             union(&mut self.parents, a, b);
         }
@@ -246,7 +270,13 @@ impl Labeller {
     /// Labels the runs of a row; those of the row above start at `above` and have these marks. Nothing branches
     /// on what a run touches, save where it touches three or more.
     #[inline(always)]
-    fn label_row(&mut self, above: usize, row: Range<usize>, v: u16, marks: Range<usize>) {
+    fn label_row<const BY_CORNERS: bool>(
+        &mut self,
+        above: usize,
+        row: Range<usize>,
+        v: u16,
+        marks: Range<usize>,
+    ) {
         let marks = &self.marks[marks];
         // One more than there can be: what is too much is written over.
         let most = row.end + 1;
@@ -255,15 +285,18 @@ impl Labeller {
             self.parents.resize(most, 0);
             self.sums.resize(most, Sums::from_row(0));
             self.joins.resize(most, (0, 0));
-            self.corners.resize(2 * most, (0, 0));
         }
-        let (mut count, mut joined, mut cornered) = (self.count, self.joined, self.cornered);
+        let (mut count, mut joined) = (self.count, self.joined);
         let (runs, labels) = (&self.runs[row.clone()], &mut self.labels[above..most]);
         let (parents, sums) = (&mut self.parents[..most], &mut self.sums[..most]);
-        let (joins, corners) = (&mut self.joins[..most], &mut self.corners[..2 * most]);
+        let joins = &mut self.joins[..most];
         for (run, k) in runs.iter().zip(row.start - above..) {
-            let from = Marks::ended_by(marks, run.start);
-            let to = Marks::started_before(marks, run.end);
+            // By corners too touch one above that ends where this starts, and one that starts where it ends.
+            let (from, to) = if BY_CORNERS {
+                (Marks::ended_before(marks, run.start), Marks::started_by(marks, run.end))
+            } else {
+                (Marks::ended_by(marks, run.start), Marks::started_before(marks, run.end))
+            };
             let is_new = from >= to;
             parents[count] = count as u32;
             sums[count] = Sums::from_row(v);
@@ -271,11 +304,6 @@ impl Labeller {
             count += usize::from(is_new);
             labels[k] = own;
             sums[own as usize].add(run, v);
-            // By a corner touch one that ends where this starts, and one that starts where it ends.
-            corners[cornered] = (own, labels[from.max(1) - 1]);
-            cornered += usize::from(Marks::ended_before(marks, run.start) < from);
-            corners[cornered] = (own, labels[to]);
-            cornered += usize::from(Marks::started_by(marks, run.end) > to);
             let other = labels[from + 1];
             joins[joined] = (own, other);
             joined += usize::from((to > from + 1) & (own != other));
@@ -285,11 +313,11 @@ impl Labeller {
                 }
             }
         }
-        (self.count, self.joined, self.cornered) = (count, joined, cornered);
+        (self.count, self.joined) = (count, joined);
     }
 
     /// Sums labels up into components and finds which are kept.
-    fn gather(&mut self, keep: &impl Fn(&Component) -> bool) {
+    fn gather(&mut self, keep: impl Fn(&Component) -> bool) {
         for label in 0..self.count {
             let parent = self.parents[label] as usize;
             if parent != label {
@@ -300,10 +328,9 @@ impl Labeller {
                 self.sums[root as usize].merge(&part);
             }
         }
-        self.roots.clear();
+        self.kept.clear();
         for (label, &parent) in self.parents[..self.count].iter().enumerate() {
             if parent as usize == label {
-                self.roots.push(parent);
                 let component = self.sums[label].component();
                 if keep(&component) {
                     self.kept.push((component, parent));
@@ -312,37 +339,13 @@ impl Labeller {
         }
     }
 
-    /// Joins components that touch by corners and finds which of the new ones are kept.
-    fn gather_cornered(&mut self, keep: &impl Fn(&Component) -> bool) {
-        for &(a, b) in &self.corners[..self.cornered] {
-            union(&mut self.parents, a, b);
-        }
-        for &label in &self.roots {
-            let parent = self.parents[label as usize];
-            if parent != label {
-                // A parent comes before its children, so it is a root by now.
-                let root = self.parents[parent as usize];
-                self.parents[label as usize] = root;
-                let part = self.sums[label as usize];
-                self.sums[root as usize].merge(&part);
-                self.sums[root as usize].has_grown = true;
-            }
-        }
-        for &label in &self.roots {
-            let sums = self.sums[label as usize];
-            if self.parents[label as usize] == label && sums.has_grown && keep(&sums.component()) {
-                self.kept.push((sums.component(), label));
-            }
-        }
-    }
-
-    /// Finds the leftmost and the rightmost run of each row of the components kept, those from `from` on.
+    /// Finds the leftmost and the rightmost run of each row of the components kept.
     #[inline(always)]
-    fn outline(&mut self, words: usize, from: usize) {
+    fn outline(&mut self, words: usize) {
         let Self { runs, labels, rows, marks, parents, kept, outlines, .. } = self;
-        for (component, root) in &kept[from..] {
-            // Joined by corners, a root is the child of another.
-            let is_own = |k: &usize| parents[parents[labels[*k] as usize] as usize] == *root;
+        outlines.clear();
+        for (component, root) in kept {
+            let is_own = |k: &usize| parents[labels[*k] as usize] == *root;
             for v in usize::from(component.top)..=usize::from(component.bottom) {
                 let (first, marks) = (rows[v] as usize, &marks[(v + 1) * (words + 1)..(v + 2) * (words + 1)]);
                 let mut within = first + Marks::ended_before(marks, component.left)
@@ -369,17 +372,29 @@ impl Kernel for FindRuns<'_> {
     }
 }
 
+/// `Labeller::label_by_sides`, likewise.
+struct LabelBySides<'a> {
+    labeller: &'a mut Labeller,
+    bits: &'a Bitmap,
+}
+
+impl Kernel for LabelBySides<'_> {
+    #[inline(always)]
+    fn run(self) {
+        self.labeller.label_by_sides(self.bits);
+    }
+}
+
 /// `Labeller::outline`, likewise.
 struct FindOutlines<'a> {
     labeller: &'a mut Labeller,
     words: usize,
-    from: usize,
 }
 
 impl Kernel for FindOutlines<'_> {
     #[inline(always)]
     fn run(self) {
-        self.labeller.outline(self.words, self.from);
+        self.labeller.outline(self.words);
     }
 }
 
@@ -389,8 +404,8 @@ mod tests {
 
     use super::*;
 
-    /// Flood fill, the plain way, by sides or by corners too: each component with its first pixel.
-    fn flooded(bits: &Bitmap, by_corners: bool) -> Vec<(Component, usize)> {
+    /// Flood fill, the plain way.
+    fn flooded(bits: &Bitmap) -> Vec<Component> {
         let dark = |u: usize, v: usize| bits.row(v)[u / 64] >> (u % 64) & 1 == 1;
         let mut seen = vec![false; bits.width * bits.height];
         let mut found = Vec::new();
@@ -408,15 +423,14 @@ mod tests {
                 c.merge(&pixel);
                 for nv in v.saturating_sub(1)..(v + 2).min(bits.height) {
                     for nu in u.saturating_sub(1)..(u + 2).min(bits.width) {
-                        let by_side = nu == u || nv == v;
-                        if (by_side || by_corners) && dark(nu, nv) && !seen[nv * bits.width + nu] {
+                        if dark(nu, nv) && !seen[nv * bits.width + nu] {
                             seen[nv * bits.width + nu] = true;
                             stack.push((nu, nv));
                         }
                     }
                 }
             }
-            found.push((Component { runs: 0, ..c.component() }, first));
+            found.push(Component { runs: 0, ..c.component() });
         }
         found
     }
@@ -438,9 +452,7 @@ mod tests {
             let mut labeller = Labeller::default();
             labeller.label(&bits, Simd::best(), |_| true);
             let mut labelled: Vec<Component> = labeller.kept().map(|(c, _)| Component { runs: 0, ..*c }).collect();
-            let by_sides = flooded(&bits, false);
-            let wider = flooded(&bits, true).into_iter().filter(|c| !by_sides.contains(c));
-            let mut expected: Vec<Component> = by_sides.iter().copied().chain(wider).map(|c| c.0).collect();
+            let mut expected = flooded(&bits);
             let key = |c: &Component| (c.top, c.left, c.bottom, c.right, c.area);
             labelled.sort_by_key(key);
             expected.sort_by_key(key);

@@ -1,10 +1,9 @@
 //! The tag detector: from an image to tags with their corners.
 
 use super::binarise::{Binariser, Bitmap, Where};
-use super::components::Labeller;
+use super::components::{Component, Labeller};
 use super::detection::TagDetection;
 use super::edges::{EdgeSearch, fit_sides};
-use super::evidence::is_there;
 use super::family::{Family, TagLayout, Word};
 use super::noise::noise_sigma;
 use super::payload;
@@ -85,22 +84,23 @@ const LEAST_EDGE_IN_LEVEL: f32 = 12.0;
 const FRACTION_DIM: u16 = 100;
 
 /// Pixels of a level for each run of dark ones, in the finest level and in the others, from which it is looked at for
-/// contrast that is weaker than that of print in clear air. Where textured ground has more, weak tags are found from
-/// twice the least size on.
-const DIM_AREA_IN_FINEST: usize = 50;
+/// contrast that is weaker than that of print in clear air, and for regions that touch by corners. Where textured
+/// ground has more, such tags are found from twice the least size on.
+const AREA_OF_RUN_IN_FINEST: usize = 50;
+const AREA_OF_RUN: usize = 20;
 
-/// The same by the share of a finest level that has such contrast, which is known before pixels are marked.
+/// Most of a finest level that has such contrast, which is known before pixels are marked.
 const MOST_DIM_IN_FINEST: f32 = 0.4;
 
 /// Least step across a side, as a share of the light outside it, in clear air.
 const CLEAR_STEP: f32 = 0.1;
 
+/// Least contrast that is looked at where an image has hardly any noise, grey levels: in clear air, and at all.
+const CLEAR_GATE: f32 = 12.0;
+const LEAST_GATE: f32 = 6.0;
+
 /// Farthest that corners of two quadrilaterals may be from each other to be read alike, pixels of a level.
 const SAME_QUAD: f32 = 0.3;
-const DIM_AREA: usize = 20;
-
-/// Least contrast that is looked at where an image has hardly any noise, grey levels.
-const LEAST_GATE: f32 = 6.0;
 
 /// Largest image, pixels on a side.
 pub const LARGEST_IMAGE_PX: usize = 32_767;
@@ -189,8 +189,7 @@ impl Detector {
                 (true, _) => &FRACTIONS_TWICE,
                 (false, _) => &FRACTIONS_THRICE,
             };
-            let dim_area = if n == first { DIM_AREA_IN_FINEST } else { DIM_AREA };
-            self.search_level(image, n, fractions, dim_area, inverted);
+            self.search_level(image, n, fractions, n == first, inverted);
         }
     }
 
@@ -199,54 +198,91 @@ impl Detector {
         image: ImageView<'_>,
         n: usize,
         fractions: &[u16],
-        dim_area: usize,
+        finest: bool,
+        inverted: bool,
+    ) {
+        let level = self.pyramid.level(image, n);
+        // Noise alone spans some five sigmas in the 144 pixels of a neighbourhood.
+        let gate = (7.0 * self.noise / level.scale).clamp(LEAST_GATE, 60.0) as u8;
+        self.binariser.measure(level.image, (gate, gate.max(CLEAR_GATE as u8)), inverted, self.simd);
+        self.tried.clear();
+        let highest = fractions.last().copied();
+        for &fraction in fractions {
+            let is_lower = self.binariser.is_busy() && Some(fraction) != highest;
+            let at = if is_lower { Where::LightChanges } else { Where::Everywhere };
+            self.search_division(image, n, (fraction, at), finest, inverted);
+        }
+        if self.binariser.is_saturated() {
+            self.search_division(image, n, (FRACTION_SATURATED, Where::Saturated), finest, inverted);
+        }
+        let most_dim = if finest && !self.binariser.is_hazy() { MOST_DIM_IN_FINEST } else { 1.0 };
+        if (f32::MIN_POSITIVE..=most_dim).contains(&self.binariser.dim_share()) {
+            self.search_division(image, n, (FRACTION_DIM, Where::AboveNoise), finest, inverted);
+        }
+    }
+
+    /// Looks for tags among the dark regions that one division into dark and light makes of a level; among their parts
+    /// too, where they are few.
+    fn search_division(
+        &mut self,
+        image: ImageView<'_>,
+        n: usize,
+        (fraction, at): (u16, Where),
+        finest: bool,
         inverted: bool,
     ) {
         let level = self.pyramid.level(image, n);
         let limits = SizeLimits { least: (self.min_px / level.scale).max(8.0), most: f32::MAX };
         let (width, height) = (level.image.width, level.image.height);
-        // Noise alone spans some five sigmas in the 144 pixels of a neighbourhood.
-        let gate = (7.0 * self.noise / level.scale).clamp(LEAST_GATE, 60.0) as u8;
-        self.binariser.measure(level.image, gate, inverted, self.simd);
-        let highest = fractions.last().copied();
-        let (is_busy, is_saturated) = (self.binariser.is_busy(), self.binariser.is_saturated());
-        let everywhere = fractions.iter().map(|&fraction| match is_busy && Some(fraction) != highest {
-            true => (fraction, Where::LightChanges),
-            false => (fraction, Where::Everywhere),
-        });
-        let saturated = is_saturated.then_some((FRACTION_SATURATED, Where::Saturated));
-        let most_dim = if dim_area == DIM_AREA_IN_FINEST { MOST_DIM_IN_FINEST } else { 1.0 };
-        let is_hazy = self.binariser.is_hazy();
-        let most_dim = if is_hazy { 1.0 } else { most_dim };
-        let has_dim = (f32::MIN_POSITIVE..=most_dim).contains(&self.binariser.dim_share());
-        let dim = has_dim.then_some((FRACTION_DIM, Where::AboveNoise));
-        self.tried.clear();
-        for (fraction, at) in everywhere.chain(saturated).chain(dim) {
-            self.binariser.mark(level.image, fraction, at, &mut self.bits, self.simd);
-            if at == Where::AboveNoise && !is_hazy && self.bits.runs() * dim_area > width * height {
+        let keep = |c: &Component| may_be_border(c, limits, width, height);
+        self.binariser.mark(level.image, fraction, at, &mut self.bits, self.simd);
+        let area_of_run = if finest { AREA_OF_RUN_IN_FINEST } else { AREA_OF_RUN };
+        if at == Where::AboveNoise
+            && !self.binariser.is_hazy()
+            && self.bits.runs() * area_of_run > width * height
+        {
+            return;
+        }
+        self.labeller.label(&self.bits, self.simd, keep);
+        self.read_regions(image, n, limits, at, inverted);
+        if self.labeller.run_count() * area_of_run <= width * height {
+            self.labeller.part(&self.bits, self.simd, keep);
+            self.read_regions(image, n, limits, at, inverted);
+        }
+    }
+
+    /// Reads the regions that were kept.
+    fn read_regions(
+        &mut self,
+        image: ImageView<'_>,
+        n: usize,
+        limits: SizeLimits,
+        at: Where,
+        inverted: bool,
+    ) {
+        let Self { pyramid, labeller, finder, refiner, found, tried, families, noise, .. } = self;
+        let level = pyramid.level(image, n);
+        let (least_gate, least_share) =
+            if at == Where::AboveNoise { (LEAST_GATE, 0.0) } else { (CLEAR_GATE, CLEAR_STEP) };
+        let gate = (7.0 * *noise / level.scale).clamp(least_gate, 60.0) as u8;
+        for (component, outline) in labeller.kept() {
+            let Some(quad) = finder.quad(component, outline, limits) else { continue };
+            let in_frame = quad.map(|p| p.map(|c| level.to_frame(c)));
+            if found.iter().any(|f| same_place(&f.corners, &in_frame)) {
                 continue;
             }
-            self.labeller.label(&self.bits, self.simd, |c| may_be_border(c, limits, width, height));
-            for (component, outline) in self.labeller.kept() {
-                let Some(quad) = self.finder.quad(component, outline, limits) else { continue };
-                let in_frame = quad.map(|p| p.map(|c| level.to_frame(c)));
-                if self.found.iter().any(|f| same_place(&f.corners, &in_frame)) {
-                    continue;
-                }
-                let is_again = |t: &Quad| (0..4).all(|i| distance(t[i], quad[i]) < SAME_QUAD);
-                if self.tried.iter().any(is_again) {
-                    continue;
-                }
-                let least_share = if at == Where::AboveNoise { 0.0 } else { CLEAR_STEP };
-                let Some(straight) = straighten(level, &quad, gate, least_share) else { continue };
-                self.tried.push(quad);
-                // Of a small tag a side may be drawn to what is beside it: then as it was.
-                let found = [straight, in_frame].iter().find_map(|quad| {
-                    let mut families = self.families.iter().filter(|f| f.inverted == inverted);
-                    families.find_map(|f| decode(image, &self.pyramid, quad, f, &mut self.refiner))
-                });
-                self.found.extend(found);
+            let is_again = |t: &Quad| (0..4).all(|i| distance(t[i], quad[i]) < SAME_QUAD);
+            if tried.iter().any(is_again) {
+                continue;
             }
+            let Some(straight) = straighten(level, &quad, gate, least_share) else { continue };
+            tried.push(quad);
+            // Of a small tag a side may be drawn to what is beside it: then as it was.
+            let tag = [straight, in_frame].iter().find_map(|quad| {
+                let mut families = families.iter().filter(|f| f.inverted == inverted);
+                families.find_map(|f| decode(image, pyramid, quad, f, refiner))
+            });
+            found.extend(tag);
         }
     }
 }
@@ -285,8 +321,11 @@ fn decode(
     let reading = payload::read(image, pyramid, quad, family)?;
     let word = reading.word;
     let corners: Quad = std::array::from_fn(|i| quad[(i + word.turns) % 4]);
-    let refined = refiner.refine(image, &corners, family, word.id).unwrap_or_else(|| unrefined(&corners));
-    if !is_there(image, pyramid, &refined.corners, family, &word) {
+    let refined = refiner
+        .refine(image, &corners, family, word.id, reading.is_over_exposed)
+        .unwrap_or_else(|| unrefined(&corners));
+    let fitted = refined.corners.map(|c| [c.x as f32, c.y as f32]);
+    if !payload::agrees(image, pyramid, &fitted, family, word.id) {
         return None;
     }
     Some(Found { family: family.family, word, margin: reading.margin, corners, refined })

@@ -61,7 +61,7 @@ impl DiscFinder {
             return;
         }
         let least = sizes.0.max(LEAST_DIAMETER);
-        self.binariser.measure(image, LEAST_STEP, false, self.simd);
+        self.binariser.measure(image, (LEAST_STEP, LEAST_STEP), false, self.simd);
         self.binariser.mark(image, 128, Where::Everywhere, &mut self.bits, self.simd);
         let (width, height) = (image.width, image.height);
         let keep = |c: &Component| {

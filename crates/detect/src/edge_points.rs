@@ -49,6 +49,8 @@ pub(super) struct NarrowModel {
     pub theta: [f32; PARAMETERS],
     pub sides: [Point; 2],
     pub origin: Point,
+    /// 1 where light spreads from white cells, else 0.
+    pub spreads: f32,
 }
 
 /// Edge points in the image: pixels, normals from dark to light, what the parameters do along those.
@@ -111,7 +113,7 @@ impl NarrowModel {
             let narrow = points[lane].narrow;
             (rows[11][lane], rows[12][lane]) = (even * n[0] - odd * n[1], -odd * n[0] - even * n[1]);
             (rows[13][lane], rows[14][lane]) = (narrow * lx, narrow * ly);
-            rows[15][lane] = -1.0;
+            rows[15][lane] = -self.spreads;
             to.shift[lane] = narrow * (lx * t[13] + ly * t[14]) - t[15];
         }
     }

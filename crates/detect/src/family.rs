@@ -34,6 +34,15 @@ pub(super) struct Word {
     pub turns: usize,
 }
 
+/// A cell of a tag and whether it is light.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Cell {
+    /// Of the code word.
+    Data(bool),
+    /// Of the border, or of the ring around it.
+    Frame(bool),
+}
+
 /// One family, ready for lookup.
 #[derive(Clone, Debug)]
 pub(super) struct Family {
@@ -82,19 +91,28 @@ impl Family {
         bit != self.inverted
     }
 
+    /// Most wrong bits that are corrected.
+    pub fn max_hamming(&self) -> u8 {
+        self.index.max_hamming
+    }
+
+    /// What cell (x, y) of the sampled grid of tag `id` is in the (possibly inverted) image.
+    pub fn cell(&self, id: u32, x: i32, y: i32) -> Cell {
+        let w = self.width as i32;
+        match self.cells.iter().position(|&c| c == (x, y)) {
+            Some(cell) => Cell::Data(self.bit(id, cell)),
+            None => Cell::Frame(!((0..w).contains(&x) && (0..w).contains(&y))),
+        }
+    }
+
     /// Whether cell (x, y) of tag `id` is light in the (possibly inverted) image: data, border (dark) or the
     /// ring around it (light). `None` beyond the ring, where it is not known.
     pub fn is_light(&self, id: u32, x: i32, y: i32) -> Option<bool> {
         let w = self.width as i32;
-        let inside = |margin: i32| (margin..w - margin).contains(&x) && (margin..w - margin).contains(&y);
-        if !inside(-1) {
-            return None;
-        }
-        if inside(self.border as i32) {
-            let cell = self.cells.iter().position(|&c| c == (x, y))?;
-            return Some(self.bit(id, cell));
-        }
-        Some(!inside(0))
+        let is_known = (-1..=w).contains(&x) && (-1..=w).contains(&y);
+        is_known.then(|| match self.cell(id, x, y) {
+            Cell::Data(light) | Cell::Frame(light) => light,
+        })
     }
 
     /// The word nearest to a grid of bits (`grid_side²`, row by row, true for white), if any is near

@@ -12,7 +12,6 @@ mod disjoint_sets;
 mod edge_points;
 mod edges;
 mod equations;
-mod evidence;
 mod family;
 mod features;
 mod flow;

@@ -1,6 +1,6 @@
 //! What a quadrilateral says: its cells sampled, told white from black, and looked up.
 
-use super::family::{Family, Word};
+use super::family::{Cell, Family, Word};
 use super::homography::{Homography, narrow, wide};
 use super::pyramid::Pyramid;
 use super::quad::{Quad, bilinear, distance, polygon_area};
@@ -15,7 +15,12 @@ pub(super) struct Reading {
     pub word: Word,
     /// Mean distance of the cells from the threshold, of the white or the black ones, whichever is less.
     pub margin: f32,
+    /// Whether most white cells are as light as a pixel can be: light spreads from them over the black ones.
+    pub is_over_exposed: bool,
 }
+
+/// From where on a cell is as light as a pixel can be, grey levels.
+const OVER_EXPOSED: f32 = 250.0;
 
 /// Least step from black border to white ring, grey levels.
 const LEAST_CONTRAST: f32 = 5.0;
@@ -211,8 +216,43 @@ impl Grid {
             sum.1 += 1.0f32;
         }
         let mean = |s: (f32, f32)| s.0 / s.1.max(1.0);
-        Some(Reading { word, margin: mean(white).min(mean(black)) })
+        let lights = (0..cells).filter(|&i| bits[i]);
+        let saturated = lights.filter(|&i| self.values[i] >= OVER_EXPOSED).count() as f32;
+        let is_over_exposed = saturated > 0.5 * white.1;
+        Some(Reading { word, margin: mean(white).min(mean(black)), is_over_exposed })
     }
+
+    /// Whether the cells are those of tag `id`, as nearly as they must be to be read.
+    fn agrees(&self, thresholds: &[f32; MOST * MOST], family: &Family, id: u32) -> bool {
+        let (mut wrong_data, mut wrong, mut all) = (0, 0.0, 0.0);
+        for i in 0..self.side * self.side {
+            let [x, y] = [i % self.side, i / self.side].map(|c| c as i32 - self.pad as i32);
+            let is_light = self.values[i] > thresholds[i];
+            match family.cell(id, x, y) {
+                Cell::Data(light) => wrong_data += u8::from(light != is_light),
+                Cell::Frame(light) => {
+                    wrong += f32::from(u8::from(light != is_light));
+                    all += 1.0;
+                }
+            }
+        }
+        wrong_data <= family.max_hamming() && wrong <= MOST_WRONG_BORDER * all
+    }
+}
+
+/// Whether a quadrilateral in the tag's own order holds tag `id`: what `read` says of a candidate, asked once more of
+/// what was made of it. A fit that took hold of other edges than the tag's fails here: the border of two cells that
+/// Kalibr prints has another square inside, without light around it.
+pub(super) fn agrees(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family: &Family, id: u32) -> bool {
+    let Some(grid) = Grid::sample(image, pyramid, quad, family) else { return false };
+    let Some(plane) = grid.plane_threshold() else { return false };
+    if grid.agrees(&plane, family, id) || grid.sharpened().agrees(&plane, family, id) {
+        return true;
+    }
+    let border = grid.border_levels();
+    grid.is_shaded(&border)
+        && (grid.halves_threshold(&border).is_some_and(|t| grid.agrees(&t, family, id))
+            || grid.agrees(&grid.blended_threshold(&border), family, id))
 }
 
 /// Reads a quadrilateral given in frame coordinates. Illumination is tried as a plane, then as lit and shaded

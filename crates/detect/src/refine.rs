@@ -89,17 +89,18 @@ impl Refiner {
     }
 
     /// Refines corners given in the tag's own order; `None` where too few edges are seen or the fit leaves
-    /// what was given.
+    /// what was given. Where white `spreads`, by how much is fitted too.
     pub fn refine(
         &mut self,
         image: ImageView<'_>,
         corners: &Quad,
         family: &Family,
         id: u32,
+        spreads: bool,
     ) -> Option<Refined> {
         let edge = (0..4).map(|i| distance(corners[i], corners[(i + 1) % 4])).sum::<f32>() / 4.0;
         let cell = f64::from(edge) / family.width as f64;
-        let mut model = Model::of_corners(corners)?;
+        let mut model = Model::of_corners(corners, spreads)?;
         self.edges.place(family, id, cell);
         let held = held(0.5 * f64::from(edge), cell);
         let (covariance, windows) = self.fit(image, &mut model, family.width, held)?;

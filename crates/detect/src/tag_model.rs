@@ -31,10 +31,12 @@ pub(super) struct Model {
     sides: [Vector2<f64>; 2],
     /// Of the pixels meant here: near the tag, so that the parameters are of one size.
     origin: Vector2<f64>,
+    /// Whether light spreads from white cells.
+    spreads: bool,
 }
 
 impl Model {
-    pub fn of_corners(corners: &Quad) -> Option<Self> {
+    pub fn of_corners(corners: &Quad, spreads: bool) -> Option<Self> {
         let origin = [0, 1].map(|k| corners.iter().map(|p| f64::from(p[k])).sum::<f64>() / 4.0);
         let wide = corners.map(|p| [f64::from(p[0]) - origin[0], f64::from(p[1]) - origin[1]]);
         // A square from 0 to 2, moved by one.
@@ -51,7 +53,7 @@ impl Model {
         let side = |a: usize, b: usize| Vector2::new(wide[b][0] - wide[a][0], wide[b][1] - wide[a][1]);
         let sides = [side(0, 1) + side(3, 2), side(0, 3) + side(1, 2)];
         let length = (0.5 * (sides[0].norm_squared() + sides[1].norm_squared())).sqrt();
-        Some(Self { theta, sides: sides.map(|s| s / length.max(1e-9)), origin: origin.into() })
+        Some(Self { theta, sides: sides.map(|s| s / length.max(1e-9)), origin: origin.into(), spreads })
     }
 
     /// How far a corner is from where another model has it, at most.
@@ -83,6 +85,7 @@ impl Model {
             theta: std::array::from_fn(|i| self.theta[i] as f32),
             sides: self.sides.map(|a| [a.x as f32, a.y as f32]),
             origin: [self.origin.x as f32, self.origin.y as f32],
+            spreads: f32::from(u8::from(self.spreads)),
         }
     }
 
