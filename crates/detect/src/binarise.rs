@@ -1,6 +1,6 @@
 //! Dark pixels: thresholds from the local range of 4×4 tiles, one bit a pixel.
 
-use super::simd::{Simd, TILE};
+use super::simd::{Kernel, Simd, TILE};
 use windhover_base::msg::ImageView;
 
 /// One bit a pixel, lowest first; set where the pixel is dark. Bits past the width are zero.
@@ -54,6 +54,11 @@ const BUSY_SHARE: f32 = 0.3;
 /// Share of an image with the contrast of print in clear air below which weak contrast is what there is.
 const HAZY_SHARE: f32 = 0.05;
 
+/// Contrast of sharp print, of 256, which stones and their shadows seldom have, and how much of an image has it that
+/// shows a sheet of print.
+const PRINTED: u8 = 190;
+const PRINTED_SHARE: f32 = 0.15;
+
 /// Tiles on a side of the blocks whose light is compared, and by what factor it differs among a block and its
 /// neighbours where a shadow ends.
 const BLOCK: usize = 8;
@@ -71,9 +76,11 @@ pub(super) struct Binariser {
     relative: Vec<u8>,
     /// The least of these that counts in this image.
     least_relative: u8,
-    /// Shares of the tiles that are above the gate and have less than that, and that have the contrast of clear air.
+    /// Shares of the tiles that are above the gate and have less than that, that have the contrast of clear air, and that
+    /// of sharp print.
     dim_share: f32,
     clear_share: f32,
+    printed_share: f32,
     thresholds: Vec<u8>,
     tiles: (usize, usize),
     /// Mean of the local maxima of each block of tiles.
@@ -116,21 +123,18 @@ impl Binariser {
         }
         widen(&self.low, &mut self.wide_low, &mut self.scratch, across, u8::min);
         widen(&self.high, &mut self.wide_high, &mut self.scratch, across, u8::max);
-        self.weigh(gates, is_negative);
+        self.weigh(gates, is_negative, simd);
     }
 
     /// Fills in `relative` and `least_relative`: see `BUSY_SHARE`.
-    fn weigh(&mut self, (gate, clear_gate): (u8, u8), is_negative: bool) {
-        let mut tiles = [0u32; 256];
-        for ((r, &low), &high) in self.relative.iter_mut().zip(&self.wide_low).zip(&self.wide_high) {
-            let range = high - low;
-            let lightest = if is_negative { !low } else { high };
-            *r = match range {
-                _ if range >= clear_gate => relative(range, lightest).max(1),
-                _ => u8::from(range >= gate),
-            };
-            tiles[usize::from(*r)] += 1;
+    fn weigh(&mut self, gates: (u8, u8), is_negative: bool, simd: Simd) {
+        let Self { wide_low: low, wide_high: high, relative: to, .. } = self;
+        match is_negative {
+            false => simd.run(Weigh::<false> { low, high, to, gates }),
+            true => simd.run(Weigh::<true> { low, high, to, gates }),
         }
+        let mut tiles = [0u32; 256];
+        self.relative.iter().for_each(|&r| tiles[usize::from(r)] += 1);
         let budget = (BUSY_SHARE * self.wide_low.len() as f32) as u32;
         let from = |r: u8| tiles[usize::from(r)];
         let (mut least, mut passed) = (ENOUGH_RELATIVE, (ENOUGH_RELATIVE..=u8::MAX).map(from).sum::<u32>());
@@ -142,6 +146,8 @@ impl Binariser {
         let clear = tiles[usize::from(CLEAR_RELATIVE)..].iter().sum::<u32>();
         [self.dim_share, self.clear_share] =
             [dim, clear].map(|count| count as f32 / self.wide_low.len() as f32);
+        let printed = tiles[usize::from(PRINTED)..].iter().sum::<u32>();
+        self.printed_share = printed as f32 / self.wide_low.len() as f32;
         self.least_relative = least;
     }
 
@@ -155,9 +161,16 @@ impl Binariser {
         self.clear_share < HAZY_SHARE
     }
 
+    /// Whether much of the image has the contrast of sharp print: sheets of tags, that touch each other's corners.
+    pub fn is_print(&self) -> bool {
+        self.printed_share > PRINTED_SHARE
+    }
+
     /// Whether a tile that is looked at has saturated pixels near.
     pub fn is_saturated(&self) -> bool {
-        self.wide_high.iter().zip(&self.relative).any(|(&h, &r)| h >= SATURATED && r >= self.least_relative)
+        let is_any = self.wide_high.iter().fold(false, |any, &h| any | (h >= SATURATED));
+        let mut tiles = self.wide_high.iter().zip(&self.relative);
+        is_any && tiles.any(|(&h, &r)| h >= SATURATED && r >= self.least_relative)
     }
 
     /// Whether more of the image has all the contrast a tag has than can be looked at cheaply.
@@ -172,20 +185,25 @@ impl Binariser {
         self.thresholds.resize(across * down, 0);
         let least = if at == Where::AboveNoise { 1 } else { self.least_relative };
         let lightest = if at == Where::Saturated { SATURATED } else { 0 };
-        let measured = self.wide_low.iter().zip(&self.wide_high).zip(&self.relative);
-        for (t, ((&low, &high), &relative)) in self.thresholds.iter_mut().zip(measured) {
-            let above = (u16::from(high - low) * fraction + 128) >> 8;
-            *t = if relative >= least && high >= lightest { low + above as u8 } else { 0 };
-        }
+        let Self { wide_low: low, wide_high: high, relative, thresholds: to, .. } = self;
+        simd.run(Divide { low, high, relative, to, fraction, least, lightest });
         if at == Where::LightChanges {
             self.clear_even_light();
         }
         let per_row = image.width.div_ceil(64);
         (out.width, out.height) = (image.width, image.height);
         out.words.resize(per_row * image.height, 0);
+        let mut is_empty = true;
         for (v, words) in out.words.chunks_exact_mut(per_row).enumerate() {
             let tile = v / TILE;
-            simd.pack_below(image.row(v), &self.thresholds[tile * across..(tile + 1) * across], words);
+            let thresholds = &self.thresholds[tile * across..(tile + 1) * across];
+            if v % TILE == 0 {
+                is_empty = thresholds.iter().fold(0, |any, t| any | t) == 0;
+            }
+            match is_empty {
+                true => words.fill(0),
+                false => simd.pack_below(image.row(v), thresholds, words),
+            }
         }
     }
 
@@ -217,20 +235,63 @@ impl Binariser {
     }
 }
 
-/// `RECIPROCALS[n]` = 255 · 2¹⁶ / n, rounded up: products with up to n, shifted back, are exact.
-const RECIPROCALS: [u32; 256] = {
-    let mut table = [0; 256];
-    let mut n = 1;
-    while n < 256 {
-        table[n] = (255u32 << 16).div_ceil(n as u32);
-        n += 1;
-    }
-    table
-};
+/// Thresholds of tiles, nought where nothing is dark.
+struct Divide<'a> {
+    low: &'a [u8],
+    high: &'a [u8],
+    relative: &'a [u8],
+    to: &'a mut [u8],
+    fraction: u16,
+    least: u8,
+    lightest: u8,
+}
 
-/// Range over maximum, of 255, without a division.
+impl Kernel for Divide<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { low, high, relative, to, fraction, least, lightest } = self;
+        let count = to.len();
+        let (low, high, relative) = (&low[..count], &high[..count], &relative[..count]);
+        for t in 0..count {
+            let above =
+                (u16::from(high[t].wrapping_sub(low[t])).wrapping_mul(fraction).wrapping_add(128)) >> 8;
+            let threshold = low[t].wrapping_add(above as u8);
+            to[t] = if (relative[t] >= least) & (high[t] >= lightest) { threshold } else { 0 };
+        }
+    }
+}
+
+/// Contrasts of tiles: ranges over what is lightest, of 255. Of a negative that is what is darkest in it.
+struct Weigh<'a, const NEGATIVE: bool> {
+    low: &'a [u8],
+    high: &'a [u8],
+    to: &'a mut [u8],
+    gates: (u8, u8),
+}
+
+impl<const NEGATIVE: bool> Kernel for Weigh<'_, NEGATIVE> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { low, high, to, gates: (gate, clear_gate) } = self;
+        let count = to.len();
+        let (low, high) = (&low[..count], &high[..count]);
+        for t in 0..count {
+            let range = high[t].wrapping_sub(low[t]);
+            let contrast = relative(range, if NEGATIVE { !low[t] } else { high[t] });
+            let dim = if range >= gate { 1 } else { 0 };
+            to[t] = if range >= clear_gate { contrast } else { dim };
+        }
+    }
+}
+
+/// Added to a number from −2²² to 2²², it leaves the nearest whole number in the low bits.
+const WHOLE: f32 = 12_582_912.0;
+
+/// Range over maximum, of 255, rounded down: quotients by at most 255 end in nothing between 254/255 and 1.
+#[inline(always)]
 fn relative(range: u8, high: u8) -> u8 {
-    ((u32::from(range) * RECIPROCALS[usize::from(high)]) >> 16) as u8
+    let high = if high > 0 { high } else { 1 };
+    (255.0 * f32::from(range) / f32::from(high) - 0.498 + WHOLE).to_bits() as u8
 }
 
 /// Extreme over 3×3 tiles.
@@ -302,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn reciprocals_divide_exactly() {
+    fn contrasts_are_exact() {
         for high in 1..=255u8 {
             for range in 0..=high {
                 assert_eq!(u32::from(relative(range, high)), u32::from(range) * 255 / u32::from(high));

@@ -1,13 +1,13 @@
 //! The tag detector: from an image to tags with their corners.
 
 use super::binarise::{Binariser, Bitmap, Where};
-use super::components::{Component, Labeller};
+use super::components::{Labeller, Touch};
 use super::detection::TagDetection;
 use super::edges::{EdgeSearch, fit_sides};
 use super::family::{Family, TagLayout, Word};
 use super::noise::noise_sigma;
 use super::payload;
-use super::pyramid::{Base, Level, Pyramid};
+use super::pyramid::{Base, Level, Pyramid, Rim};
 use super::quad::{Quad, QuadFinder, SizeLimits, distance, looks_like_tag, may_be_border, polygon_area};
 use super::refine::Refiner;
 use super::roi::Roi;
@@ -83,14 +83,13 @@ const LEAST_EDGE_IN_LEVEL: f32 = 12.0;
 /// Where weak contrast is divided.
 const FRACTION_DIM: u16 = 100;
 
-/// Pixels of a level for each run of dark ones, in the finest level and in the others, from which it is looked at for
-/// contrast that is weaker than that of print in clear air, and for regions that touch by corners. Where textured
-/// ground has more, such tags are found from twice the least size on.
-const AREA_OF_RUN_IN_FINEST: usize = 50;
+/// Pixels of a level for each run of dark ones from which it is looked at for contrast that is weaker than that of
+/// print in clear air, where there is such too. In the finest level it is not: weak tags beside clear contrast are found
+/// from twice the least size on.
 const AREA_OF_RUN: usize = 20;
 
-/// Most of a finest level that has such contrast, which is known before pixels are marked.
-const MOST_DIM_IN_FINEST: f32 = 0.4;
+/// The same by the share of a level that has such contrast, which is known before pixels are marked.
+const MOST_DIM: f32 = 0.25;
 
 /// Least step across a side, as a share of the light outside it, in clear air.
 const CLEAR_STEP: f32 = 0.1;
@@ -179,7 +178,7 @@ impl Detector {
         } else {
             Base::Full
         };
-        self.pyramid.build(image, base, 16, self.simd);
+        self.pyramid.build(image, base, Rim::Kept, 16, self.simd);
         self.noise = noise_sigma(image);
         let first = usize::from(base != Base::Full).min(self.pyramid.len() - 1);
         let last = (first + 2).min(self.pyramid.len() - 1);
@@ -208,60 +207,53 @@ impl Detector {
         self.tried.clear();
         let highest = fractions.last().copied();
         for &fraction in fractions {
-            let is_lower = self.binariser.is_busy() && Some(fraction) != highest;
+            let is_rough = self.binariser.is_busy() && !self.binariser.is_print();
+            let is_lower = is_rough && Some(fraction) != highest;
             let at = if is_lower { Where::LightChanges } else { Where::Everywhere };
-            self.search_division(image, n, (fraction, at), finest, inverted);
+            self.search_division(image, n, (fraction, at), inverted);
+            // Higher up borders are thick, and hold together by their sides.
+            let is_high = !finest && Some(fraction) == highest && !self.binariser.is_busy();
+            if is_high || self.binariser.is_print() {
+                self.search_regions(image, n, at, Touch::Sides, inverted);
+            }
         }
         if self.binariser.is_saturated() {
-            self.search_division(image, n, (FRACTION_SATURATED, Where::Saturated), finest, inverted);
+            self.search_division(image, n, (FRACTION_SATURATED, Where::Saturated), inverted);
         }
-        let most_dim = if finest && !self.binariser.is_hazy() { MOST_DIM_IN_FINEST } else { 1.0 };
+        let most_dim = match (self.binariser.is_hazy(), finest) {
+            (true, _) => 1.0,
+            (false, false) => MOST_DIM,
+            (false, true) => 0.0,
+        };
         if (f32::MIN_POSITIVE..=most_dim).contains(&self.binariser.dim_share()) {
-            self.search_division(image, n, (FRACTION_DIM, Where::AboveNoise), finest, inverted);
+            self.search_division(image, n, (FRACTION_DIM, Where::AboveNoise), inverted);
         }
     }
 
-    /// Looks for tags among the dark regions that one division into dark and light makes of a level; among their parts
-    /// too, where they are few.
+    /// Looks for tags among the dark regions that one division into dark and light makes of a level.
     fn search_division(
         &mut self,
         image: ImageView<'_>,
         n: usize,
         (fraction, at): (u16, Where),
-        finest: bool,
         inverted: bool,
     ) {
-        let level = self.pyramid.level(image, n);
-        let limits = SizeLimits { least: (self.min_px / level.scale).max(8.0), most: f32::MAX };
-        let (width, height) = (level.image.width, level.image.height);
-        let keep = |c: &Component| may_be_border(c, limits, width, height);
-        self.binariser.mark(level.image, fraction, at, &mut self.bits, self.simd);
-        let area_of_run = if finest { AREA_OF_RUN_IN_FINEST } else { AREA_OF_RUN };
-        if at == Where::AboveNoise
-            && !self.binariser.is_hazy()
-            && self.bits.runs() * area_of_run > width * height
-        {
+        let level = self.pyramid.level(image, n).image;
+        self.binariser.mark(level, fraction, at, &mut self.bits, self.simd);
+        let is_dim = at == Where::AboveNoise && !self.binariser.is_hazy();
+        if is_dim && self.bits.runs() * AREA_OF_RUN > level.width * level.height {
             return;
         }
-        self.labeller.label(&self.bits, self.simd, keep);
-        self.read_regions(image, n, limits, at, inverted);
-        if self.labeller.run_count() * area_of_run <= width * height {
-            self.labeller.part(&self.bits, self.simd, keep);
-            self.read_regions(image, n, limits, at, inverted);
-        }
+        self.search_regions(image, n, at, Touch::Corners, inverted);
     }
 
-    /// Reads the regions that were kept.
-    fn read_regions(
-        &mut self,
-        image: ImageView<'_>,
-        n: usize,
-        limits: SizeLimits,
-        at: Where,
-        inverted: bool,
-    ) {
-        let Self { pyramid, labeller, finder, refiner, found, tried, families, noise, .. } = self;
+    /// Looks for tags among the marked regions of a level.
+    fn search_regions(&mut self, image: ImageView<'_>, n: usize, at: Where, touch: Touch, inverted: bool) {
+        let Self { pyramid, bits, labeller, finder, refiner, found, tried, families, noise, .. } = self;
         let level = pyramid.level(image, n);
+        let limits = SizeLimits { least: (self.min_px / level.scale).max(8.0), most: f32::MAX };
+        let (width, height) = (level.image.width, level.image.height);
+        labeller.label(bits, touch, self.simd, |c| may_be_border(c, limits, width, height));
         let (least_gate, least_share) =
             if at == Where::AboveNoise { (LEAST_GATE, 0.0) } else { (CLEAR_GATE, CLEAR_STEP) };
         let gate = (7.0 * *noise / level.scale).clamp(least_gate, 60.0) as u8;

@@ -4,7 +4,7 @@
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
 use super::binarise::{Binariser, Bitmap, Where};
-use super::components::{Component, Labeller, Outline};
+use super::components::{Component, Labeller, Outline, Touch};
 use super::quad::bilinear;
 use super::simd::Simd;
 use windhover_base::msg::ImageView;
@@ -75,7 +75,7 @@ impl DiscFinder {
                 && w.min(h) <= sizes.1 + 2.0
                 && w.min(h) >= LEAST_AXES * 0.9 * w.max(h)
         };
-        self.labeller.label(&self.bits, self.simd, keep);
+        self.labeller.label(&self.bits, Touch::Corners, self.simd, keep);
         for (component, outline) in self.labeller.kept() {
             if let Some(rough) = ellipse_of(component, outline)
                 && let Some(blob) = refine(image, &rough)

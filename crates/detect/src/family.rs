@@ -50,8 +50,6 @@ pub(super) struct Family {
     pub family: TagFamily,
     /// Cells on a side of the border's outer square.
     pub width: usize,
-    /// How many cells wide the border is.
-    pub border: usize,
     /// Cells sampled around the border: 1, or 2 where data lie outside.
     pub pad: usize,
     /// Whether the border is light inside a dark ring.
@@ -77,7 +75,7 @@ impl Family {
         });
         let max_hamming = max_hamming.min(limit);
         let index = ChunkIndex::new(codes, cells.len(), max_hamming);
-        Self { family, width, border, pad, inverted, cells, codes, turned, index }
+        Self { family, width, pad, inverted, cells, codes, turned, index }
     }
 
     /// Cells on a side of the sampled grid.
