@@ -30,8 +30,8 @@ pub struct Detector {
     finder: QuadFinder,
     refiner: Refiner,
     found: Vec<Found>,
-    /// What did not look like a tag when it was read, in the level at hand.
-    tried: Vec<Quad>,
+    /// Levels and quadrilaterals that were read.
+    tried: Vec<(usize, Quad)>,
     detections: Vec<TagDetection>,
     negative: GrayImage,
     /// Of a frame pixel, grey levels.
@@ -65,6 +65,22 @@ struct Found {
     corners: Quad,
     refined: Refined,
 }
+
+/// How regions of a level are looked at once more, those that touch by a corner alone taken apart.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+enum Look {
+    /// Not at all.
+    Whole,
+    /// At the highest division: ground with a tag here and there.
+    Ground,
+    /// At every division: sheets of tags that touch each other's corners.
+    Print,
+    /// The same, and whole regions too, where lower divisions were left out because there is so much of it.
+    BusyPrint,
+}
+
+/// Most levels of an image that are searched.
+const MOST_SEARCHED: usize = 3;
 
 /// Where between the local minimum and maximum dark and light are divided, of 256. Low keeps a border whole
 /// where a shadow's edge crosses the tag; a second time higher up for borders that are blurred, which the
@@ -138,7 +154,7 @@ impl Detector {
 
     /// Every tag found in a part of an image, in coordinates of the whole image.
     pub fn detect_roi(&mut self, image: ImageView<'_>, roi: Roi) -> &[TagDetection] {
-        self.search_all(image.crop(roi.u, roi.v, roi.width, roi.height));
+        self.search_all(image.crop(roi.u, roi.v, roi.width, roi.height), Rim::LeftOut);
         let origin = Vector2::new(roi.u as f64, roi.v as f64);
         self.detections.iter_mut().for_each(|found| *found = found.moved(origin));
         &self.detections
@@ -146,11 +162,11 @@ impl Detector {
 
     /// Every tag found in an image, each once. Images with a side over [`LARGEST_IMAGE_PX`] are not searched.
     pub fn detect(&mut self, image: ImageView<'_>) -> &[TagDetection] {
-        self.search_all(image);
+        self.search_all(image, Rim::Kept);
         &self.detections
     }
 
-    fn search_all(&mut self, image: ImageView<'_>) {
+    fn search_all(&mut self, image: ImageView<'_>, rim: Rim) {
         self.found.clear();
         self.detections.clear();
         let sides = [image.width, image.height];
@@ -158,19 +174,19 @@ impl Detector {
             return;
         }
         if self.families.iter().any(|f| !f.inverted) {
-            self.search(image, false);
+            self.search(image, rim, false);
         }
         if self.families.iter().any(|f| f.inverted) {
             let mut negative = std::mem::take(&mut self.negative);
             negate(image, &mut negative);
-            self.search(negative.view(), true);
+            self.search(negative.view(), rim, true);
             self.negative = negative;
         }
         self.detections.extend(self.found.iter().map(detection));
     }
 
     /// Searches an image, or its negative for the families whose border is light.
-    fn search(&mut self, image: ImageView<'_>, inverted: bool) {
+    fn search(&mut self, image: ImageView<'_>, rim: Rim, inverted: bool) {
         let base = if self.min_px >= LEAST_EDGE_IN_LEVEL * 2.0 {
             Base::Half
         } else if self.min_px >= LEAST_EDGE_IN_LEVEL * 1.3 {
@@ -178,20 +194,33 @@ impl Detector {
         } else {
             Base::Full
         };
-        self.pyramid.build(image, base, Rim::Kept, 16, self.simd);
+        self.pyramid.build(image, base, rim, 16, self.simd);
         self.noise = noise_sigma(image);
         let first = usize::from(base != Base::Full).min(self.pyramid.len() - 1);
-        let last = (first + 2).min(self.pyramid.len() - 1);
-        for n in (first..=last).rev() {
-            let fractions: &[u16] = match (n == first, base) {
+        let last = (first + MOST_SEARCHED - 1).min(self.pyramid.len() - 1);
+        let fractions = |n: usize| -> &[u16] {
+            match (n == first, base) {
                 (true, Base::Half) => &FRACTIONS_ONCE,
                 (true, _) => &FRACTIONS_TWICE,
                 (false, _) => &FRACTIONS_THRICE,
-            };
-            self.search_level(image, n, fractions, n == first, inverted);
+            }
+        };
+        self.tried.clear();
+        let mut looks = [Look::Whole; MOST_SEARCHED];
+        for n in (first..=last).rev() {
+            looks[n - first] = self.search_level(image, n, fractions(n), n == first, inverted);
+        }
+        // What touches others by a corner comes last: what is found without needs no second look. While tracking a region
+        // is foretold, and has to be searched fast.
+        if rim == Rim::LeftOut {
+            return;
+        }
+        for n in (first..=last).rev() {
+            self.search_parts(image, n, fractions(n), looks[n - first], inverted);
         }
     }
 
+    /// Looks for tags in a level; how their parts are to be looked at afterwards.
     fn search_level(
         &mut self,
         image: ImageView<'_>,
@@ -199,26 +228,17 @@ impl Detector {
         fractions: &[u16],
         finest: bool,
         inverted: bool,
-    ) {
-        let level = self.pyramid.level(image, n);
-        // Noise alone spans some five sigmas in the 144 pixels of a neighbourhood.
-        let gate = (7.0 * self.noise / level.scale).clamp(LEAST_GATE, 60.0) as u8;
-        self.binariser.measure(level.image, (gate, gate.max(CLEAR_GATE as u8)), inverted, self.simd);
-        self.tried.clear();
-        let highest = fractions.last().copied();
+    ) -> Look {
+        self.measure(image, n, inverted);
+        let (is_busy, highest) = (self.binariser.is_busy(), fractions.last().copied());
         for &fraction in fractions {
-            let is_rough = self.binariser.is_busy() && !self.binariser.is_print();
-            let is_lower = is_rough && Some(fraction) != highest;
+            let is_lower = is_busy && Some(fraction) != highest;
             let at = if is_lower { Where::LightChanges } else { Where::Everywhere };
-            self.search_division(image, n, (fraction, at), inverted);
-            // Higher up borders are thick, and hold together by their sides.
-            let is_high = !finest && Some(fraction) == highest && !self.binariser.is_busy();
-            if is_high || self.binariser.is_print() {
-                self.search_regions(image, n, at, Touch::Sides, inverted);
-            }
+            self.search_division(image, n, (fraction, at, Touch::Corners), inverted);
         }
         if self.binariser.is_saturated() {
-            self.search_division(image, n, (FRACTION_SATURATED, Where::Saturated), inverted);
+            let division = (FRACTION_SATURATED, Where::Saturated, Touch::Corners);
+            self.search_division(image, n, division, inverted);
         }
         let most_dim = match (self.binariser.is_hazy(), finest) {
             (true, _) => 1.0,
@@ -226,8 +246,45 @@ impl Detector {
             (false, true) => 0.0,
         };
         if (f32::MIN_POSITIVE..=most_dim).contains(&self.binariser.dim_share()) {
-            self.search_division(image, n, (FRACTION_DIM, Where::AboveNoise), inverted);
+            self.search_division(image, n, (FRACTION_DIM, Where::AboveNoise, Touch::Corners), inverted);
         }
+        match self.binariser.is_print() {
+            true if is_busy => Look::BusyPrint,
+            true => Look::Print,
+            false if !is_busy && !finest => Look::Ground,
+            false => Look::Whole,
+        }
+    }
+
+    /// Looks for tags among what is left of regions when those that touch by a corner alone are taken apart.
+    fn search_parts(
+        &mut self,
+        image: ImageView<'_>,
+        n: usize,
+        fractions: &[u16],
+        look: Look,
+        inverted: bool,
+    ) {
+        if look == Look::Whole {
+            return;
+        }
+        self.measure(image, n, inverted);
+        // Higher up borders are thick, and hold together by their sides.
+        let from = if look == Look::Ground { fractions.len() - 1 } else { 0 };
+        for &fraction in &fractions[from..] {
+            let at = Where::Everywhere;
+            self.search_division(image, n, (fraction, at, Touch::Sides), inverted);
+            if look == Look::BusyPrint {
+                self.search_regions(image, n, at, Touch::Corners, inverted);
+            }
+        }
+    }
+
+    fn measure(&mut self, image: ImageView<'_>, n: usize, inverted: bool) {
+        let level = self.pyramid.level(image, n);
+        // Noise alone spans some five sigmas in the 144 pixels of a neighbourhood.
+        let gate = (7.0 * self.noise / level.scale).clamp(LEAST_GATE, 60.0) as u8;
+        self.binariser.measure(level.image, (gate, gate.max(CLEAR_GATE as u8)), inverted, self.simd);
     }
 
     /// Looks for tags among the dark regions that one division into dark and light makes of a level.
@@ -235,7 +292,7 @@ impl Detector {
         &mut self,
         image: ImageView<'_>,
         n: usize,
-        (fraction, at): (u16, Where),
+        (fraction, at, touch): (u16, Where, Touch),
         inverted: bool,
     ) {
         let level = self.pyramid.level(image, n).image;
@@ -244,7 +301,7 @@ impl Detector {
         if is_dim && self.bits.runs() * AREA_OF_RUN > level.width * level.height {
             return;
         }
-        self.search_regions(image, n, at, Touch::Corners, inverted);
+        self.search_regions(image, n, at, touch, inverted);
     }
 
     /// Looks for tags among the marked regions of a level.
@@ -263,12 +320,13 @@ impl Detector {
             if found.iter().any(|f| same_place(&f.corners, &in_frame)) {
                 continue;
             }
-            let is_again = |t: &Quad| (0..4).all(|i| distance(t[i], quad[i]) < SAME_QUAD);
+            let is_again =
+                |t: &(usize, Quad)| t.0 == n && (0..4).all(|i| distance(t.1[i], quad[i]) < SAME_QUAD);
             if tried.iter().any(is_again) {
                 continue;
             }
             let Some(straight) = straighten(level, &quad, gate, least_share) else { continue };
-            tried.push(quad);
+            tried.push((n, quad));
             // Of a small tag a side may be drawn to what is beside it: then as it was.
             let tag = [straight, in_frame].iter().find_map(|quad| {
                 let mut families = families.iter().filter(|f| f.inverted == inverted);
