@@ -5,7 +5,7 @@ CARGO ?= cargo
 VENV  ?= target/venv
 DEMO  ?= demo
 
-.PHONY: help setup setup-python build debug demo test test-python test-web test-real test-zenoh proofs check lint docs configs \
+.PHONY: help setup setup-python build debug demo test test-python test-web test-real test-zenoh test-clients fuzz soak proofs check lint docs configs \
         licences oldest aarch64 bench load misfit-table clean deb hil hil-long hil-short hil-tools
 
 help:
@@ -13,6 +13,9 @@ help:
 	@echo "make test     every test"
 	@echo "make test-web the station's page in headless Chromium (half a minute)"
 	@echo "make test-real DATA=FOLDER  real recordings, photographs and flights against bars (tests/real)"
+	@echo "make test-clients  gpsd, GDAL and MAVProxy against a flying payload and its station"
+	@echo "make fuzz     every parser of strangers' bytes under a fuzzer, a minute each (FUZZ_S=600: ten)"
+	@echo "make soak     an hour with hostile peers, slow readers, flapping devices, a card that comes and goes"
 	@echo "make test-zenoh the station on Zenoh, met by the Python client (builds the feature zenoh: minutes)"
 	@echo "make proofs   the long tests: hundreds of power cuts, mounts, drawn tags, flights (half an hour)"
 	@echo "make check    format, lints of all features, documentation, shipped configurations, licences and"
@@ -59,6 +62,25 @@ test-python: setup-python debug
 test-web: setup-python debug
 	@sh tests/setup/packages.sh chromium
 	$(VENV)/bin/python -m unittest discover -s tests/web -p 'test_*.py' -v
+
+# Other people's programs against a flying payload and its station.
+test-clients: setup debug
+	@sh tests/setup/packages.sh python3 python3-venv gpsd gpsd-clients gdal-bin
+	@sh tests/setup/venv.sh $(VENV)-clients tests/clients/requirements.txt
+	$(VENV)-clients/bin/python -m unittest discover -s tests/clients -p 'test_*.py' -v
+
+# An hour of everything that goes wrong at once; SOAK_S=120 for two minutes.
+SOAK_S ?= 3600
+soak: setup-python debug
+	$(VENV)/bin/python tests/soak/soak.py --seconds $(SOAK_S)
+
+# Every parser of strangers' bytes under a fuzzer, a minute each; FUZZ_S=600 for ten.
+FUZZ_S ?= 60
+fuzz: setup
+	test -x target/tools/bin/cargo-fuzz || $(CARGO) install cargo-fuzz --locked --root target/tools
+	for target in $$(sed -n 's/^name = "\(.*\)"/\1/p' fuzz/Cargo.toml | tail -n +2); do \
+	    PATH="$$PWD/target/tools/bin:$$PATH" RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run -s none $$target -- \
+	        -max_total_time=$(FUZZ_S) -rss_limit_mb=3000 || exit 1; done
 
 # Real recordings and frames, and what the program must make of them: make test-real DATA=FOLDER.
 test-real: debug

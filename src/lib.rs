@@ -9,9 +9,16 @@
 //! values: it never reads a clock, logs, waits or touches a device. `io` moves events and records;
 //! `app` wires; `cli` talks to people. `tests/architecture.rs` holds this.
 
-#![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
+#![warn(
+    missing_docs,
+    clippy::unwrap_used,
+    clippy::disallowed_methods,
+    clippy::print_stdout,
+    clippy::print_stderr
+)]
 
 // -- core: values in, values out
+pub mod text;
 pub mod config;
 pub mod jpeg;
 pub mod pixels;

@@ -8,7 +8,7 @@ use crate::config::{Config, Part};
 use crate::io::clock::HostClock;
 use crate::io::device::blocking;
 use crate::io::store::{Recording, Store, StoreNotice, StoreStatus};
-use windhover_base::time::Span;
+use windhover_base::time::{MonoTime, Span};
 
 use super::context::TaskContext;
 use super::events::{self, OperatorEvent};
@@ -37,6 +37,36 @@ pub fn open(config: &Config, clock: HostClock, flight_store: &FlightStore) -> Op
     let (store, notices) = config.store.enabled.then(|| Store::start(&config.store, text, clock))?;
     flight_store.set(Some(store.handle()));
     Some(OpenStore { store, notices })
+}
+
+/// Recorded for less than this, a flight's pace is not known.
+const SETTLED: Span = Span::from_ns(10_000_000_000);
+
+/// How long a flight is recorded, and how long the card lasts at its pace.
+#[derive(Default)]
+struct CardPace {
+    /// When recording began, and bytes of the flight then and at last.
+    begun: Option<(MonoTime, u64, u64)>,
+}
+
+impl CardPace {
+    /// Takes the store's state of now; gives how long it records and what is left.
+    fn take(&mut self, store: &StoreStatus, now: MonoTime) -> (Option<Span>, Option<Span>) {
+        if store.recording != Recording::On {
+            self.begun = None;
+            return (None, None);
+        }
+        let written = store.bytes_written;
+        // Less than before is another flight.
+        let (began, first, _) =
+            self.begun.filter(|(_, _, last)| *last <= written).unwrap_or((now, written, written));
+        self.begun = Some((began, first, written));
+        let recording = now - began;
+        let pace = (written - first) as f64 / recording.s();
+        let left = store.free_mb.map(|mb| mb as f64 * 1e6 / pace);
+        let known = recording >= SETTLED && pace > 0.0;
+        (Some(recording), left.filter(|_| known).map(Span::from_s))
+    }
 }
 
 /// Why a store is closed.
@@ -104,6 +134,7 @@ impl StoreTask {
         let mut power = self.orders.power_going.subscribe();
         let mut round = tokio::time::interval(ROUND);
         round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
+        let mut pace = CardPace::default();
         let mut end = std::pin::pin!(self.end());
         loop {
             tokio::select! {
@@ -114,7 +145,7 @@ impl StoreTask {
                 _ = round.tick() => {
                     self.heart.beat();
                     self.report(notices);
-                    self.show(&handle.status());
+                    self.show(&handle.status(), &mut pace);
                 }
             }
         }
@@ -155,7 +186,7 @@ impl StoreTask {
         self.status.with(|status| status.figures.card.state = state.into());
     }
 
-    fn show(&self, store: &StoreStatus) {
+    fn show(&self, store: &StoreStatus, pace: &mut CardPace) {
         let (state, part) = match &store.recording {
             Recording::Starting => ("starting", PartState::Open),
             Recording::On => ("ok", PartState::Delivers),
@@ -165,13 +196,44 @@ impl StoreTask {
         if self.context.presence.get(Part::Store) != part {
             self.context.presence.set(Part::Store, part);
         }
+        let (recording, left) = pace.take(store, self.context.clock.now());
         let figures = CardFigures {
             state: state.into(),
             flight: store.flight.clone(),
             free_mb: store.free_mb.map(|mb| mb as f64),
             sync_p99: (store.fsync_p99_ms > 0.0).then(|| Span::from_ms(store.fsync_p99_ms)),
             dropped: store.dropped_messages,
+            recording,
+            left,
         };
         self.status.with(|status| status.figures.card = figures);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_left_follows_from_the_flights_own_pace() {
+        let mut pace = CardPace::default();
+        let at = |s: f64| MonoTime::default() + Span::from_s(s);
+        let store = |bytes_written| StoreStatus {
+            recording: Recording::On,
+            free_mb: Some(1_000),
+            bytes_written,
+            ..StoreStatus::default()
+        };
+        assert_eq!(pace.take(&StoreStatus::default(), at(0.0)), (None, None), "nothing is recorded yet");
+        assert_eq!(pace.take(&store(0), at(1.0)), (Some(Span::ZERO), None));
+        assert_eq!(
+            pace.take(&store(5_000_000), at(6.0)),
+            (Some(Span::from_s(5.0)), None),
+            "too short to tell"
+        );
+        let told = pace.take(&store(20_000_000), at(21.0));
+        assert_eq!(told, (Some(Span::from_s(20.0)), Some(Span::from_s(1_000.0))));
+        // Another flight begins anew.
+        assert_eq!(pace.take(&store(10), at(22.0)), (Some(Span::ZERO), None));
     }
 }

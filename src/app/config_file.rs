@@ -79,12 +79,14 @@ fn read_text(path: &Path) -> std::io::Result<String> {
     Ok(text)
 }
 
-/// The terrain tile of a configuration. `None` where it names none, or where it cannot be read:
-/// [`load`] has refused that already, and a recording's own configuration may name a tile of another
-/// machine, of which the pipeline then tells.
-pub fn terrain_of(config: &Config) -> Option<Arc<Tile>> {
-    let path = config.ground.terrain.as_ref()?;
-    io::terrain::load(Path::new(path)).ok().map(Arc::new)
+/// The terrain tile of a recording's configuration: the file of that name beside the recording, else the one that the
+/// configuration names. `None` where it names none or it cannot be read: a recording may name a tile of another machine,
+/// of which the pipeline then tells.
+pub fn terrain_of(config: &Config, recording: &Path) -> Option<Arc<Tile>> {
+    let named = Path::new(config.ground.terrain.as_ref()?);
+    let beside = named.file_name().map(|name| recording.with_file_name(name));
+    let files = beside.into_iter().chain([named.to_owned()]);
+    files.filter_map(|file| io::terrain::load(&file).ok()).map(Arc::new).next()
 }
 
 #[cfg(test)]

@@ -3,8 +3,10 @@
 use std::sync::Arc;
 
 use crate::config::{Config, Part};
+use crate::io::autopilot::{self, AutopilotSettings, Reached, ToAutopilot};
 use crate::io::camera::{self, CameraSettings};
-use crate::io::device::{Fault, NoteKind, Report};
+use crate::io::device::{Fault, NoteKind, Report, blocking};
+use crate::io::mavlink::signing_key;
 use crate::io::pps;
 use crate::io::serial::{self, SerialSettings};
 use windhover_base::msg::{EventBody, Source};
@@ -42,6 +44,27 @@ async fn line(part: Part, source: Source, settings: &SerialSettings, context: Ta
     let device = DeviceReports { part, source, context, heart };
     let reports = |report| device.take(report);
     stop.run_until_cancelled(serial::run(settings, clock, &reports)).await;
+}
+
+/// Hears the autopilot, and sends it what is to be sent, until the end is asked for.
+pub async fn autopilot(config: Arc<Config>, outgoing: ToAutopilot, context: TaskContext, heart: Heart) {
+    let Some(autopilot) = &config.autopilot else { return };
+    let key = config.mavlink.signing_key.clone();
+    let key = match blocking(move || signing_key(key.as_deref())).await {
+        Ok(key) => key,
+        Err(error) => return OperatorEvent::AutopilotNote.emit("autopilot", error),
+    };
+    let reached = match (&autopilot.device, autopilot.listen_at()) {
+        (Some(device), _) => Reached::Serial { device: device.clone(), baud: autopilot.baud },
+        (None, Some(address)) => Reached::Udp(address.to_owned()),
+        (None, None) => return,
+    };
+    let (system_id, configure) = (autopilot.system_id, autopilot.configure);
+    let settings = AutopilotSettings { reached, system_id, configure, key };
+    let (clock, stop) = (context.clock, context.stop.clone());
+    let device = DeviceReports { part: Part::Autopilot, source: Source::Autopilot, context, heart };
+    let reports = |report| device.take(report);
+    stop.run_until_cancelled(autopilot::run(&settings, &outgoing, clock, &reports)).await;
 }
 
 /// Takes frames until the end is asked for.

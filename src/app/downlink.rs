@@ -11,6 +11,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 
 use crate::config::Config;
+use crate::io::autopilot::ToAutopilot;
 use crate::io::clock::HostClock;
 use crate::io::device::blocking;
 use crate::io::link::{
@@ -51,15 +52,17 @@ pub struct Downlink {
     lines: Arc<Mutex<Lines>>,
     /// Whether the link numbers records in the run the store is in.
     one_run: Arc<AtomicBool>,
+    to_autopilot: ToAutopilot,
 }
 
 impl Downlink {
     /// Before anything is open; with a link configured, records are numbered from the first on.
-    pub fn new(config: &Config) -> Self {
+    pub fn new(config: &Config, to_autopilot: &ToAutopilot) -> Self {
         let early =
             config.link.enabled.then(|| EarlyRecords::new(&PayloadSettings::from_config(&config.link)));
         let lines = Lines { link: None, early, mavlink: None, frame: None };
-        Self { lines: Arc::new(Mutex::new(lines)), one_run: Arc::new(AtomicBool::new(true)) }
+        let one_run = Arc::new(AtomicBool::new(true));
+        Self { lines: Arc::new(Mutex::new(lines)), one_run, to_autopilot: to_autopilot.clone() }
     }
 
     fn lines(&self) -> MutexGuard<'_, Lines> {
@@ -205,7 +208,8 @@ impl LinkTask {
 
     async fn open_mavlink(&self) -> Option<MavlinkSender> {
         let config = Arc::clone(&self.config);
-        let open = move || MavlinkSender::open(&config.mavlink, &config.target, &config.ground);
+        let to_autopilot = self.downlink.to_autopilot.clone();
+        let open = move || MavlinkSender::open(&config, to_autopilot);
         blocking(open).await.inspect_err(|error| self.fault(error)).ok()
     }
 

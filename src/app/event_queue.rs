@@ -17,6 +17,9 @@ const READS: usize = 8192;
 const BURST: usize = 16;
 const CATCH_UP: Span = Span::from_ns(500_000_000);
 
+/// Bytes of the frames that wait, however few they are: twenty of 4K in colour.
+const FRAME_BYTES: usize = 512 << 20;
+
 /// A frame whose turn comes later than this after it was heard is dropped: estimates are of now.
 const FRESH: Span = Span::from_ns(500_000_000);
 
@@ -97,12 +100,11 @@ impl EventQueue {
         if lanes.frames.len() > self.frames {
             let since = *lanes.crowded.get_or_insert(t_recv);
             let most = if t_recv - since < CATCH_UP { self.frames.max(BURST) } else { self.frames };
-            while lanes.frames.len() > most {
-                let goes = usize::from(lanes.pinned);
-                lanes.frames.remove(goes);
-                lanes.dropped[Source::Camera] += 1;
-            }
+            lanes.thin(|lanes| lanes.frames.len() > most);
         }
+        lanes.thin(|lanes| {
+            lanes.frames.iter().map(|(_, frame)| frame.data.len()).sum::<usize>() > FRAME_BYTES
+        });
         drop(lanes);
         self.filled.notify_one();
     }
@@ -136,6 +138,15 @@ impl EventQueue {
 }
 
 impl Lanes {
+    /// Drops the oldest frame that is not the next one while there are too many, down to the newest.
+    fn thin(&mut self, too_many: impl Fn(&Self) -> bool) {
+        let goes = usize::from(self.pinned);
+        while self.frames.len() > goes + 1 && too_many(self) {
+            self.frames.remove(goes);
+            self.dropped[Source::Camera] += 1;
+        }
+    }
+
     fn is_empty(&self) -> bool {
         self.reads.is_empty() && self.frames.is_empty()
     }
@@ -239,6 +250,19 @@ mod tests {
         assert_eq!(times, [10, 20, 30, 30]);
         let numbers: Vec<u64> = first.iter().chain(&late).map(|e| e.seq).collect();
         assert_eq!(numbers, [0, 1, 2, 3]);
+    }
+
+    #[test]
+    fn frames_are_held_by_their_bytes() {
+        let queue = EventQueue::new(3);
+        let large: Arc<[u8]> = Arc::from(vec![0; FRAME_BYTES / 4]);
+        for n in 0..10 {
+            queue.put_frame(at(n), FramePayload { data: Arc::clone(&large), ..frame(n) });
+        }
+        let frames = |e: &Event| matches!(&e.body, EventBody::Frame(frame) if frame.t_exposure >= at(6));
+        let events = drain(&queue);
+        assert_eq!(events.iter().filter(|e| frames(e)).count(), 4, "{}", events.len());
+        assert!(matches!(events[0].body, EventBody::Dropped { source: Source::Camera, count: 6 }));
     }
 
     #[test]

@@ -163,6 +163,8 @@ table! {
     MavlinkFault: "mavlink_fault", WARN, every 30 s;
     /// MAVLink goes to that station again.
     MavlinkUp: "mavlink_up", INFO, every 0 s;
+    /// The autopilot is followed, was started anew, or is not the only one.
+    AutopilotNote: "autopilot_note", WARN, every 5 s;
     /// The supply voltage is going.
     PowerGoing: "power_going", ERROR, every 0 s;
     /// The supply voltage is back.
@@ -257,6 +259,7 @@ impl From<NoteKind> for OperatorEvent {
             NoteKind::FramesMissed => Self::CameraFramesMissed,
             NoteKind::Configured => Self::ReceiverConfigured,
             NoteKind::NotConfigured => Self::ReceiverNotConfigured,
+            NoteKind::Autopilot => Self::AutopilotNote,
             NoteKind::PlayedOut => Self::RecordingPlayedOut,
         }
     }
@@ -362,7 +365,7 @@ pub fn flight(name: &str) {
 /// Decimals with which a field's figure is shown; those of a sigma are its figure's.
 pub fn decimals(field: &str) -> Option<usize> {
     Some(match field.strip_suffix("_sigma").unwrap_or(field) {
-        "card_free_mb" | "cpu_pct" | "mem_mb" => 0,
+        "card_free_mb" | "cpu_pct" | "mem_mb" | "recording_s" | "card_left_s" => 0,
         "latency_p50_ms" | "latency_p99_ms" | "card_sync_p99_ms" | "temp_c" => 1,
         "heading_deg" | "yaw_rate_dps" => 1,
         "supply_v" | "north_m" | "east_m" | "speed_mps" | "p50_ms" | "p99_ms" | "max_ms" => 2,

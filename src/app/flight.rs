@@ -112,7 +112,10 @@ impl Flight {
 
     fn take(&mut self, raw: &RawMessage) {
         match raw.channel.topic.as_str() {
-            topic::OWNSHIP => keep(&mut self.ownship, raw),
+            topic::OWNSHIP => {
+                keep(&mut self.ownship, raw);
+                self.ownship.pop_if(|own| !own.is_sound());
+            }
             topic::GPS_EPOCH => keep(&mut self.epochs, raw),
             topic::COMPASS_ATTITUDE => keep(&mut self.attitudes, raw),
             topic::CAMERA_DETECTIONS => keep(&mut self.detections, raw),
@@ -121,7 +124,7 @@ impl Flight {
             topic::LOG => keep(&mut self.notices, raw),
             topic::SOURCE_EVENT => keep(&mut self.source_events, raw),
             topic::DATUM => {
-                if let Ok(d) = wh::Datum::decode(&raw.data[..]) {
+                if let Some(d) = wh::Datum::decode(&raw.data[..]).ok().filter(wh::Datum::is_sound) {
                     self.datum =
                         Some(Geodetic { lat_deg: d.lat_deg, lon_deg: d.lon_deg, height_m: d.height_m });
                 }
@@ -139,11 +142,13 @@ impl Flight {
             return;
         }
         let track = self.targets.entry(name.to_owned()).or_default();
-        match what {
-            "state" => keep(&mut track.filtered, raw),
-            "smoothed" => keep(&mut track.smoothed, raw),
-            _ => keep(&mut track.paper, raw),
-        }
+        let states = match what {
+            "state" => &mut track.filtered,
+            "smoothed" => &mut track.smoothed,
+            _ => &mut track.paper,
+        };
+        keep(states, raw);
+        states.pop_if(|state| !state.is_sound());
     }
 
     /// Whether a frame came, be it kept or not.

@@ -44,6 +44,10 @@ pub struct CardFigures {
     pub flight: String,
     /// Free space, megabytes.
     pub free_mb: Option<f64>,
+    /// How long this flight is recorded already.
+    pub recording: Option<Span>,
+    /// How long the free space lasts at the flight's pace.
+    pub left: Option<Span>,
     /// Time to make a second's data safe, 99 of 100.
     pub sync_p99: Option<Span>,
     /// Messages that could not be kept since the start.
@@ -52,7 +56,7 @@ pub struct CardFigures {
 
 impl Figures {
     /// Latency, card, computer, in this order; nothing where it is not known.
-    fn numbers(&self) -> [(&'static str, Option<f64>); 9] {
+    fn numbers(&self) -> [(&'static str, Option<f64>); 11] {
         let ms = |span: Option<Span>| span.map(|span| span.ms());
         let dropped = (self.card.dropped > 0).then_some(self.card.dropped as f64);
         [
@@ -61,6 +65,8 @@ impl Figures {
             ("card_free_mb", self.card.free_mb),
             ("card_sync_p99_ms", ms(self.card.sync_p99)),
             ("card_dropped", dropped),
+            ("recording_s", self.card.recording.map(|span| span.s())),
+            ("card_left_s", self.card.left.map(|span| span.s())),
             ("temp_c", self.temperature_c),
             ("supply_v", self.voltage_v),
             ("cpu_pct", self.cpu_percent),
@@ -159,10 +165,10 @@ impl Fields {
         let mavlink = word("mavlink", &figures.mavlink);
         self.numbers(&numbers[..2]);
         self.text(card.0, card.1.map(String::as_str));
-        self.numbers(&numbers[2..5]);
+        self.numbers(&numbers[2..7]);
         self.text(link.0, link.1.map(String::as_str));
         self.text(mavlink.0, mavlink.1.map(String::as_str));
-        self.numbers(&numbers[5..]);
+        self.numbers(&numbers[7..]);
     }
 
     fn numbers(&mut self, numbers: &[(&str, Option<f64>)]) {

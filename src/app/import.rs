@@ -8,6 +8,7 @@ use crate::io::import::{
     Frames, ImportError, Samples, VideoSource, open_video, read_attitude, read_inertial, read_serial_log,
 };
 use crate::io::mcap_write::WriteError;
+use crate::text::counted;
 use windhover_base::msg::{Event, EventBody, FramePayload, Source};
 use windhover_base::time::{MonoTime, Span};
 
@@ -114,8 +115,11 @@ fn serial_lines(path: &Path, warnings: &mut Vec<String>) -> Result<Vec<(MonoTime
     let log = read_serial_log(path)?;
     if let Some(first) = log.untimed.first() {
         let count = log.untimed.len();
-        warnings
-            .push(format!("{}: {count} lines without a time left out, line {first} first", path.display()));
+        warnings.push(format!(
+            "{}: {} without a time left out, line {first} first",
+            path.display(),
+            counted(count, "line")
+        ));
     }
     Ok(log.lines)
 }
@@ -125,8 +129,9 @@ fn rows<T>(path: &Path, table: Samples<T>, warnings: &mut Vec<String>) -> Vec<(M
     if let Some(first) = table.unread.first() {
         let count = table.unread.len();
         warnings.push(format!(
-            "{}: {count} rows that cannot be read left out, line {first} first",
-            path.display()
+            "{}: {} that cannot be read left out, line {first} first",
+            path.display(),
+            counted(count, "row")
         ));
     }
     table.samples

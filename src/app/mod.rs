@@ -17,6 +17,7 @@ pub mod ground;
 pub mod health;
 pub mod import;
 pub mod latencies;
+pub mod live;
 pub mod log;
 pub mod outlets;
 pub mod pipeline_task;

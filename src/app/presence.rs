@@ -68,8 +68,8 @@ mod tests {
     #[test]
     fn ready_when_all_that_is_wanted_delivers() {
         let board = Presence::default();
-        assert_eq!(board.missing(&[]).len(), 4);
-        for part in [Part::Gps, Part::Camera, Part::Store] {
+        assert_eq!(board.missing(&[]).len(), 5);
+        for part in [Part::Gps, Part::Camera, Part::Autopilot, Part::Store] {
             board.set(part, PartState::Delivers);
         }
         board.set(Part::Compass, PartState::Down("unplugged".into()));

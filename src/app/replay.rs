@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
 
@@ -21,6 +22,8 @@ use windhover_base::time::{MonoTime, Span};
 
 /// Events read and frames decoded ahead of the pipeline.
 const AHEAD: usize = 16;
+/// Bytes of their pixels: sixteen frames of 4K, or one of any size.
+const AHEAD_BYTES: usize = 256 << 20;
 
 /// Why a recording could not be replayed.
 #[derive(Debug, thiserror::Error)]
@@ -93,19 +96,71 @@ pub fn replay(
     watch: &mut dyn FnMut(ReplayStep<'_>),
 ) -> Result<ReplaySummary, ReplayError> {
     let reader = CaptureReader::open(recording)?;
-    let mut run = ReplayRun::new(config, out, realtime);
+    let mut run = ReplayRun::new(recording, config, out, realtime);
     let want_rgb = run.pipeline.wants_rgb();
     let (sender, receiver) = sync_channel(AHEAD);
+    let room = Room::new();
     thread::scope(|scope| {
-        scope.spawn(move || read_ahead(reader, want_rgb, &sender));
+        let taker = LastTaker(&room);
+        scope.spawn(|| read_ahead(reader, want_rgb, sender, &room));
         // By value: a flight that cannot be written ends the reader too, which waits for room.
-        run.all(receiver, watch)
+        run.all(receiver, taker, watch)
     })?;
     if run.summary.events == 0 {
         return Err(ReplayError::Nothing { path: recording.to_owned() });
     }
     run.summary.took = run.clock.now() - run.started;
     Ok(run.summary)
+}
+
+/// Bytes of decoded frames that wait for the pipeline: what is read ahead is bounded by bytes as well as by number.
+struct Room {
+    /// Bytes that wait; `None` when nobody takes any more.
+    taken: Mutex<Option<usize>>,
+    freed: Condvar,
+}
+
+impl Room {
+    fn new() -> Self {
+        Self { taken: Mutex::new(Some(0)), freed: Condvar::new() }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Option<usize>> {
+        self.taken.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Waits until there is room for so many bytes; one frame has room alone, whatever its size.
+    fn take(&self, bytes: usize) {
+        let full = |taken: &mut Option<usize>| {
+            taken.is_some_and(|taken| taken > 0 && taken.saturating_add(bytes) > AHEAD_BYTES)
+        };
+        let mut taken = self.freed.wait_while(self.lock(), full).unwrap_or_else(PoisonError::into_inner);
+        *taken = taken.map(|taken| taken.saturating_add(bytes));
+    }
+
+    fn give(&self, bytes: usize) {
+        let mut taken = self.lock();
+        *taken = taken.map(|taken| taken.saturating_sub(bytes));
+        drop(taken);
+        self.freed.notify_one();
+    }
+}
+
+/// Lets the reader go, which may wait for room that nobody gives any more.
+struct LastTaker<'a>(&'a Room);
+
+impl Drop for LastTaker<'_> {
+    fn drop(&mut self) {
+        *self.0.lock() = None;
+        self.0.freed.notify_all();
+    }
+}
+
+/// Bytes of a frame's pixels.
+fn bytes_of(prepared: Option<&Result<DecodedFrame, FrameFault>>) -> usize {
+    let Some(Ok(frame)) = prepared else { return 0 };
+    let (width, height) = (frame.gray.width, frame.gray.height);
+    width * height * if frame.rgb.is_some() { 4 } else { 1 }
 }
 
 /// What the reading thread hands over.
@@ -115,12 +170,13 @@ enum Ahead {
 }
 
 /// Reads and decodes ahead; the pipeline's thread sees items in order whatever this one's pace.
-fn read_ahead(mut reader: CaptureReader, want_rgb: bool, sender: &SyncSender<Ahead>) {
+fn read_ahead(mut reader: CaptureReader, want_rgb: bool, sender: SyncSender<Ahead>, room: &Room) {
     while let Some(item) = reader.next() {
         let prepared = match item.event.as_ref().map(|e| &e.body) {
             Some(EventBody::Frame(frame)) => Some(pixels::decode(frame, want_rgb)),
             _ => None,
         };
+        room.take(bytes_of(prepared.as_ref()));
         let warnings = reader.take_warnings().into_iter().map(Ahead::Warning);
         let progress = reader.progress();
         let item = std::iter::once(Ahead::Item(Box::new(item), prepared, progress));
@@ -149,13 +205,13 @@ struct ReplayRun {
 }
 
 impl ReplayRun {
-    fn new(config: &Config, out: Option<&Path>, realtime: bool) -> Self {
+    fn new(recording: &Path, config: &Config, out: Option<&Path>, realtime: bool) -> Self {
         let clock = HostClock::start();
         // A configuration that was checked can be written.
         let text = config.to_toml().unwrap_or_default();
         let file = out.map(|path| FlightFile::new(path.to_owned(), text, config.camera.clone()));
         Self {
-            pipeline: Pipeline::with_terrain(config.into(), config_file::terrain_of(config)),
+            pipeline: Pipeline::with_terrain(config.into(), config_file::terrain_of(config, recording)),
             outlets: Outlets::new(OutputEncoder::new(&config.target), file.into_iter().collect()),
             outputs: Vec::new(),
             summary: ReplaySummary::default(),
@@ -169,6 +225,7 @@ impl ReplayRun {
     fn all(
         &mut self,
         receiver: Receiver<Ahead>,
+        taker: LastTaker<'_>,
         watch: &mut dyn FnMut(ReplayStep<'_>),
     ) -> Result<(), ReplayError> {
         for ahead in receiver {
@@ -179,6 +236,7 @@ impl ReplayRun {
                 }
                 Ahead::Item(item, prepared, progress) => (item, prepared, progress),
             };
+            taker.0.give(bytes_of(prepared.as_ref()));
             let t = item.raw.log_time;
             watch(ReplayStep::Progress(done, total));
             self.outlets.sinks.iter_mut().try_for_each(|file| file.copy(&item.raw))?;

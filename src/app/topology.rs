@@ -3,7 +3,8 @@
 //! ```text
 //!   gps, pps ─┐                                  ┌─► store   (card: flights, index)
 //!   compass ──┼─► event queue ─► pipeline ───────┼─► link    (ground stations, MAVLink)
-//!   camera ───┘                                  └─► status ◄── health (health line, watchdog, signals)
+//!   camera ───┤                                  │   autopilot (frames for it)
+//! autopilot ──┘                                  └─► status ◄── health (health line, watchdog, signals)
 //!   power ─────────────────────────────────────────────────────► health
 //!                         every task ─────► log     (journal, file)
 //! ```
@@ -13,6 +14,7 @@
 //! | task | waits for | restart rule |
 //! |---|---|---|
 //! | gps, compass | their line's descriptor | open the device again, waiting ¼ s to 5 s |
+//! | autopilot | its line or socket, frames for it, a second's timer | the same |
 //! | pps | the pulse device's descriptor | the same |
 //! | camera | the V4L2 queue's descriptor, or the thread that plays a recording | the same |
 //! | power | the GPIO line's descriptor, a second's timer | the same |
@@ -41,6 +43,7 @@
 //! | recording to camera | 12 frames, as a driver's buffers | the recording waits |
 //! | store | see `io::store` | what does not fit is dropped and counted; the pipeline never waits |
 //! | link | see `io::link` | the oldest estimate goes first; what was missed is sent later |
+//! | MAVLink to autopilot | 64 frames | the oldest is dropped |
 //! | power to health, power to store, store to link | the newest value | a newer value replaces it |
 //! | log, each sink | 512 lines | the line is dropped and counted |
 //!
@@ -53,6 +56,7 @@ use std::sync::Arc;
 
 use tokio_util::sync::CancellationToken;
 
+use crate::io::autopilot::ToAutopilot;
 use crate::io::clock::HostClock;
 
 use super::card::{self, StoreTask};
@@ -83,6 +87,8 @@ pub const STORE: TaskRule = TaskRule { name: "store", restart: Restart::Retries 
 pub const PPS: TaskRule = TaskRule { name: "pps", restart: Restart::Retries };
 /// Supply, temperature, and the line that tells of power going.
 pub const POWER: TaskRule = TaskRule { name: "power", restart: Restart::Retries };
+/// The link to the autopilot, where it is heard.
+pub const AUTOPILOT: TaskRule = TaskRule { name: "autopilot", restart: Restart::Retries };
 /// The wireless link.
 pub const LINK: TaskRule = TaskRule { name: "link", restart: Restart::Retries };
 
@@ -113,7 +119,8 @@ pub fn start(loaded: Loaded, clock: HostClock) -> std::io::Result<Graph> {
     let status = SharedStatus::default();
     status.with(|status| status.figures.link = "off".into());
     let (flight_store, orders) = (FlightStore::default(), StoreOrders::default());
-    let downlink = Downlink::new(&config);
+    let to_autopilot = ToAutopilot::default();
+    let downlink = Downlink::new(&config, &to_autopilot);
     let mut tasks = Supervisor::new(clock);
 
     tasks.spawn(LINK, |heart| {
@@ -141,8 +148,16 @@ pub fn start(loaded: Loaded, clock: HostClock) -> std::io::Result<Graph> {
     if let Some(device) = config.gps.pps_device.clone() {
         tasks.spawn(PPS, |heart| devices::pulses(device, context.clone(), heart));
     }
-    tasks.spawn(GPS, |heart| devices::gps(Arc::clone(&config), context.clone(), heart));
-    tasks.spawn(COMPASS, |heart| devices::compass(Arc::clone(&config), context.clone(), heart));
+    if config.gps.is_there() {
+        tasks.spawn(GPS, |heart| devices::gps(Arc::clone(&config), context.clone(), heart));
+    }
+    if config.compass.is_there() {
+        tasks.spawn(COMPASS, |heart| devices::compass(Arc::clone(&config), context.clone(), heart));
+    }
+    if config.autopilot.is_some() {
+        let (config, context, to_autopilot) = (Arc::clone(&config), context.clone(), to_autopilot.clone());
+        tasks.spawn(AUTOPILOT, |heart| devices::autopilot(config, to_autopilot, context, heart));
+    }
     tasks.spawn(CAMERA, |heart| devices::camera(Arc::clone(&config), context.clone(), heart));
     Ok(Graph { context, status, orders, power, tasks })
 }

@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use crate::text;
+
 /// Why a truth file gave no truth.
 #[derive(Debug, thiserror::Error)]
 pub enum TruthError {
@@ -55,9 +57,9 @@ impl Truth {
     /// and `yaw_rate_radps` are compared where present. With a column `frame` each row belongs to
     /// that frame; without, the file has one row: a surveyed point at rest.
     pub fn read(path: &Path) -> Result<Self, TruthError> {
-        let text = std::fs::read_to_string(path)
+        let content = std::fs::read_to_string(path)
             .map_err(|source| TruthError::Unreadable { path: path.to_owned(), source })?;
-        Self::parse(&text).map_err(|(line, reason)| TruthError::Malformed {
+        Self::parse(&content).map_err(|(line, reason)| TruthError::Malformed {
             path: path.to_owned(),
             line,
             reason,
@@ -65,8 +67,8 @@ impl Truth {
     }
 
     /// As [`Self::read`], of the file's text; the error is line and reason.
-    pub fn parse(text: &str) -> Result<Self, (usize, String)> {
-        let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty());
+    pub fn parse(content: &str) -> Result<Self, (usize, String)> {
+        let mut lines = content.lines().enumerate().filter(|(_, l)| !l.trim().is_empty());
         let (_, header) = lines.next().ok_or((1, "it is empty".to_owned()))?;
         let names: Vec<&str> = header.split(',').map(str::trim).collect();
         let column = |name: &str| names.iter().position(|n| *n == name);
@@ -79,8 +81,7 @@ impl Truth {
         for (k, line) in lines {
             let fields: Vec<&str> = line.split(',').map(str::trim).collect();
             let number = |c: usize| {
-                let text = fields.get(c).copied().unwrap_or("");
-                text.parse::<f64>().map_err(|_| (k + 1, format!("{text:?} is not a number")))
+                text::number(fields.get(c).copied().unwrap_or("")).map_err(|reason| (k + 1, reason))
             };
             let maybe = |c: Option<usize>| {
                 c.filter(|c| fields.get(*c).is_some_and(|f| !f.is_empty())).map(number).transpose()
@@ -94,7 +95,11 @@ impl Truth {
             };
             match frame {
                 Some(c) => {
-                    rows.insert(number(c)? as u32, row);
+                    let frame = number(c)?;
+                    if !(0.0..=f64::from(u32::MAX)).contains(&frame) || frame.fract() != 0.0 {
+                        return Err((k + 1, format!("{frame} is no frame: they count from 0")));
+                    }
+                    rows.insert(frame as u32, row);
                 }
                 None => alone.push(row),
             }
@@ -145,5 +150,9 @@ mod tests {
         let error = Truth::parse("frame,lat_deg,lon_deg\n1,2,3\n2,x,3\n").expect_err("a word");
         assert_eq!(error, (3, "\"x\" is not a number".to_owned()));
         assert!(Truth::parse("").is_err());
+        for row in ["nan,1,2", "1,nan,2", "1,2,inf", "-1,1,2", "1.5,1,2", "1e99,1,2"] {
+            let error = Truth::parse(&format!("frame,lat_deg,lon_deg\n{row}\n")).expect_err(row);
+            assert_eq!(error.0, 2, "{error:?}");
+        }
     }
 }

@@ -100,7 +100,7 @@ impl Watch {
 
     fn look_for_readiness(&mut self) {
         let context = &self.context;
-        let missing = Presence::words(&context.presence.missing(&self.config.daemon.optional));
+        let missing = Presence::words(&context.presence.missing(&self.config.optional_parts()));
         let estimating = self.status.with(|shown| shown.health.is_some());
         if missing.is_empty() && estimating {
             if !std::mem::replace(&mut self.ready, true) {
@@ -196,7 +196,7 @@ impl Watch {
             format!("{}; {}", rates.join(", "), targets.join(", "))
         } else {
             let context = &self.context;
-            format!("waiting: {}", Presence::words(&context.presence.missing(&self.config.daemon.optional)))
+            format!("waiting: {}", Presence::words(&context.presence.missing(&self.config.optional_parts())))
         };
         ServiceManager.status(&text);
     }

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use super::{CliError, CliResult};
 use crate::app::config_file;
+use crate::cli::out::out;
 
 /// Say what is wrong with a configuration, or print the effective one with every default filled in.
 #[derive(clap::Args, Debug)]
@@ -18,6 +19,6 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args) -> CliResult {
     let config = config_file::load(&args.file).map_err(CliError::config)?;
-    print!("{}", config.to_toml().map_err(CliError::config)?);
+    out!("{}", config.to_toml().map_err(CliError::config)?)?;
     Ok(())
 }

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::{CliError, CliResult};
+use crate::cli::out::{note, written};
 use windhover_base::msg::GnssEpoch;
 use windhover_base::settings::{CompassFormat, GpsFormat};
 use windhover_base::time::{MonoTime, NS_PER_S, UtcTime};
@@ -99,21 +100,13 @@ pub(super) fn run(args: &Args) -> CliResult {
         }
     };
     let counts = counts.and_then(|counts| out.flush().map(|()| counts));
-    match counts {
-        Ok(counts) => {
-            eprintln!("{counts}");
-            if counts.understood_nothing() {
-                let file = file.display();
-                return Err(CliError::failed(format!(
-                    "{file}: nothing in it is understood: is it {likely}?"
-                )));
-            }
-            Ok(())
-        }
-        // Whoever read the output has seen enough.
-        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
-        Err(error) => Err(CliError::failed(format!("standard output: {error}"))),
+    let counts = written(counts)?;
+    note!("{counts}");
+    if counts.understood_nothing() {
+        let file = file.display();
+        return Err(CliError::failed(format!("{file}: nothing in it is understood: is it {likely}?")));
     }
+    Ok(())
 }
 
 fn read(file: &Path) -> Result<Vec<u8>, CliError> {

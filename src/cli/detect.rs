@@ -5,8 +5,10 @@ use std::path::{Path, PathBuf};
 use serde_json::{Value, json};
 
 use super::{CliError, CliResult};
+use crate::cli::out::{note, outln};
 use crate::io::clock::HostClock;
 use crate::pixels;
+use crate::text::counted;
 use windhover_base::msg::{GrayImage, TagFamily};
 use windhover_detect::{Detector, LARGEST_IMAGE_PX, Limits, TagDetection, TagLayout};
 
@@ -59,7 +61,7 @@ pub(super) fn run(args: &Args) -> CliResult {
         let image = match read(path) {
             Ok(image) => image,
             Err(message) => {
-                eprintln!("windhover: {}: {message}", path.display());
+                note!("windhover: {}: {message}", path.display());
                 failed += 1;
                 continue;
             }
@@ -68,14 +70,17 @@ pub(super) fn run(args: &Args) -> CliResult {
         let found = detector.detect(image.view());
         let ms = (HostClock::thread_processor_time() - start).ms();
         if args.json {
-            println!("{}", as_json(path, ms, found));
+            outln!("{}", as_json(path, ms, found))?;
         } else {
-            print_lines(path, ms, found);
+            print_lines(path, ms, found)?;
         }
     }
     match failed {
         0 => Ok(()),
-        n => Err(CliError::failed(format!("{n} of {} images could not be read", args.images.len()))),
+        n => {
+            let all = counted(args.images.len(), "image");
+            Err(CliError::failed(format!("{n} of {all} could not be read")))
+        }
     }
 }
 
@@ -89,7 +94,7 @@ fn read(path: &Path) -> Result<GrayImage, String> {
         ));
     }
     if !missing.is_empty() {
-        eprintln!("windhover: {}: damaged: {} parts of it are missing", path.display(), missing.len());
+        note!("windhover: {}: damaged: {} of it missing", path.display(), counted(missing.len(), "part"));
     }
     Ok(image)
 }
@@ -111,11 +116,10 @@ fn as_json(path: &Path, ms: f64, found: &[TagDetection]) -> Value {
     json!({ "image": path.to_string_lossy(), "ms": ms, "detections": detections })
 }
 
-fn print_lines(path: &Path, ms: f64, found: &[TagDetection]) {
-    let tags = if found.len() == 1 { "tag" } else { "tags" };
-    println!("{}: {} {tags} in {ms:.2} ms", path.display(), found.len());
+fn print_lines(path: &Path, ms: f64, found: &[TagDetection]) -> CliResult {
+    outln!("{}: {} in {ms:.2} ms", path.display(), counted(found.len(), "tag"))?;
     for tag in found {
-        println!(
+        outln!(
             "  {} {} at ({:.1}, {:.1}), {:.1} px, hamming {}, margin {:.0}",
             tag.family.name(),
             tag.id,
@@ -124,6 +128,7 @@ fn print_lines(path: &Path, ms: f64, found: &[TagDetection]) {
             tag.size_px,
             tag.hamming,
             tag.margin
-        );
+        )?;
     }
+    Ok(())
 }

@@ -3,7 +3,9 @@
 use std::fmt::Display;
 use std::process::ExitCode;
 
+use super::out;
 use crate::app::log::last_words;
+use crate::text;
 
 /// Done.
 pub const DONE: u8 = 0;
@@ -17,9 +19,10 @@ pub const BAD_CONFIG: u8 = 78;
 /// Result of a command.
 pub type CliResult = Result<(), CliError>;
 
-/// A message for people and the exit code that goes with it.
+/// A message for people, of one line or two, and the exit code that goes with it.
 #[derive(Debug)]
 pub struct CliError {
+    /// Empty where there is nothing to say.
     message: String,
     code: u8,
 }
@@ -33,6 +36,11 @@ impl CliError {
     /// Wrong usage.
     pub fn usage(message: impl Display) -> Self {
         Self { message: message.to_string(), code: WRONG_USAGE }
+    }
+
+    /// Whoever read standard output went: nothing failed, and there is nobody to say it to.
+    pub(super) fn unread() -> Self {
+        Self { message: String::new(), code: DONE }
     }
 
     /// Bad configuration.
@@ -49,10 +57,13 @@ impl<E: std::error::Error> From<E> for CliError {
 
 /// Prints the error, if any, and gives the exit code.
 pub(super) fn exit_code(result: CliResult) -> ExitCode {
-    match result {
+    match result.and_then(|()| out::flush()) {
         Ok(()) => ExitCode::from(DONE),
         Err(error) => {
-            last_words(&format!("windhover: {}", error.message));
+            if !error.message.is_empty() {
+                let message = text::without_numbers(&error.message);
+                last_words(&format!("windhover: {}", text::printable(&message)));
+            }
             ExitCode::from(error.code)
         }
     }

@@ -2,8 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use super::CliResult;
+use super::{CliResult, place};
 use crate::app::export::{self, Format};
+use crate::cli::out::note;
+use crate::io::new_file::Inputs;
+use crate::text::one_line;
 
 /// Write the outputs of a flight for other tools: tables, GIS, Google Earth.
 #[derive(clap::Args, Debug)]
@@ -23,12 +26,19 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args) -> CliResult {
     let out = args.out.clone().unwrap_or_else(|| named_after(&args.flight));
-    let exported = export::export(&args.flight, args.format, &out)?;
+    write(&args.flight, args.format, &out)
+}
+
+/// Writes the outputs of a flight into a directory, and says what was written.
+pub(super) fn write(flight: &Path, format: Format, out: &Path) -> CliResult {
+    let inputs = Inputs::of([flight]);
+    format.files().iter().try_for_each(|(file, mark)| place::check(&out.join(file), &inputs, &[*mark]))?;
+    let exported = export::export(flight, format, out)?;
     for warning in &exported.warnings {
-        eprintln!("windhover: {warning}");
+        note!("windhover: {}", one_line(warning));
     }
     for file in &exported.files {
-        eprintln!("wrote {}", file.display());
+        note!("wrote {}", file.display());
     }
     Ok(())
 }

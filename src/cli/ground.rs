@@ -10,6 +10,7 @@ use crate::app::log;
 use crate::io::clock::HostClock;
 use crate::io::link::StationSettings;
 use crate::io::link::tls::KeyFiles;
+use crate::text::number;
 
 /// Receive from payloads: keep their flights, show them on a web page, feed other programs.
 #[derive(clap::Args, Debug)]
@@ -18,7 +19,7 @@ use crate::io::link::tls::KeyFiles;
   windhover ground --certificate keys/station-hut.pem --connect 10.0.0.2:4433")]
 pub(super) struct Args {
     /// Payload to call; may be given several times
-    #[arg(long, value_name = "HOST:PORT")]
+    #[arg(long, value_name = "HOST:PORT", value_parser = host_and_port)]
     connect: Vec<String>,
     /// Address at which payloads that call reach this station
     #[arg(long, value_name = "ADDRESS:PORT")]
@@ -50,7 +51,11 @@ pub(super) struct Args {
     /// Folder with map tiles (Z/X/Y.png, Web Mercator)
     #[arg(long, value_name = "DIR")]
     tiles: Option<PathBuf>,
-    /// Serve the vehicles as NMEA (RMC and GGA) over TCP here, for example 127.0.0.1:10110
+    /// Where the station stands, in degrees: the page tells distance and bearing from there [default: from where the
+    /// helicopter was first seen]
+    #[arg(long, value_name = "LAT,LON", value_parser = position, allow_hyphen_values = true)]
+    position: Option<[f64; 2]>,
+    /// Serve the vehicles as NMEA (RMC, GGA, GSA, GST) over TCP here, for example 127.0.0.1:10110
     #[arg(long, value_name = "ADDRESS:PORT")]
     nmea: Option<SocketAddr>,
     /// Serve Foxglove over its WebSocket; elsewhere than on loopback the token is asked for
@@ -63,6 +68,27 @@ pub(super) struct Args {
     /// Ask for no thumbnails of the camera image
     #[arg(long)]
     no_thumbnails: bool,
+}
+
+/// An address to call: a name, an IPv4 address or an IPv6 address in brackets, with a port.
+fn host_and_port(text: &str) -> Result<String, String> {
+    let advice = "give HOST:PORT; the port is that of the payload's [link] listen";
+    let (host, port) = text.rsplit_once(':').ok_or(advice)?;
+    let bracketed = host.starts_with('[') && host.ends_with(']');
+    let port_fits = port.parse::<u16>().is_ok_and(|port| port > 0);
+    if host.is_empty() || !port_fits || (host.contains(':') && !bracketed) {
+        return Err(advice.into());
+    }
+    Ok(text.to_owned())
+}
+
+/// A place on the Earth, in degrees.
+fn position(text: &str) -> Result<[f64; 2], String> {
+    let (lat, lon) =
+        text.split_once(',').ok_or("give latitude and longitude in degrees, such as 48.1,11.6")?;
+    let [lat, lon] = [number(lat)?, number(lon)?];
+    let fits = lat.abs() <= 90.0 && lon.abs() <= 180.0;
+    fits.then_some([lat, lon]).ok_or_else(|| format!("{lat}, {lon} is no place on the Earth"))
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
@@ -101,6 +127,7 @@ pub(super) fn run(args: &Args) -> CliResult {
         web: (!args.no_web).then_some(args.web),
         token: args.token.clone(),
         tiles: args.tiles.clone(),
+        position: args.position,
         nmea: args.nmea,
         foxglove: args.foxglove,
         #[cfg(feature = "zenoh")]
@@ -130,4 +157,33 @@ pub(super) fn run(args: &Args) -> CliResult {
         ground::run(settings, stopped).await
     })?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_address_has_a_port_and_a_place_is_on_the_earth() {
+        for fits in ["10.0.0.2:4433", "heli:7447", "[fe80::1%wlan0]:7447", "heli.local:1"] {
+            assert_eq!(host_and_port(fits).as_deref(), Ok(fits));
+        }
+        for wrong in [
+            "10.0.0.2",
+            "heli",
+            "heli:",
+            "heli:0",
+            "heli:99999",
+            ":7447",
+            "fe80::1",
+            "fe80::1:7447x",
+            "::1:7447",
+        ] {
+            assert!(host_and_port(wrong).is_err(), "{wrong}");
+        }
+        assert_eq!(position("-33.9, 151.2"), Ok([-33.9, 151.2]));
+        for wrong in ["48.1", "91,0", "0,181", "nan,0", "a,b"] {
+            assert!(position(wrong).is_err(), "{wrong}");
+        }
+    }
 }

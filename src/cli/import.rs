@@ -2,9 +2,13 @@
 
 use std::path::PathBuf;
 
-use super::{CliError, CliResult};
+use super::{CliError, CliResult, place};
 use crate::app::{config_file, import};
+use crate::cli::out::note;
 use crate::io::import::parse_time;
+use crate::io::mcap_write::Maker;
+use crate::io::new_file::Inputs;
+use crate::text::{counted, one_line};
 use windhover_base::time::MonoTime;
 
 /// Make a capture of recordings you already have: serial logs with a time a line, and a video.
@@ -58,6 +62,9 @@ pub(super) fn run(args: &Args) -> CliResult {
         }
         None => String::new(),
     };
+    let read = [&args.gps, &args.compass, &args.imu, &args.attitude, &args.video, &args.config];
+    let inputs = Inputs::of(read.into_iter().filter_map(|path| path.as_deref()));
+    place::check(&args.out, &inputs, &Maker::Capture.marks())?;
     let sources = import::Sources {
         gps: args.gps.clone(),
         compass: args.compass.clone(),
@@ -71,18 +78,19 @@ pub(super) fn run(args: &Args) -> CliResult {
         other => CliError::failed(other),
     })?;
     for warning in &imported.warnings {
-        eprintln!("windhover: {warning}");
+        note!("windhover: {}", one_line(warning));
     }
     let samples = [(imported.imu_samples, "IMU"), (imported.attitude_samples, "attitude")];
     let samples = samples.into_iter().filter(|(count, _)| *count > 0);
-    let samples: String = samples.map(|(count, name)| format!(", {count} {name} samples")).collect();
-    eprintln!(
-        "imported {} GPS lines, {} compass lines{samples} and {} frames over {:.1} s",
-        imported.gps_lines,
-        imported.compass_lines,
-        imported.frames,
+    let samples: String =
+        samples.map(|(count, name)| format!(", {}", counted(count, &format!("{name} sample")))).collect();
+    note!(
+        "imported {}, {}{samples} and {} over {:.1} s",
+        counted(imported.gps_lines, "GPS line"),
+        counted(imported.compass_lines, "compass line"),
+        counted(imported.frames as usize, "frame"),
         imported.length.s()
     );
-    eprintln!("wrote {}", args.out.display());
+    note!("wrote {}", args.out.display());
     Ok(())
 }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args as ClapArgs, Subcommand};
 
 use super::{CliError, CliResult};
+use crate::cli::out::outln;
 use crate::io::link::keys::{Authority, Role};
 use windhover_base::time::{NS_PER_S, UtcTime};
 
@@ -73,7 +74,7 @@ pub(super) fn run(args: &Args) -> CliResult {
         Action::Authority { place, name, days } => {
             let authority = Authority::at(&place.dir);
             authority.create(name, *days, now)?;
-            println!("authority in {}: keep authority.key at home", place.dir.display());
+            outln!("authority in {}: keep authority.key at home", place.dir.display())?;
             Ok(())
         }
         Action::Payload(issue) => make(Role::Payload, issue, now),
@@ -82,11 +83,11 @@ pub(super) fn run(args: &Args) -> CliResult {
             let role = if role == "payload" { Role::Payload } else { Role::Station };
             let authority = Authority::at(&place.dir);
             authority.revoke(role, name, now)?;
-            println!(
+            outln!(
                 "{} {name} revoked: copy {} to every payload and station",
                 role.name(),
                 authority.revoked_file().display()
-            );
+            )?;
             Ok(())
         }
         Action::List(place) => list(&place.dir, now),
@@ -96,10 +97,10 @@ pub(super) fn run(args: &Args) -> CliResult {
 fn make(role: Role, issue: &Issue, now: UtcTime) -> CliResult {
     let authority = Authority::at(&issue.place.dir);
     let (certificate, key) = authority.issue(role, &issue.name, issue.days, now)?;
-    println!("certificate {}", certificate.display());
-    println!("key         {}", key.display());
-    println!("authority   {}", authority.certificate_file().display());
-    println!("revoked     {}", authority.revoked_file().display());
+    outln!("certificate {}", certificate.display())?;
+    outln!("key         {}", key.display())?;
+    outln!("authority   {}", authority.certificate_file().display())?;
+    outln!("revoked     {}", authority.revoked_file().display())?;
     Ok(())
 }
 
@@ -117,7 +118,7 @@ fn list(dir: &Path, now: UtcTime) -> CliResult {
             (false, true) => "expired",
             (false, false) => "valid",
         };
-        println!("{:8} {:24} {state:8} until {}", member.role.name(), member.name, member.expires);
+        outln!("{:8} {:24} {state:8} until {}", member.role.name(), member.name, member.expires)?;
     }
     Ok(())
 }

@@ -10,7 +10,10 @@ mod generate;
 mod ground;
 mod import;
 mod keys;
+mod live;
 mod montecarlo;
+mod out;
+mod place;
 mod replay;
 mod report;
 mod run;
@@ -21,7 +24,7 @@ pub use error::{CliError, CliResult};
 
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
 use crate::app::run::prepare;
 
@@ -70,7 +73,8 @@ enum Command {
 pub fn main() -> ExitCode {
     // The daemon takes its signals over first of all: to understand the command line takes milliseconds.
     let prepared = std::env::args_os().nth(1).is_some_and(|first| first == "run").then(prepare);
-    let cli = match Cli::try_parse() {
+    let matches = with_negative_numbers(Cli::command()).try_get_matches();
+    let cli = match matches.and_then(|matches| Cli::from_arg_matches(&matches)) {
         Ok(cli) => cli,
         Err(error) => {
             let code = if error.use_stderr() { error::WRONG_USAGE } else { error::DONE };
@@ -97,4 +101,13 @@ pub fn main() -> ExitCode {
         Command::Simulate(args) => simulate::run(&args),
     };
     error::exit_code(result)
+}
+
+/// The command, and all below it, with options that take `-5` as their value and not for another option.
+fn with_negative_numbers(command: clap::Command) -> clap::Command {
+    let command = command.mut_args(|arg| match arg.get_action().takes_values() {
+        true => arg.allow_negative_numbers(true),
+        false => arg,
+    });
+    command.mut_subcommands(with_negative_numbers)
 }

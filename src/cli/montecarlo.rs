@@ -4,11 +4,13 @@ use std::path::{Path, PathBuf};
 
 use serde_json::json;
 
-use super::{CliError, CliResult};
+use super::{CliError, CliResult, place};
 use crate::app::flight::Flight;
 use crate::app::truth::Truth;
 use crate::app::{config_file, declination, geopositions};
+use crate::cli::out::outln;
 use crate::config::Config;
+use crate::io::new_file::Inputs;
 use crate::plot;
 use crate::plot::montecarlo::{Overlay, scatter_svg};
 use windhover_calibrate::montecarlo::{Analysis, Setup, radii};
@@ -51,6 +53,11 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
+    if let Some(plot) = &args.plot {
+        let read = [&args.config, &args.flight, &args.truth];
+        let inputs = Inputs::of(read.into_iter().filter_map(|path| path.as_deref()));
+        place::check(plot, &inputs, &place::DRAWING)?;
+    }
     let flight = args.flight.as_deref().map(Flight::read).transpose()?;
     let flown_with = flight.as_ref().and_then(|f| f.config.clone());
     let config = match (&args.config, flown_with) {
@@ -67,15 +74,15 @@ pub(super) fn run(args: &Args) -> CliResult {
         write_plot(path, &setup, &analysis, overlay.as_ref())?;
     }
     if args.json {
-        println!("{}", as_json(&setup, &analysis, args.seed, overlay.as_ref()));
+        outln!("{}", as_json(&setup, &analysis, args.seed, overlay.as_ref()))?;
     } else {
-        print_text(&setup, &analysis, args.seed);
+        print_text(&setup, &analysis, args.seed)?;
         if let Some(flown) = &overlay {
             let (r50, r95, max) = radii(&flown.errors_m);
-            println!(
+            outln!(
                 "\nflown: {} errors, 50 % within {r50:.3} m, 95 % within {r95:.3} m, worst {max:.3} m",
                 flown.errors_m.len()
-            );
+            )?;
         }
     }
     Ok(())
@@ -105,7 +112,7 @@ fn write_plot(path: &Path, setup: &Setup, analysis: &Analysis, overlay: Option<&
     let title =
         format!("Geo-positioning error, {} errors, {:.1} m above ground", setup.distribution.name(), -p.z);
     let svg = plot::standalone(&scatter_svg(analysis, &title, overlay));
-    std::fs::write(path, svg).map_err(|e| CliError::failed(format!("cannot write {}: {e}", path.display())))
+    place::write(path, &svg)
 }
 
 fn as_json(setup: &Setup, analysis: &Analysis, seed: u64, overlay: Option<&Overlay>) -> serde_json::Value {
@@ -147,28 +154,34 @@ fn as_json(setup: &Setup, analysis: &Analysis, seed: u64, overlay: Option<&Overl
     })
 }
 
-fn print_text(setup: &Setup, analysis: &Analysis, seed: u64) {
+fn print_text(setup: &Setup, analysis: &Analysis, seed: u64) -> CliResult {
     let p = setup.position_ned_m;
     let [heading, pitch, roll] = setup.attitude_rad.map(f64::to_degrees);
     let (sample, closed) = (&analysis.sample_m2, &analysis.closed_m2);
-    println!(
+    outln!(
         "camera at north {:.2} east {:.2} down {:.2} m, heading {heading:.1}°, pitch {pitch:.1}°, roll {roll:.1}°, pixel ({:.1}, {:.1})",
-        p.x, p.y, p.z, setup.pixel.x, setup.pixel.y
-    );
+        p.x,
+        p.y,
+        p.z,
+        setup.pixel.x,
+        setup.pixel.y
+    )?;
     let drawn = analysis.errors_m.len() + analysis.missed;
-    println!("{drawn} draws, {} errors, seed {seed}", setup.distribution.name());
+    outln!("{drawn} draws, {} errors, seed {seed}", setup.distribution.name())?;
     if analysis.missed > 0 {
-        println!("{} draws looked past the ground and are left out", analysis.missed);
+        outln!("{} draws looked past the ground and are left out", analysis.missed)?;
     }
-    println!("\n               north m    east m");
-    println!("sigma drawn   {:8.4}  {:8.4}", sample[(0, 0)].sqrt(), sample[(1, 1)].sqrt());
-    println!("sigma closed  {:8.4}  {:8.4}   (first order)", closed[(0, 0)].sqrt(), closed[(1, 1)].sqrt());
-    println!("mean          {:8.4}  {:8.4}", analysis.mean_m.x, analysis.mean_m.y);
-    println!(
+    outln!("\n               north m    east m")?;
+    outln!("sigma drawn   {:8.4}  {:8.4}", sample[(0, 0)].sqrt(), sample[(1, 1)].sqrt())?;
+    outln!("sigma closed  {:8.4}  {:8.4}   (first order)", closed[(0, 0)].sqrt(), closed[(1, 1)].sqrt())?;
+    outln!("mean          {:8.4}  {:8.4}", analysis.mean_m.x, analysis.mean_m.y)?;
+    outln!(
         "\n50 % within {:.3} m, 95 % within {:.3} m, worst {:.3} m",
-        analysis.r50_m, analysis.r95_m, analysis.max_m
-    );
-    println!("\nerror budget       one sigma   north m    east m   share of variance");
+        analysis.r50_m,
+        analysis.r95_m,
+        analysis.max_m
+    )?;
+    outln!("\nerror budget       one sigma   north m    east m   share of variance")?;
     for line in &analysis.budget {
         let (sigma, unit) = match line.source {
             s if s.starts_with("gps") || s.starts_with("ground") => (line.sigma, "m"),
@@ -177,12 +190,13 @@ fn print_text(setup: &Setup, analysis: &Analysis, seed: u64) {
             }
             _ => (line.sigma, "px"),
         };
-        println!(
+        outln!(
             "{:<18} {sigma:8.3} {unit:<2} {:8.4}  {:8.4}   {:6.2} %",
             line.source,
             line.north_m,
             line.east_m,
             100.0 * line.share
-        );
+        )?;
     }
+    Ok(())
 }

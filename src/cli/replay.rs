@@ -5,11 +5,15 @@ use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{CliError, CliResult};
+use super::{CliError, CliResult, place};
 use crate::app::health::HealthLine;
 use crate::app::replay::{self, ReplayError, ReplayStep};
 use crate::app::{config_file, events, log};
+use crate::cli::out::note;
 use crate::io::clock::HostClock;
+use crate::io::mcap_write::Maker;
+use crate::io::new_file::Inputs;
+use crate::text::{counted, one_line};
 use windhover_base::msg::Output;
 
 /// Run a recorded capture or flight through the pipeline that flies: the same bytes and frames give
@@ -44,8 +48,9 @@ pub(super) fn run(args: &Args) -> CliResult {
             other => CliError::failed(other),
         })?,
     };
-    if args.out.as_ref().is_some_and(|out| same_file(out, &args.capture)) {
-        return Err(CliError::usage("--out names the capture itself; a replay never writes over its source"));
+    if let Some(out) = &args.out {
+        let inputs = Inputs::of([Some(args.capture.as_path()), args.config.as_deref()].into_iter().flatten());
+        place::check(out, &inputs, &Maker::Replay.marks())?;
     }
     let bar = progress_bar();
     let health_line = args.log.then(|| {
@@ -58,7 +63,7 @@ pub(super) fn run(args: &Args) -> CliResult {
                 bar.set_length(total);
                 bar.set_position(done);
             }
-            ReplayStep::Warning(words) => bar.suspend(|| eprintln!("windhover: {words}")),
+            ReplayStep::Warning(words) => bar.suspend(|| note!("windhover: {}", one_line(words))),
             ReplayStep::Output(output) => {
                 if let Some(health) = &health_line {
                     log_output(output, health);
@@ -66,18 +71,18 @@ pub(super) fn run(args: &Args) -> CliResult {
             }
         })?;
     bar.finish_and_clear();
-    eprintln!(
-        "replayed {:.1} s and {} frames in {:.1} s: {:.1} times real time",
+    note!(
+        "replayed {:.1} s and {} in {:.1} s: {:.1} times real time",
         summary.recorded.s(),
-        summary.frames,
+        counted(summary.frames as usize, "frame"),
         summary.took.s(),
         summary.recorded.s() / summary.took.s().max(1e-3)
     );
     if summary.frames == 0 {
-        eprintln!("no frame came from the camera: the helicopter's own state is all that was estimated");
+        note!("no frame came from the camera: the helicopter's own state is all that was estimated");
     }
     if let Some(out) = &args.out {
-        eprintln!("wrote {}", out.display());
+        note!("wrote {}", out.display());
     }
     Ok(())
 }
@@ -102,10 +107,6 @@ impl Write for AboveBar {
     fn flush(&mut self) -> std::io::Result<()> {
         Ok(())
     }
-}
-
-fn same_file(a: &std::path::Path, b: &std::path::Path) -> bool {
-    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
 }
 
 /// A bar of bytes on a terminal; nothing where standard error is a file.

@@ -2,10 +2,13 @@
 
 use std::path::PathBuf;
 
-use super::{CliError, CliResult};
+use super::{CliResult, place};
 use crate::app::flight::Flight;
 use crate::app::report;
 use crate::app::truth::Truth;
+use crate::cli::out::{note, out, outln};
+use crate::io::new_file::Inputs;
+use crate::plot::MADE_BY;
 
 /// Write a page about a flight: map, states with their bands, measurements, sensors, frames; errors
 /// where truth is given.
@@ -26,15 +29,23 @@ pub(super) struct Args {
     out: PathBuf,
 }
 
+/// What a report says near its begin.
+const REPORT: [&str; 2] = ["<meta name=\"generator\" content=\"report ", MADE_BY];
+
 pub(super) fn run(args: &Args) -> CliResult {
+    let inputs = Inputs::of([Some(args.flight.as_path()), args.truth.as_deref()].into_iter().flatten());
+    place::check(&args.out, &inputs, &REPORT)?;
+    let replaced = args.out.exists();
     let truth = args.truth.as_deref().map(Truth::read).transpose()?;
     let flight = Flight::read(&args.flight)?;
     let page = report::render(&args.flight, &flight, truth.as_ref())?;
-    std::fs::write(&args.out, page)
-        .map_err(|e| CliError::failed(format!("cannot write {}: {e}", args.out.display())))?;
-    if let Some(table) = truth.as_ref().and_then(|truth| report::error_text(&flight, truth)) {
-        print!("{table}");
+    place::write(&args.out, &page)?;
+    if replaced {
+        note!("the report that was there is replaced");
     }
-    println!("{}", args.out.display());
+    if let Some(table) = truth.as_ref().and_then(|truth| report::error_text(&flight, truth)) {
+        out!("{table}")?;
+    }
+    outln!("{}", args.out.display())?;
     Ok(())
 }

@@ -1,13 +1,16 @@
 //! `windhover simulate OUT.mcap`
 
-use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::{CliError, CliResult};
+use super::live::{self, Live};
+use super::{CliError, CliResult, place};
+use crate::cli::out::{note, out, outln};
 use crate::config::Config;
 use crate::io::capture::CaptureWriter;
+use crate::io::mcap_write::Maker;
+use crate::io::new_file::{Inputs, NewFile};
 use crate::jpeg;
 use windhover_base::msg::{EventBody, GrayImage};
 use windhover_simulate::{Deviation, Flight, FrameStorage, FrameTruth, Scenario, World, truth};
@@ -28,6 +31,7 @@ Examples:
   windhover simulate flight.mcap                          a minute of following a vehicle at 15 m
   windhover simulate a.mcap --scenario hover10 --seed 7   another draw of every error
   windhover simulate b.mcap --duration 10 --scale 0.5     short, at half the resolution: a small file
+  windhover simulate --live --duration 120                the helicopter follows, in real time; then windhover ground
   windhover simulate --list                               what scenarios and deviations there are
   windhover simulate c.mcap --with people=3 --with readout=15   a flight that its configuration does not fit
 
@@ -36,7 +40,7 @@ Then:
   windhover report result.mcap --truth flight.truth.csv   how far the estimates are from the truth")]
 pub(super) struct Args {
     /// Capture to write
-    #[arg(required_unless_present = "list", value_name = "OUT.mcap")]
+    #[arg(required_unless_present_any = ["list", "live"], value_name = "OUT.mcap")]
     out: Option<PathBuf>,
     /// What happens in the flight (see --list)
     #[arg(long, default_value = "follow", value_name = "NAME")]
@@ -62,6 +66,19 @@ pub(super) struct Args {
     /// Store frames as raw grey pixels instead of JPEG (large)
     #[arg(long, conflicts_with = "quality")]
     lossless: bool,
+    /// Fly in real time with a daemon on pseudo-terminals: the helicopter follows the vehicle by what the daemon says over
+    /// MAVLink
+    #[arg(long, conflicts_with_all = ["out", "lossless"])]
+    live: bool,
+    /// With --live: folder for lines, configuration, keys and card
+    #[arg(long, value_name = "DIR", default_value = "windhover-live", requires = "live")]
+    dir: PathBuf,
+    /// With --live: another program flies the helicopter, by UDP datagrams at this address (docs/autopilot.md)
+    #[arg(long, value_name = "ADDRESS:PORT", requires = "live")]
+    driver: Option<String>,
+    /// With --live: the daemon is started by hand
+    #[arg(long, requires = "live")]
+    no_daemon: bool,
     /// List scenarios and deviations and exit
     #[arg(long)]
     list: bool,
@@ -69,11 +86,20 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args) -> CliResult {
     if args.list {
-        list();
-        return Ok(());
+        return list();
+    }
+    if args.live {
+        let live = Live {
+            folder: &args.dir,
+            seed: args.seed,
+            driver: args.driver.as_deref(),
+            no_daemon: args.no_daemon,
+        };
+        return live::run(scenario(args)?, &live);
     }
     let out = args.out.as_deref().ok_or_else(|| CliError::usage("say which capture to write"))?;
     let scenario = scenario(args)?;
+    check_places(out, &scenario)?;
     let quality = args.quality;
     let encode = move |image: &GrayImage| jpeg::encode_grey(image, quality).map_err(|e| e.to_string());
     let storage = if args.lossless { FrameStorage::Raw } else { FrameStorage::Jpeg(Arc::new(encode)) };
@@ -81,18 +107,19 @@ pub(super) fn run(args: &Args) -> CliResult {
 }
 
 /// A line each, which begins with a name that `--scenario` takes.
-fn list() {
+fn list() -> CliResult {
     for (name, about) in Scenario::names().iter().copied().chain(Scenario::composed()) {
-        println!("{name:18} {about}");
+        outln!("{name:18} {about}")?;
     }
     for d in Deviation::all() {
         let (name, effect, (low, high)) = (d.name, d.effect.name(), d.limits);
-        print!("{name:18} {effect}: {}", d.about);
+        out!("{name:18} {effect}: {}", d.about)?;
         match low < high {
-            true => println!("; --with {name}[={}] {}, {low} to {high}", d.usual, d.unit),
-            false => println!("; --with {name}"),
+            true => outln!("; --with {name}[={}] {}, {low} to {high}", d.usual, d.unit)?,
+            false => outln!("; --with {name}")?,
         }
     }
+    Ok(())
 }
 
 fn scenario(args: &Args) -> Result<Scenario, CliError> {
@@ -139,31 +166,46 @@ fn beside(out: &Path, suffix: &str) -> PathBuf {
     out.with_extension(format!("{suffix}.csv"))
 }
 
+/// The truths of a flight's vehicles, in their order, then the helicopter's.
+fn truth_paths(out: &Path, scenario: &Scenario) -> Vec<PathBuf> {
+    let targets = scenario.rig.target.iter().enumerate();
+    let vehicles = targets.map(|(i, target)| match i {
+        0 => beside(out, "truth"),
+        _ => beside(out, &format!("truth_{}", target.name)),
+    });
+    vehicles.chain([beside(out, "truth_ownship")]).collect()
+}
+
+/// A flight and its truth are written over older ones of a simulation, and over nothing else.
+fn check_places(out: &Path, scenario: &Scenario) -> CliResult {
+    place::check(out, &Inputs::default(), &Maker::Capture.marks())?;
+    let truths = truth_paths(out, scenario);
+    let marks = [truth::VEHICLE_COLUMNS];
+    let (own, vehicles) = truths.split_last().expect("the helicopter's is the last");
+    vehicles.iter().try_for_each(|path| place::check(path, &Inputs::default(), &marks))?;
+    place::check(own, &Inputs::default(), &[truth::OWNSHIP_HEADER])
+}
+
 struct TruthFiles {
-    files: Vec<(PathBuf, BufWriter<File>)>,
+    files: Vec<(PathBuf, BufWriter<NewFile>)>,
 }
 
 impl TruthFiles {
     /// One file for each vehicle, then the helicopter's.
     fn create(out: &Path, world: &World) -> Result<Self, CliError> {
-        let targets = world.scenario().rig.target.iter().enumerate();
-        let mut headed: Vec<(PathBuf, String)> = targets
-            .map(|(i, target)| {
-                let suffix = if i == 0 { "truth".into() } else { format!("truth_{}", target.name) };
-                (beside(out, &suffix), truth::vehicle_header(world, i))
-            })
-            .collect();
-        headed.push((beside(out, "truth_ownship"), truth::OWNSHIP_HEADER.to_owned()));
+        let paths = truth_paths(out, world.scenario());
+        let vehicles = (0..world.scenario().rig.target.len()).map(|i| truth::vehicle_header(world, i));
+        let headed = paths.into_iter().zip(vehicles.chain([truth::OWNSHIP_HEADER.to_owned()]));
         let mut files = Vec::new();
         for (path, header) in headed {
-            let file = File::create(&path).map_err(|e| cannot_write(&path, &e))?;
+            let file = NewFile::create(&path).map_err(|e| cannot_write(&path, &e))?;
             files.push((path, BufWriter::new(file)));
             Self::line(files.last_mut().expect("one was just pushed"), &header)?;
         }
         Ok(Self { files })
     }
 
-    fn line((path, file): &mut (PathBuf, BufWriter<File>), text: &str) -> Result<(), CliError> {
+    fn line((path, file): &mut (PathBuf, BufWriter<NewFile>), text: &str) -> Result<(), CliError> {
         writeln!(file, "{text}").map_err(|e| cannot_write(path, &e))
     }
 
@@ -176,8 +218,9 @@ impl TruthFiles {
     }
 
     fn finish(self) -> Result<Vec<PathBuf>, CliError> {
-        let close = |(path, mut file): (PathBuf, BufWriter<File>)| {
-            file.flush().map_err(|e| cannot_write(&path, &e)).map(|()| path)
+        let close = |(path, file): (PathBuf, BufWriter<NewFile>)| {
+            let whole = file.into_inner().map_err(|e| e.into_error()).and_then(NewFile::finish);
+            whole.map_err(|e| cannot_write(&path, &e)).map(|()| path)
         };
         self.files.into_iter().map(close).collect()
     }
@@ -215,7 +258,7 @@ fn write_flight(scenario: Scenario, seed: u64, storage: FrameStorage, out: &Path
     writer.finish().map_err(CliError::failed)?;
     let beside: Vec<_> = truths.finish()?.iter().map(|p| p.display().to_string()).collect();
     let written = bar.position();
-    eprintln!("{}: {name}, seed {seed}, {written} frames; truth in {}", out.display(), beside.join(", "));
+    note!("{}: {name}, seed {seed}, {written} frames; truth in {}", out.display(), beside.join(", "));
     Ok(())
 }
 

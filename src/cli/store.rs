@@ -3,16 +3,19 @@
 mod check;
 mod show;
 
-use std::io::{BufRead, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
 use clap::{Args as ClapArgs, Subcommand};
 
-use super::{CliError, CliResult};
+use super::{CliError, CliResult, place};
 use crate::app::config_file;
+use crate::cli::out::outln;
 use crate::io::store::flight::{self, FLIGHTS};
 use crate::io::store::inspect;
 use crate::io::store::volume::Volume;
+
+/// The daemon's configuration.
+const CONFIG: &str = "/etc/windhover/windhover.toml";
 
 /// See and tend the flights on the data card.
 ///
@@ -21,7 +24,7 @@ use crate::io::store::volume::Volume;
 #[derive(ClapArgs, Debug)]
 pub(super) struct Args {
     /// Configuration that tells where the store is
-    #[arg(long, global = true, value_name = "FILE", default_value = "/etc/windhover/windhover.toml")]
+    #[arg(long, global = true, value_name = "FILE", default_value = CONFIG)]
     config: PathBuf,
     /// Directory of the store, instead of the configuration's store.path
     #[arg(long, global = true, value_name = "DIR")]
@@ -101,20 +104,39 @@ pub(super) fn run(args: &Args) -> CliResult {
         let root = root.display();
         return Err(CliError::failed(format!("no store at {root}; is the data card mounted? (--path DIR)")));
     }
+    let called = called(args);
     match &args.action {
         Action::List { json } => show::list(&root, *json),
-        Action::Show { flight, json } => show::show(&root, &resolve(&root, flight)?, *json),
-        Action::Verify { flight } => check::verify(&root, &resolve_all(&root, flight)?, flight.is_empty()),
-        Action::Repair { flight } => check::repair(&root, &resolve_all(&root, flight)?),
+        Action::Show { flight, json } => show::show(&root, &resolve(&root, flight, &called)?, *json),
+        Action::Verify { flight } => {
+            check::verify(&root, &resolve_all(&root, flight, &called)?, flight.is_empty(), &called)
+        }
+        Action::Repair { flight } => check::repair(&root, &resolve_all(&root, flight, &called)?),
         Action::Rebuild => check::rebuild(&root),
-        Action::Export(export) => run_export(&root, export),
-        Action::Keep { flight, undo } => keep(&root, &resolve_all(&root, flight)?, !undo),
-        Action::Delete { flight, yes } => delete(&root, &resolve_all(&root, flight)?, *yes),
+        Action::Export(export) => run_export(&root, export, &called),
+        Action::Keep { flight, undo } => keep(&root, &resolve_all(&root, flight, &called)?, !undo),
+        Action::Delete { flight, yes } => delete(&root, &resolve_all(&root, flight, &called)?, *yes, &called),
+    }
+}
+
+/// How `store` was called, so that advice can be typed as it stands.
+fn called(args: &Args) -> String {
+    let quoted = |path: &Path| {
+        let path = path.display().to_string();
+        let plain = path.chars().all(|c| c.is_ascii_alphanumeric() || "/._-+,:@".contains(c));
+        if plain { path } else { format!("'{}'", path.replace('\'', r"'\''")) }
+    };
+    match &args.path {
+        Some(path) => format!("windhover store --path {}", quoted(path)),
+        None if args.config != Path::new(CONFIG) => {
+            format!("windhover store --config {}", quoted(&args.config))
+        }
+        None => "windhover store".into(),
     }
 }
 
 /// The flight of that name, or the only one whose name begins so.
-fn resolve(root: &Path, asked: &str) -> Result<String, CliError> {
+fn resolve(root: &Path, asked: &str, called: &str) -> Result<String, CliError> {
     // Shells complete to paths: the last part counts.
     let asked = asked.trim_end_matches('/').rsplit('/').next().unwrap_or(asked);
     let names = flight::flight_names(root)?;
@@ -125,10 +147,9 @@ fn resolve(root: &Path, asked: &str) -> Result<String, CliError> {
     like.sort_unstable();
     match like[..] {
         [one] => Ok(one.clone()),
-        [] => Err(CliError::failed(format!(
-            "no flight {asked:?} in {}; see `windhover store list`",
-            root.display()
-        ))),
+        [] => {
+            Err(CliError::failed(format!("no flight {asked:?} in {}; see `{called} list`", root.display())))
+        }
         _ => Err(CliError::failed(format!(
             "{asked:?} may be {} or {}; give more of the name",
             like[0], like[1]
@@ -137,51 +158,46 @@ fn resolve(root: &Path, asked: &str) -> Result<String, CliError> {
 }
 
 /// The flights asked for; all, oldest first, where none was.
-fn resolve_all(root: &Path, asked: &[String]) -> Result<Vec<String>, CliError> {
+fn resolve_all(root: &Path, asked: &[String], called: &str) -> Result<Vec<String>, CliError> {
     if asked.is_empty() {
         return Ok(inspect::list(root)?.0.into_iter().map(|info| info.name).collect());
     }
-    asked.iter().map(|name| resolve(root, name)).collect()
+    asked.iter().map(|name| resolve(root, name, called)).collect()
 }
 
-fn run_export(root: &Path, export: &Export) -> CliResult {
-    let name = resolve(root, &export.flight)?;
+fn run_export(root: &Path, export: &Export, called: &str) -> CliResult {
+    let name = resolve(root, &export.flight, called)?;
     let out = export.out.clone().unwrap_or_else(|| PathBuf::from(&name));
-    let written = crate::app::export::export(&root.join(FLIGHTS).join(&name), export.format, &out)?;
-    for warning in &written.warnings {
-        eprintln!("windhover: {warning}");
-    }
-    for file in &written.files {
-        eprintln!("wrote {}", file.display());
-    }
-    Ok(())
+    super::export::write(&root.join(FLIGHTS).join(&name), export.format, &out)
 }
 
 fn keep(root: &Path, names: &[String], keep: bool) -> CliResult {
     let volume = Volume::new(root);
     for name in names {
         flight::set_keep(&volume, name, keep)?;
-        println!("{name}: {}", if keep { "kept" } else { "may be deleted to make room" });
+        outln!("{name}: {}", if keep { "kept" } else { "may be deleted to make room" })?;
     }
     Ok(())
 }
 
-fn delete(root: &Path, names: &[String], yes: bool) -> CliResult {
+fn delete(root: &Path, names: &[String], yes: bool, called: &str) -> CliResult {
     refuse_in_the_air(root, names)?;
     let volume = Volume::new(root);
     for name in names {
         let info = inspect::glance(root, name)?;
         if info.keep {
             return Err(CliError::failed(format!(
-                "{name} is marked keep; `windhover store keep --undo {name}` first"
+                "{name} is marked keep; `{called} keep --undo {name}` first"
             )));
         }
-        if !yes && !asked(&format!("delete {name}, {}?", show::size(info.bytes)))? {
-            println!("{name}: left as it is");
+        let question = || place::asked(&format!("delete {name}, {}?", show::size(info.bytes)));
+        let no_terminal = || CliError::usage("there is no terminal to ask on; say --yes");
+        if !yes && !question()?.ok_or_else(no_terminal)? {
+            outln!("{name}: left as it is")?;
             continue;
         }
         flight::delete(&volume, name)?;
-        println!("{name}: deleted");
+        outln!("{name}: deleted")?;
     }
     Ok(())
 }
@@ -193,17 +209,4 @@ fn refuse_in_the_air(root: &Path, names: &[String]) -> CliResult {
         }
         _ => Ok(()),
     }
-}
-
-/// Asks on the terminal; without one, `--yes` must say it.
-fn asked(question: &str) -> Result<bool, CliError> {
-    let stdin = std::io::stdin();
-    if !stdin.is_terminal() {
-        return Err(CliError::usage("there is no terminal to ask on; say --yes"));
-    }
-    eprint!("{question} [y/N] ");
-    std::io::stderr().flush()?;
-    let mut answer = String::new();
-    stdin.lock().read_line(&mut answer)?;
-    Ok(matches!(answer.trim(), "y" | "Y" | "yes"))
 }

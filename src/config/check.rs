@@ -1,10 +1,11 @@
 //! What a configuration must satisfy beyond its syntax.
 
 use windhover_base::settings::{
-    AttitudeConfig, GroundConfig, ImuConfig, MarkerConfig, MarkerKind, TargetConfig, TargetModel,
+    AttitudeConfig, AutopilotUse, GroundConfig, ImuConfig, MarkerConfig, MarkerKind, TargetConfig,
+    TargetModel,
 };
 
-use super::Config;
+use super::{AUTOPILOT, Config};
 
 /// What is wrong with a configuration.
 #[derive(Clone, PartialEq, Debug, thiserror::Error)]
@@ -88,6 +89,11 @@ pub(super) fn within(key: impl Into<String>, value: f64, low: f64, high: f64) ->
     refuse(key, format!("{value} is not between {low} and {high}"))
 }
 
+/// Targets: all are states of one filter, whose memory grows with their square.
+const MOST_TARGETS: usize = 32;
+/// Markers of all targets together.
+const MOST_MARKERS: usize = 256;
+
 /// Line speeds a UART can be set to.
 const BAUDS: [u32; 13] =
     [1200, 2400, 4800, 9600, 19200, 38400, 57600, 115_200, 230_400, 460_800, 921_600, 1_000_000, 2_000_000];
@@ -97,6 +103,17 @@ fn baud(key: &str, value: u32) -> Result<(), ConfigError> {
         return Ok(());
     }
     refuse(key, format!("{value} is not a line speed; use one of {BAUDS:?}"))
+}
+
+/// A device on the network is `tcp://HOST:PORT` or `udp://ADDRESS:PORT`.
+fn network_device(key: &str, device: &str) -> Result<(), ConfigError> {
+    let Some((protocol, address)) = device.split_once("://") else { return Ok(()) };
+    let port = address.rsplit_once(':').filter(|(host, _)| !host.is_empty());
+    let has_port = port.is_some_and(|(_, port)| port.parse::<u16>().is_ok_and(|port| port > 0));
+    if matches!(protocol, "tcp" | "udp") && has_port {
+        return Ok(());
+    }
+    refuse(key, format!("{device} is no device; give a path, tcp://HOST:PORT or udp://ADDRESS:PORT"))
 }
 
 impl Config {
@@ -185,17 +202,29 @@ impl Config {
     fn check_sensors(&self) -> Result<(), ConfigError> {
         baud("gps.baud", self.gps.baud)?;
         baud("compass.baud", self.compass.baud)?;
-        if self.gps.device == self.compass.device {
+        self.check_autopilot()?;
+        // A server gives the same to everybody who asks; a serial line has one reader.
+        let is_line = self.gps.is_there() && !self.gps.device.starts_with("tcp://");
+        if is_line && self.gps.device == self.compass.device {
             refuse("compass.device", format!("{} is the GPS receiver's line too", self.compass.device))?;
         }
-        for (key, device) in [
-            ("gps.device", &self.gps.device),
-            ("compass.device", &self.compass.device),
-            ("camera.device", &self.camera.device),
+        let given = |what| self.autopilot.as_ref().is_some_and(|autopilot| autopilot.gives(what));
+        for (key, device, what) in [
+            ("gps.device", &self.gps.device, Some(AutopilotUse::Gps)),
+            ("compass.device", &self.compass.device, Some(AutopilotUse::Attitude)),
+            ("camera.device", &self.camera.device, None),
         ] {
-            if device.is_empty() {
+            if device.is_empty() && !what.is_some_and(given) {
                 refuse(key, "names no device; give a path such as /dev/ttyS0")?;
             }
+        }
+        network_device("gps.device", &self.gps.device)?;
+        network_device("compass.device", &self.compass.device)?;
+        if self.gps.configure_garmin && self.gps.device.contains("://") {
+            refuse(
+                "gps.configure_garmin",
+                "a receiver behind the network is not configured; leave this out",
+            )?;
         }
         for (axis, value) in self.gps.antenna_position_m.iter().enumerate() {
             within(format!("gps.antenna_position_m[{axis}]"), *value, -20.0, 20.0)?;
@@ -224,6 +253,33 @@ impl Config {
         within("compass.tilt_noise_deg", compass.tilt_noise_deg, 1e-3, 90.0)?;
         self.imu.as_ref().map_or(Ok(()), check_imu)?;
         self.attitude.as_ref().map_or(Ok(()), check_attitude)
+    }
+
+    fn check_autopilot(&self) -> Result<(), ConfigError> {
+        let to_autopilot = self.mavlink.send_to.iter().any(|station| station == AUTOPILOT);
+        let Some(autopilot) = &self.autopilot else {
+            if to_autopilot {
+                refuse("mavlink.send_to", "names the autopilot, and there is no [autopilot]")?;
+            }
+            return Ok(());
+        };
+        baud("autopilot.baud", autopilot.baud)?;
+        match (&autopilot.device, autopilot.listen_at()) {
+            (Some(_), Some(_)) => refuse("autopilot.listen", "device is given too; keep one of them")?,
+            (None, None) => refuse("autopilot", "give device, or listen = \"udp://0.0.0.0:14550\"")?,
+            (Some(device), None) if [&self.gps.device, &self.compass.device].contains(&device) => {
+                refuse("autopilot.device", format!("{device} is another device's line too"))?;
+            }
+            (None, Some(address)) if address.parse::<std::net::SocketAddr>().is_err() => {
+                refuse("autopilot.listen", format!("{address:?} is not udp://ADDRESS:PORT"))?;
+            }
+            _ => {}
+        }
+        let mavlink = &self.mavlink;
+        if autopilot.system_id.is_some_and(|id| id == mavlink.system_id) {
+            refuse("autopilot.system_id", "is that of the first target, mavlink.system_id")?;
+        }
+        Ok(())
     }
 
     fn check_camera(&self) -> Result<(), ConfigError> {
@@ -263,6 +319,14 @@ impl Config {
     fn check_targets(&self) -> Result<(), ConfigError> {
         if self.target.is_empty() {
             return refuse("target", "no [[target]]: say which vehicle to watch");
+        }
+        let markers: usize = self.target.iter().map(|target| target.marker.len()).sum();
+        for (key, count, most) in
+            [("target", self.target.len(), MOST_TARGETS), ("target.marker", markers, MOST_MARKERS)]
+        {
+            if count > most {
+                refuse(key, format!("there are {count}; one helicopter watches {most} at most"))?;
+            }
         }
         let mut names = std::collections::BTreeSet::new();
         let mut tags = std::collections::BTreeSet::new();

@@ -32,13 +32,15 @@ pub enum Part {
     Compass,
     /// The camera.
     Camera,
+    /// The link to the autopilot.
+    Autopilot,
     /// The data card.
     Store,
 }
 
 impl Part {
     /// Every part.
-    pub const ALL: [Self; 4] = [Self::Gps, Self::Compass, Self::Camera, Self::Store];
+    pub const ALL: [Self; 5] = [Self::Gps, Self::Compass, Self::Camera, Self::Autopilot, Self::Store];
 
     /// Its name in configuration and log.
     pub const fn name(self) -> &'static str {
@@ -46,6 +48,7 @@ impl Part {
             Self::Gps => "gps",
             Self::Compass => "compass",
             Self::Camera => "camera",
+            Self::Autopilot => "autopilot",
             Self::Store => "store",
         }
     }

@@ -56,16 +56,25 @@ impl Default for LinkConfig {
     }
 }
 
+/// The station that is the helicopter's autopilot: reached by the link of `[autopilot]`.
+pub const AUTOPILOT: &str = "autopilot";
+
 /// `[mavlink]`: the vehicle as MAVLink 2 over UDP.
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MavlinkConfig {
     /// Whether anything is sent.
     pub enabled: bool,
-    /// Where to (`host:port`); ground stations listen on UDP 14550.
+    /// Where to (`host:port`, or "autopilot": the link of `[autopilot]`); ground stations listen on UDP 14550.
     pub send_to: Vec<String>,
     /// System id of the first target; the others follow. Must differ from the helicopter's own.
     pub system_id: u8,
+    /// System id of the helicopter's autopilot: what it carries (camera, landing target) goes out under it.
+    pub autopilot_id: u8,
+    /// What is sent of each target.
+    pub messages: Vec<MavlinkMessage>,
+    /// Axes of LANDING_TARGET.
+    pub landing_frame: LandingFrame,
     /// Positions a second.
     pub rate_hz: f64,
     /// An estimate older than this goes out no more, seconds.
@@ -81,13 +90,54 @@ pub struct MavlinkConfig {
     pub signing_link_id: u8,
 }
 
+/// A message of which a target can be told.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum MavlinkMessage {
+    /// Place and velocity: maps of ground stations.
+    GlobalPositionInt,
+    /// Heading and yaw rate: the same.
+    Attitude,
+    /// Place, velocity, acceleration, heading: ArduPilot's and PX4's following.
+    FollowTarget,
+    /// Vector from the helicopter: ArduPilot's precision landing.
+    LandingTarget,
+    /// Vector from the helicopter with its errors: PX4's target estimator.
+    TargetRelative,
+    /// Place and motion with their errors: the same.
+    TargetAbsolute,
+    /// What the camera tracks, on the ground: QGroundControl.
+    CameraTrackingGeoStatus,
+    /// What the camera tracks, in the picture: QGroundControl.
+    CameraTrackingImageStatus,
+    /// Place and motion in the datum's frame.
+    Odometry,
+}
+
+/// Axes of LANDING_TARGET.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LandingFrame {
+    /// Of the helicopter's body: forward, right, down (MAV_FRAME_BODY_FRD).
+    Body,
+    /// Level, in the direction of its nose (MAV_FRAME_LOCAL_FRD).
+    Local,
+}
+
 impl Default for MavlinkConfig {
     fn default() -> Self {
         Self {
             enabled: false,
             send_to: vec!["127.0.0.1:14550".into()],
             system_id: 42,
-            rate_hz: 5.0,
+            autopilot_id: 1,
+            messages: vec![
+                MavlinkMessage::GlobalPositionInt,
+                MavlinkMessage::Attitude,
+                MavlinkMessage::FollowTarget,
+            ],
+            landing_frame: LandingFrame::Body,
+            rate_hz: 10.0,
             max_age_s: 0.5,
             max_sigma_m: 2.0,
             coast_s: 1.0,
@@ -131,7 +181,7 @@ impl LinkConfig {
 impl MavlinkConfig {
     pub(super) fn check(&self) -> Result<(), ConfigError> {
         for address in &self.send_to {
-            if !has_port(address) {
+            if address != AUTOPILOT && !has_port(address) {
                 refuse(
                     "mavlink.send_to",
                     format!("{address:?} is not HOST:PORT, for example 10.0.0.5:14550"),
@@ -139,6 +189,10 @@ impl MavlinkConfig {
             }
         }
         within("mavlink.system_id", f64::from(self.system_id), 1.0, 250.0)?;
+        within("mavlink.autopilot_id", f64::from(self.autopilot_id), 1.0, 250.0)?;
+        if self.autopilot_id == self.system_id {
+            refuse("mavlink.system_id", "must differ from mavlink.autopilot_id, the helicopter's own")?;
+        }
         within("mavlink.rate_hz", self.rate_hz, 0.1, 50.0)?;
         within("mavlink.max_age_s", self.max_age_s, 0.05, 10.0)?;
         within("mavlink.max_sigma_m", self.max_sigma_m, 0.01, 1_000.0)?;

@@ -11,14 +11,14 @@ mod store;
 
 pub use check::ConfigError;
 pub use daemon::{DaemonConfig, GoingLine, Part, PowerConfig};
-pub use link::{LinkConfig, MavlinkConfig};
+pub use link::{AUTOPILOT, LandingFrame, LinkConfig, MavlinkConfig, MavlinkMessage};
 pub use log::{LogConfig, LogFormat, LogLevel};
 pub use store::{FramePolicy, StoreConfig};
 
 use serde::{Deserialize, Serialize};
 use windhover_base::settings::{
-    AttitudeConfig, CameraConfig, CompassConfig, Datum, DetectorConfig, EstimatorConfig, GpsConfig,
-    GroundConfig, ImuConfig, MonteCarloConfig, Rig, TargetConfig,
+    AttitudeConfig, AutopilotConfig, AutopilotUse, CameraConfig, CompassConfig, Datum, DetectorConfig,
+    EstimatorConfig, GpsConfig, GroundConfig, ImuConfig, MonteCarloConfig, Rig, TargetConfig,
 };
 
 /// The whole configuration. Unknown keys are errors everywhere.
@@ -26,9 +26,14 @@ use windhover_base::settings::{
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// The GPS receiver.
+    #[serde(default, skip_serializing_if = "GpsConfig::is_absent")]
     pub gps: GpsConfig,
     /// The digital compass.
+    #[serde(default, skip_serializing_if = "CompassConfig::is_absent")]
     pub compass: CompassConfig,
+    /// The helicopter's autopilot, where it is heard.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub autopilot: Option<AutopilotConfig>,
     /// Gyros and accelerometers, where there are any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub imu: Option<ImuConfig>,
@@ -76,10 +81,11 @@ pub struct Config {
 impl Config {
     /// The configuration of a rig over known ground, with every other section at its default.
     pub fn of_rig(rig: Rig, ground: GroundConfig) -> Self {
-        let Rig { gps, compass, imu, attitude, camera, target } = rig;
+        let Rig { gps, compass, autopilot, imu, attitude, camera, target } = rig;
         Self {
             gps,
             compass,
+            autopilot,
             imu,
             attitude,
             camera,
@@ -107,14 +113,28 @@ impl Config {
 
     /// The instruments and the targets.
     pub fn rig(&self) -> Rig {
+        let gives = |what| self.autopilot.as_ref().is_some_and(|autopilot| autopilot.gives(what));
+        let second = gives(AutopilotUse::Attitude) && self.compass.is_there();
         Rig {
             gps: self.gps.clone(),
             compass: self.compass.clone(),
-            imu: self.imu,
-            attitude: self.attitude,
+            autopilot: self.autopilot.clone(),
+            imu: self.imu.or_else(|| gives(AutopilotUse::Imu).then(ImuConfig::default)),
+            attitude: self.attitude.or_else(|| second.then(AttitudeConfig::default)),
             camera: self.camera.clone(),
             target: self.target.clone(),
         }
+    }
+
+    /// Parts that the daemon is ready without: those whose absence is accepted, and those that are not configured.
+    pub fn optional_parts(&self) -> Vec<Part> {
+        let absent = [
+            (Part::Gps, self.gps.is_absent()),
+            (Part::Compass, self.compass.is_absent()),
+            (Part::Autopilot, self.autopilot.is_none()),
+        ];
+        let absent = absent.into_iter().filter(|(_, is)| *is).map(|(part, _)| part);
+        self.daemon.optional.iter().copied().chain(absent).collect()
     }
 
     /// Parses and checks a configuration. The error names line and key where it can.

@@ -1,12 +1,10 @@
 //! Captures: serial bytes and frames in and out of MCAP.
 
 use std::collections::BinaryHeap;
-use std::fs::File;
-use std::io::BufWriter;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::mcap_read::{self, McapReader, RawMessage, ReadError};
-use super::mcap_write::{CONFIG_ATTACHMENT, McapWriter, WriteError};
+use super::mcap_write::{CONFIG_ATTACHMENT, Maker, McapFile, WriteError};
 use super::records::{self, EventDecoder, FRAME_NUMBER_KEY, IN_SEQUENCE, KeptMessage};
 use windhover_base::msg::{Event, EventBody};
 use windhover_base::time::{MonoTime, Span};
@@ -150,15 +148,17 @@ impl Iterator for CaptureReader {
     }
 }
 
-/// Writes a capture of events.
+/// Writes a capture of events, which stands in its place when it is finished.
 pub struct CaptureWriter {
-    writer: McapWriter<BufWriter<File>>,
+    path: PathBuf,
+    writer: McapFile,
 }
 
 impl CaptureWriter {
-    /// Creates a capture with its configuration attached.
+    /// Begins a capture with its configuration attached.
     pub fn create(path: &Path, config_toml: &str, began: MonoTime) -> Result<Self, WriteError> {
-        Ok(Self { writer: McapWriter::create(path, config_toml, began)? })
+        let writer = McapFile::create(path, Maker::Capture, config_toml, began)?;
+        Ok(Self { path: path.to_owned(), writer })
     }
 
     /// Writes an event; ticks are not recorded.
@@ -168,6 +168,6 @@ impl CaptureWriter {
 
     /// Ends the capture.
     pub fn finish(self) -> Result<(), WriteError> {
-        self.writer.finish().map(drop)
+        self.writer.close(&self.path)
     }
 }

@@ -109,6 +109,8 @@ pub enum NoteKind {
     Configured,
     /// A receiver refused or ignored its configuration.
     NotConfigured,
+    /// Something to know of the autopilot.
+    Autopilot,
     /// A recorded source has played to its end.
     PlayedOut,
 }

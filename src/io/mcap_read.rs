@@ -16,6 +16,7 @@ use mcap::records::{Record as McapRecord, op};
 
 use super::mcap_definitions::{ChannelInfo, Definitions};
 use super::mcap_record::{RECORD_HEAD, longest, parse, sized_u32, split, unpack_chunk};
+use super::regular;
 use super::segment_files::segment_files;
 use windhover_base::time::MonoTime;
 
@@ -105,6 +106,11 @@ pub(super) fn warn(warnings: &mut Vec<String>, text: String) {
     }
 }
 
+/// A segment that is none.
+fn skipped(error: &ReadError) -> String {
+    format!("{error}; it is skipped")
+}
+
 /// What reading a record gave.
 enum Step {
     Message(RawMessage),
@@ -121,10 +127,21 @@ impl McapReader {
         let bytes_total = files.iter().filter_map(|f| f.metadata().ok()).map(|m| m.len()).sum();
         let mut reader =
             Self { files: files.into(), current: None, warnings: Vec::new(), bytes_total, bytes_done: 0 };
-        // The first file must be one, so that a wrong path is an error and not an empty recording.
-        let first = reader.files.pop_front().ok_or_else(|| ReadError::Empty { path: path.to_owned() })?;
-        reader.current = Some(OpenFile::open(first)?);
-        Ok(reader)
+        // One file must be one, so that a wrong path is an error and not an empty recording.
+        let mut first_error = None;
+        while let Some(file) = reader.files.pop_front() {
+            match OpenFile::open(file) {
+                Ok(file) => {
+                    reader.current = Some(file);
+                    return Ok(reader);
+                }
+                Err(error) => {
+                    warn(&mut reader.warnings, skipped(&error));
+                    first_error.get_or_insert(error);
+                }
+            }
+        }
+        Err(first_error.unwrap_or_else(|| ReadError::Empty { path: path.to_owned() }))
     }
 
     /// What was damaged, so far. Taken: the next call tells only what is new.
@@ -144,7 +161,7 @@ impl McapReader {
                     self.current = Some(file);
                     return true;
                 }
-                Err(error) => warn(&mut self.warnings, error.to_string()),
+                Err(error) => warn(&mut self.warnings, skipped(&error)),
             }
         }
         false
@@ -177,7 +194,7 @@ impl Iterator for McapReader {
 impl OpenFile {
     fn open(path: PathBuf) -> Result<Self, ReadError> {
         let io = |source| ReadError::Io { path: path.clone(), source };
-        let file = File::open(&path).map_err(io)?;
+        let file = regular::open(&path).map_err(io)?;
         let length = file.metadata().map_err(io)?.len();
         let mut input = BufReader::with_capacity(1 << 16, file);
         let mut magic = [0; MAGIC_LENGTH as usize];
@@ -317,7 +334,7 @@ pub fn attachment(path: &Path, name: &str) -> Result<Option<Vec<u8>>, ReadError>
     for segment in segments_of(path)? {
         let mut file = match OpenFile::open(segment) {
             Ok(file) => file,
-            Err(ReadError::NotMcap { .. }) if path.is_dir() => continue,
+            Err(_) if path.is_dir() => continue,
             Err(error) => return Err(error),
         };
         if let Some(found) = file.find_attachment(name) {

@@ -1,7 +1,6 @@
 //! Writing MCAP files: channels and schemas registered as they come, one chunk a second.
 
 use std::collections::{BTreeMap, HashMap};
-use std::fs::File;
 use std::io::{BufWriter, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -10,6 +9,7 @@ use mcap::records::MessageHeader;
 use mcap::{Attachment, Compression, WriteOptions};
 
 use super::mcap_definitions::{ChannelInfo, SchemaInfo};
+use super::new_file::NewFile;
 use super::records::Record;
 use windhover_base::time::{MonoTime, Span};
 
@@ -32,6 +32,32 @@ pub enum WriteError {
     Mcap(#[from] mcap::McapError),
 }
 
+/// Which of the program's commands makes a recording.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Maker {
+    /// One that makes captures: `simulate`, `import`.
+    Capture,
+    /// `replay`.
+    Replay,
+}
+
+impl Maker {
+    const fn library(self) -> &'static str {
+        match self {
+            Self::Capture => concat!("windhover ", env!("CARGO_PKG_VERSION"), " capture"),
+            Self::Replay => concat!("windhover ", env!("CARGO_PKG_VERSION"), " replay"),
+        }
+    }
+
+    /// What is found near the begin of a file that it made, by whatever version.
+    pub const fn marks(self) -> [&'static str; 2] {
+        match self {
+            Self::Capture => ["windhover ", " capture"],
+            Self::Replay => ["windhover ", " replay"],
+        }
+    }
+}
+
 /// Writes one MCAP file of [`Record`]s.
 pub struct McapWriter<W: Write + Seek> {
     writer: mcap::Writer<W>,
@@ -40,23 +66,34 @@ pub struct McapWriter<W: Write + Seek> {
     chunk_began: Option<MonoTime>,
 }
 
-impl McapWriter<BufWriter<File>> {
-    /// Creates a file with its configuration attached.
-    pub fn create(path: &Path, config_toml: &str, began: MonoTime) -> Result<Self, WriteError> {
-        let file = File::create(path).map_err(|source| WriteError::Io { path: path.to_owned(), source })?;
-        Self::new(BufWriter::with_capacity(1 << 16, file), config_toml, began)
+/// A recording in the making, which comes to its place when it is whole.
+pub type McapFile = McapWriter<BufWriter<NewFile>>;
+
+impl McapFile {
+    /// Begins a file with its configuration attached.
+    pub fn create(path: &Path, maker: Maker, config_toml: &str, began: MonoTime) -> Result<Self, WriteError> {
+        let failed = |source| WriteError::Io { path: path.to_owned(), source };
+        let file = NewFile::create(path).map_err(failed)?;
+        Self::new(BufWriter::with_capacity(1 << 16, file), maker, config_toml, began)
+    }
+
+    /// Ends the recording and puts it in its place, which is named in errors.
+    pub fn close(self, path: &Path) -> Result<(), WriteError> {
+        let failed = |source| WriteError::Io { path: path.to_owned(), source };
+        let file = self.finish()?.into_inner().map_err(|error| failed(error.into_error()))?;
+        file.finish().map_err(failed)
     }
 }
 
 impl<W: Write + Seek> McapWriter<W> {
     /// Begins a recording on any seekable output. `config_toml` becomes the attachment
     /// [`CONFIG_ATTACHMENT`] unless it is empty; versions go into the metadata record `windhover`.
-    pub fn new(output: W, config_toml: &str, began: MonoTime) -> Result<Self, WriteError> {
+    pub fn new(output: W, maker: Maker, config_toml: &str, began: MonoTime) -> Result<Self, WriteError> {
         let options = WriteOptions::new()
             .compression(Some(Compression::Lz4))
             .compression_threads(0)
             .chunk_size(None)
-            .library(concat!("windhover ", env!("CARGO_PKG_VERSION")));
+            .library(maker.library());
         let mut writer = options.create(output)?;
         let t = unsigned(began);
         if !config_toml.is_empty() {

@@ -1,5 +1,6 @@
 //! The edge: clock, serial, camera, captures, store, link.
 
+pub mod autopilot;
 pub mod camera;
 pub mod capture;
 pub mod clock;
@@ -10,6 +11,7 @@ pub mod mcap_definitions;
 pub mod mcap_read;
 pub mod mcap_record;
 pub mod mcap_write;
+pub mod new_file;
 pub mod notify;
 pub mod power;
 pub mod power_line;
@@ -17,6 +19,7 @@ pub mod pps;
 pub mod process;
 pub mod proto;
 pub mod records;
+pub mod regular;
 pub mod segment_files;
 pub mod serial;
 pub mod store;

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::text;
+
 /// What the kernel said of power and heat. `None` where it offers nothing.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct PowerReading {
@@ -41,7 +43,7 @@ impl PowerReader {
         if let Some(file) = &self.voltage_file {
             reading.voltage_v = voltage(file);
         }
-        reading.line_set = self.going_file.as_deref().and_then(text).is_some_and(|value| value != "0");
+        reading.line_set = self.going_file.as_deref().and_then(words).is_some_and(|value| value != "0");
         reading
     }
 
@@ -60,13 +62,13 @@ impl PowerReader {
 
     fn read_supplies(&self, reading: &mut PowerReading) {
         for supply in children(&self.root.join("class/power_supply")) {
-            let kind = text(&supply.join("type")).unwrap_or_default();
+            let kind = words(&supply.join("type")).unwrap_or_default();
             if kind == "Mains" || kind == "USB" {
                 reading.mains_off |= number(&supply.join("online")) == Some(0.0);
                 continue;
             }
             if kind == "UPS" {
-                reading.mains_off |= text(&supply.join("status")).as_deref() == Some("Discharging");
+                reading.mains_off |= words(&supply.join("status")).as_deref() == Some("Discharging");
             }
             if number(&supply.join("present")) == Some(0.0) {
                 continue;
@@ -102,12 +104,12 @@ fn file_name(file: &Path) -> &str {
     file.file_name().and_then(|name| name.to_str()).unwrap_or_default()
 }
 
-fn text(file: &Path) -> Option<String> {
+fn words(file: &Path) -> Option<String> {
     std::fs::read_to_string(file).ok().map(|text| text.trim().to_owned())
 }
 
 fn number(file: &Path) -> Option<f64> {
-    text(file)?.parse().ok().filter(|figure: &f64| figure.is_finite())
+    text::number(&words(file)?).ok()
 }
 
 /// Decides when power is going: a voltage under its threshold for a while, mains off where asked, or at

@@ -1,9 +1,10 @@
 //! Files of a recording: itself, or the segments of a flight's directory, each of them once.
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
+
+use super::regular;
 
 /// Bytes that are compared at a time.
 const BLOCK: u64 = 1 << 16;
@@ -43,7 +44,7 @@ pub fn segment_files(path: &Path) -> io::Result<Vec<PathBuf>> {
 /// Whether two files hold the same bytes. Segments differ in their first blocks, where their numbers stand, so this
 /// reads more of copies only. Two files that hold nothing are two.
 fn is_same(one: &Path, other: &Path) -> io::Result<bool> {
-    let (mut one, mut other) = (File::open(one)?, File::open(other)?);
+    let (mut one, mut other) = (regular::open(one)?, regular::open(other)?);
     if one.metadata()?.len() == 0 {
         return Ok(false);
     }

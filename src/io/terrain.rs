@@ -1,12 +1,12 @@
 //! Terrain tiles from files: SRTM `.hgt` and GeoTIFF.
 
-use std::fs::File;
-use std::io::{BufReader, Read as _};
+use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 use tiff::decoder::{Decoder, DecodingResult, Limits};
 use tiff::tags::Tag;
 
+use super::regular;
 use windhover_base::geo::{TerrainError, Tile};
 
 /// GDAL's tag for the value of missing heights, as text (GDAL, GeoTIFF driver).
@@ -16,6 +16,8 @@ const HIGHEST_M: f64 = 12_000.0;
 
 /// Bytes of the largest `.hgt` file, 3601 heights square.
 const LARGEST_HGT: u64 = 3601 * 3601 * 2;
+/// Bytes of the largest GeoTIFF that is looked at: 1″ floats over two degrees square, not compressed.
+const LARGEST_TIFF: u64 = 1 << 28;
 
 /// Why a file gave no tile.
 #[derive(Debug, thiserror::Error)]
@@ -60,15 +62,20 @@ pub fn load(path: &Path) -> Result<Tile, TileError> {
     if !is_hgt {
         return geotiff(path);
     }
-    let mut bytes = Vec::new();
-    let read = File::open(path).and_then(|file| file.take(LARGEST_HGT + 1).read_to_end(&mut bytes));
-    read.map_err(|source| TileError::Io { path: path.to_owned(), source })?;
+    let bytes =
+        regular::read(path, LARGEST_HGT).map_err(|source| TileError::Io { path: path.to_owned(), source })?;
     let stem = path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
     Tile::from_hgt(&stem, &bytes).map_err(|source| TileError::Tile { path: path.to_owned(), source })
 }
 
 fn geotiff(path: &Path) -> Result<Tile, TileError> {
-    let file = File::open(path).map_err(|source| TileError::Io { path: path.to_owned(), source })?;
+    let io = |source| TileError::Io { path: path.to_owned(), source };
+    let file = regular::open(path).map_err(io)?;
+    if file.metadata().map_err(io)?.len() > LARGEST_TIFF {
+        return Err(io(std::io::Error::other(
+            "it is longer than 256 MB; cut out the place with gdalwarp -te",
+        )));
+    }
     let wrong = |source| TileError::Tiff { path: path.to_owned(), source };
     let unfit = |reason| TileError::Unfit { path: path.to_owned(), reason };
     let mut decoder = Decoder::new(BufReader::new(file)).map_err(wrong)?.with_limits(Limits::default());
@@ -114,6 +121,8 @@ fn heights(image: DecodingResult, missing: Option<f64>) -> Option<Vec<f32>> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::File;
+
     use super::*;
 
     #[test]

@@ -306,6 +306,13 @@ impl Pipeline {
             match reading {
                 SensorReading::Gnss(epoch) => self.gnss(&epoch, t, out),
                 SensorReading::Attitude(sample) => self.attitude(&sample, out),
+                SensorReading::SecondAttitude(sample) => {
+                    self.tell_joint(|joint, out| joint.second_attitude(&sample, out));
+                }
+                SensorReading::Inertial(sample) => {
+                    self.tell_joint(|joint, out| joint.inertial(&sample, out));
+                }
+                SensorReading::Autopilot(_) => out.push(Output::Reading(reading)),
             }
         }
         self.take_estimated(t, out);
@@ -333,6 +340,12 @@ impl Pipeline {
             estimators.paper.attitude(sample, &mut self.papered);
         } else if !self.held.is_empty() && self.held.len() < HELD_MAX {
             self.held.push(SensorReading::Attitude(*sample));
+        }
+    }
+
+    fn tell_joint(&mut self, take: impl FnOnce(&mut Estimator, &mut Vec<EstimatorOutput>)) {
+        if let Some(estimators) = &mut self.estimators {
+            take(&mut estimators.joint, &mut self.estimated);
         }
     }
 
@@ -390,6 +403,7 @@ impl Pipeline {
                     joint.attitude(&sample, &mut self.estimated);
                     paper.attitude(&sample, &mut self.papered);
                 }
+                _ => {}
             }
         }
         self.estimators = Some(Estimators { joint, paper, site: settled.warm });

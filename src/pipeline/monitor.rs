@@ -34,6 +34,8 @@ pub(super) struct Monitor {
     sources: PerSource<SourceCount>,
     fix: FixKind,
     sats: Option<u32>,
+    hdop: Option<f64>,
+    geoid_m: Option<f64>,
     clock_sigma: Option<Span>,
     utc_minus_host: Option<Span>,
     targets: Vec<TargetHealth>,
@@ -60,6 +62,8 @@ impl Monitor {
             sources: PerSource::default(),
             fix: FixKind::None,
             sats: None,
+            hdop: None,
+            geoid_m: None,
             clock_sigma: None,
             utc_minus_host: None,
             targets: (0..names.len()).map(|i| TargetHealth { frames_seen: 0, last: lost(i) }).collect(),
@@ -109,7 +113,7 @@ impl Monitor {
                 count.silent = true;
                 if source == Source::Gps {
                     // What a receiver said before it fell silent is no fix of now.
-                    (self.fix, self.sats) = (FixKind::None, None);
+                    (self.fix, self.sats, self.hdop) = (FixKind::None, None, None);
                 }
                 let detail = format!("nothing to use from the {} for {:.1} s", source.name(), quiet.s());
                 out.push(notice(t, NoticeKind::SourceSilent, Some(source), detail));
@@ -136,6 +140,8 @@ impl Monitor {
             sources: self.watched.iter().map(&mut figures).collect(),
             fix: self.fix,
             sats: self.sats,
+            hdop: self.hdop,
+            geoid_m: self.geoid_m,
             clock_sigma: self.clock_sigma,
             utc_minus_host: self.utc_minus_host,
             targets: self.targets.clone(),
@@ -213,6 +219,8 @@ impl Monitor {
             out.push(notice(t, NoticeKind::FixLost, Some(Source::Gps), detail));
         }
         (self.fix, self.sats, self.clock_sigma) = (fix, sats, clock_sigma);
+        self.hdop = epoch.value.hdop;
+        self.geoid_m = epoch.value.geoid_m.or(self.geoid_m);
     }
 
     /// Why the receiver's pulses are not used, if they are not.

@@ -1,6 +1,7 @@
 //! Pixels out of the bytes of a frame, as cameras and captures give it.
 
 mod huffman;
+mod mosaic;
 mod scan;
 #[cfg(test)]
 mod scan_tests;
@@ -176,6 +177,8 @@ fn raw_layout(encoding: FrameEncoding, width: usize, height: usize) -> (usize, u
         FrameEncoding::Yuyv | FrameEncoding::Uyvy => (2 * width, height),
         FrameEncoding::Nv12 => (width, height + height.div_ceil(2)),
         FrameEncoding::Rgb24 | FrameEncoding::Bgr24 => (3 * width, height),
+        FrameEncoding::Y10 | FrameEncoding::Y12 | FrameEncoding::Y16 => (2 * width, height),
+        FrameEncoding::Y10Packed => (width.div_ceil(4) * 5, height),
         _ => (width, height),
     }
 }
@@ -197,12 +200,17 @@ fn raw(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault>
     if stride < row_bytes || frame.data.len() < stride.saturating_mul(rows - 1) + row_bytes {
         return Err(wrong_size);
     }
+    if let FrameEncoding::Bayer(order) = encoding {
+        let rows = mosaic::Rows { data: &frame.data, stride, width, height };
+        let rgb = want_rgb.then(|| rows.colours(order));
+        return Ok(DecodedFrame { gray: rows.grey(), rgb, missing: Vec::new() });
+    }
     let row = |v: usize| &frame.data[v * stride..v * stride + row_bytes];
     let mut gray = GrayImage::new(width, height);
     for (v, out) in gray.data.chunks_exact_mut(width).enumerate() {
         luma_row(encoding, row(v), out);
     }
-    let rgb = (want_rgb && encoding != FrameEncoding::Grey).then(|| {
+    let rgb = (want_rgb && has_colour(encoding)).then(|| {
         let mut data = Vec::with_capacity(3 * width * height);
         for v in 0..height {
             let chroma = if encoding == FrameEncoding::Nv12 { row(height + v / 2) } else { &[] };
@@ -223,8 +231,34 @@ fn luma_row(encoding: FrameEncoding, row: &[u8], out: &mut [u8]) {
         FrameEncoding::Bgr24 => {
             out.iter_mut().zip(row.chunks_exact(3)).for_each(|(o, p)| *o = luma(p[2], p[1], p[0]));
         }
+        FrameEncoding::Y10 => upper_eight(row, out, 2),
+        FrameEncoding::Y12 => upper_eight(row, out, 4),
+        FrameEncoding::Y16 => upper_eight(row, out, 8),
+        FrameEncoding::Y10Packed => {
+            let pixels = row.chunks_exact(5).flat_map(|group| &group[..4]);
+            out.iter_mut().zip(pixels).for_each(|(o, y)| *o = *y);
+        }
         _ => out.copy_from_slice(&row[..out.len()]),
     }
+}
+
+/// The upper eight of a pixel's bits in two bytes; bits above them saturate.
+fn upper_eight(row: &[u8], out: &mut [u8], below: u32) {
+    for (o, pair) in out.iter_mut().zip(row.chunks_exact(2)) {
+        *o = (u16::from_le_bytes([pair[0], pair[1]]) >> below).min(255) as u8;
+    }
+}
+
+/// Whether a format that is not a mosaic has colours.
+const fn has_colour(encoding: FrameEncoding) -> bool {
+    matches!(
+        encoding,
+        FrameEncoding::Yuyv
+            | FrameEncoding::Uyvy
+            | FrameEncoding::Nv12
+            | FrameEncoding::Rgb24
+            | FrameEncoding::Bgr24
+    )
 }
 
 /// Luma of ITU-R BT.601 in 1/256: 0.299 R + 0.587 G + 0.114 B, rounded.
@@ -269,6 +303,14 @@ mod tests {
         assert_eq!(decode(&uyvy, true).unwrap().rgb.unwrap().data, [10, 10, 10, 20, 20, 20]);
         let nv12 = payload(FrameEncoding::Nv12, 2, 2, 0, vec![1, 2, 3, 4, 128, 128]);
         assert_eq!(decode(&nv12, false).unwrap().gray.data, [1, 2, 3, 4]);
+        let y10 = payload(FrameEncoding::Y10, 2, 1, 6, vec![0xff, 0x03, 0x04, 0x02, 9, 9]);
+        assert_eq!(decode(&y10, true).unwrap().gray.data, [255, 129]);
+        let y12 = payload(FrameEncoding::Y12, 2, 1, 0, vec![0xff, 0x0f, 0x10, 0x08]);
+        assert_eq!(decode(&y12, false).unwrap().gray.data, [255, 129]);
+        let y16 = payload(FrameEncoding::Y16, 2, 1, 0, vec![0xff, 0x7f, 0, 3]);
+        assert_eq!(decode(&y16, false).unwrap().gray.data, [127, 3]);
+        let y10p = payload(FrameEncoding::Y10Packed, 6, 1, 0, vec![1, 2, 3, 4, 0xff, 5, 6, 7, 8, 0xff]);
+        assert_eq!(decode(&y10p, false).unwrap().gray.data, [1, 2, 3, 4, 5, 6]);
         let padded = payload(FrameEncoding::Grey, 2, 2, 3, vec![1, 2, 99, 3, 4]);
         assert_eq!(decode(&padded, false).unwrap().gray.data, [1, 2, 3, 4]);
     }

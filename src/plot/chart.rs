@@ -2,10 +2,11 @@
 
 use std::fmt::Write as _;
 
+use super::Scale;
 use super::ink::Ink;
 use super::mark::{Mark, draw_mark};
 use super::scale::range;
-use super::{Scale, escape};
+use crate::text::xml;
 
 /// A chart under construction.
 #[derive(Clone, PartialEq, Debug)]
@@ -101,10 +102,10 @@ impl Chart {
             "<svg xmlns=\"http://www.w3.org/2000/svg\" class=\"chart\" viewBox=\"0 0 {} {}\" role=\"img\" aria-label=\"{}\">",
             self.size[0],
             self.size[1],
-            escape(&self.title)
+            xml(&self.title)
         );
         if !self.title.is_empty() {
-            let _ = write!(out, "<text class=\"title\" x=\"{LEFT}\" y=\"18\">{}</text>", escape(&self.title));
+            let _ = write!(out, "<text class=\"title\" x=\"{LEFT}\" y=\"18\">{}</text>", xml(&self.title));
         }
         self.draw_legend(&mut out, &rows);
         self.draw_axes(&mut out, &x, &y);
@@ -160,7 +161,7 @@ impl Chart {
                     ink.class(),
                     y - 4.0,
                     x + 23.0,
-                    escape(name)
+                    xml(name)
                 );
             }
         }
@@ -219,9 +220,9 @@ impl Chart {
             x.to,
             (x.from + x.to) / 2.0,
             bottom + 31.0,
-            escape(&self.x_label),
+            xml(&self.x_label),
             (top + bottom) / 2.0,
-            escape(&self.y_label)
+            xml(&self.y_label)
         );
     }
 }

@@ -2,8 +2,9 @@
 
 use std::fmt::Write as _;
 
+use super::Scale;
 use super::ink::Ink;
-use super::{Scale, escape};
+use crate::text::xml;
 
 /// Something drawn in data coordinates. A not-a-number point breaks a line or band.
 #[derive(Clone, PartialEq, Debug)]
@@ -96,7 +97,7 @@ pub(super) fn draw_mark(out: &mut String, mark: &Mark, ink: Ink, x: &Scale, y: &
                 "<text class=\"{class}\" style=\"fill:currentColor\" x=\"{:.1}\" y=\"{:.1}\">{}</text>",
                 x.at(at[0]),
                 y.at(at[1]),
-                escape(words)
+                xml(words)
             );
         }
     }

@@ -17,4 +17,4 @@ pub use geometry::{ellipse, thin};
 pub use ink::Ink;
 pub use mark::Mark;
 pub use scale::Scale;
-pub use style::{CHART_CSS, PALETTE_CSS, escape, standalone};
+pub use style::{CHART_CSS, MADE_BY, PALETTE_CSS, standalone};

@@ -25,22 +25,8 @@ pub const CHART_CSS: &str = "\
 .chart .violet{color:var(--violet)}.chart .red{color:var(--red)}.chart .grey{color:var(--grey)}\
 .chart .black{color:var(--text)}";
 
-/// Text made safe inside SVG and HTML, in elements and in quoted attributes alike.
-pub fn escape(text: &str) -> String {
-    let mut out = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            '&' => out.push_str("&amp;"),
-            '<' => out.push_str("&lt;"),
-            '>' => out.push_str("&gt;"),
-            '"' => out.push_str("&quot;"),
-            '\'' => out.push_str("&#39;"),
-            c if c.is_control() && c != '\n' && c != '\t' => {}
-            c => out.push(c),
-        }
-    }
-    out
-}
+/// What every file of ours with a drawing, a map or a page in it says near its begin.
+pub const MADE_BY: &str = "made by windhover";
 
 /// A chart as an SVG file: with its style sheet and the ground painted.
 pub fn standalone(chart: &str) -> String {
@@ -51,17 +37,12 @@ pub fn standalone(chart: &str) -> String {
         Some(end) => format!("{}{style}{}", &chart[..=end], &chart[end + 1..]),
         None => chart.to_owned(),
     };
-    format!("<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n{body}\n")
+    format!("<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<!-- {MADE_BY} -->\n{body}\n")
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn markup_in_names_stays_text() {
-        assert_eq!(escape("a<b & \"c\"\u{7}"), "a&lt;b &amp; &quot;c&quot;");
-    }
 
     #[test]
     fn a_file_has_its_style_inside_the_root() {

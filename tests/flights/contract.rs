@@ -34,20 +34,20 @@ const COMMANDS: [&[&str]; 26] = [
     &["check-config"],
 ];
 
-fn windhover(args: &[&str], dir: &Path) -> Output {
+pub fn windhover(args: &[&str], dir: &Path) -> Output {
     Command::new(env!("CARGO_BIN_EXE_windhover")).args(args).current_dir(dir).output().expect("it starts")
 }
 
-fn said(run: &Output) -> String {
+pub fn said(run: &Output) -> String {
     String::from_utf8_lossy(&run.stderr).into_owned()
 }
 
-fn capture() -> String {
+pub fn capture() -> String {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/captures/follow.mcap");
     path.to_str().expect("a plain path").to_owned()
 }
 
-fn scratch() -> tempfile::TempDir {
+pub fn scratch() -> tempfile::TempDir {
     tempfile::tempdir().expect("a scratch directory")
 }
 

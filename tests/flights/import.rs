@@ -52,7 +52,7 @@ fn logs_and_a_folder_of_images_merge_in_order() {
 
     assert_eq!((imported.gps_lines, imported.compass_lines, imported.frames), (2, 1, 2));
     assert_eq!(imported.video, Some(VideoSource::Folder));
-    assert!(imported.warnings[0].contains("1 lines without a time left out, line 2 first"));
+    assert!(imported.warnings[0].contains("1 line without a time left out, line 2 first"));
     let times: Vec<i64> = got.iter().map(|(ms, _)| *ms).collect();
     assert_eq!(times, [0, 100, 150, 200, 250]);
     assert_eq!(got[0].1, "gps $GPRMC,a*00");
@@ -97,7 +97,7 @@ fn tables_of_samples_merge_with_the_rest() {
     let (imported, got) = run(folder.path(), sources).unwrap();
     assert_eq!((imported.imu_samples, imported.attitude_samples), (2, 1));
     assert!(
-        imported.warnings[0].contains("imu.csv: 1 rows") && imported.warnings[0].contains("line 4 first")
+        imported.warnings[0].contains("imu.csv: 1 row ") && imported.warnings[0].contains("line 4 first")
     );
     let times: Vec<i64> = got.iter().map(|(ms, _)| *ms).collect();
     assert_eq!(times, [0, 20, 30, 40]);

@@ -1,6 +1,8 @@
 //! Flights through the pipeline and the commands: simulated, imported, calibrated with, continued.
 
+mod borders;
 mod calibration_doc;
+mod closed_loop;
 mod compass_conventions;
 mod contract;
 mod import;

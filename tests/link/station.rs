@@ -70,6 +70,7 @@ fn alone(keys: &Keys, web: SocketAddr) -> GroundSettings {
         web: Some(web),
         token: None,
         tiles: None,
+        position: None,
         nmea: None,
         foxglove: None,
         #[cfg(feature = "zenoh")]

@@ -10,16 +10,24 @@ import unittest
 os.environ["MAVLINK20"] = "1"
 
 from pymavlink import mavutil  # noqa: E402
-from pymavlink.dialects.v20 import common  # noqa: E402
+from pymavlink.dialects.v20 import development as common  # noqa: E402
 
 import rig  # noqa: E402
 
 KEY = bytes(range(32))
 KINDS = {"HEARTBEAT", "GLOBAL_POSITION_INT", "ATTITUDE", "FOLLOW_TARGET"}
+MORE = {
+    "LANDING_TARGET",
+    "TARGET_RELATIVE",
+    "TARGET_ABSOLUTE",
+    "CAMERA_TRACKING_GEO_STATUS",
+    "CAMERA_TRACKING_IMAGE_STATUS",
+    "ODOMETRY",
+}
 
 
 def receiver(port, key=None):
-    link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=255, dialect="common")
+    link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=255, dialect="development")
     link.robust_parsing = True
     if key is not None:
         # The simulated flight's time, not today's, is what signatures carry.
@@ -77,6 +85,40 @@ class Mavlink(unittest.TestCase):
         self.assertTrue(follow.est_capabilities & 0b11 == 0b11, "position and velocity")
         self.assertLess(math.hypot(position.vx, position.vy), 2_000, "no faster than 20 m/s")
         self.assertTrue(-math.pi <= attitude.yaw <= math.pi)
+
+    def test_every_message_in_the_units_of_its_definition(self):
+        port = rig.free_port()
+        link = receiver(port)
+        self.addCleanup(link.close)
+        names = ", ".join(f'"{name}"' for name in sorted(MORE | {"FOLLOW_TARGET", "GLOBAL_POSITION_INT"}))
+        self.fly(port, f"messages = [{names}]\n")
+        latest, bad = receive(link, MORE | {"HEARTBEAT", "FOLLOW_TARGET"}, 90)
+        self.assertTrue(MORE <= set(latest) and bad == 0, (set(latest), bad))
+        landing, relative, absolute = (latest[k] for k in ("LANDING_TARGET", "TARGET_RELATIVE", "TARGET_ABSOLUTE"))
+        geo, image, odometry = (
+            latest[k] for k in ("CAMERA_TRACKING_GEO_STATUS", "CAMERA_TRACKING_IMAGE_STATUS", "ODOMETRY")
+        )
+        for message in (landing, relative, absolute, geo, image):
+            self.assertEqual((message.get_srcSystem(), message.get_srcComponent()), (1, 100))
+        self.assertEqual((odometry.get_srcSystem(), odometry.get_srcComponent()), (77, 1))
+        # The helicopter is above the vehicle: below it in the body's axes, and in north, east, down.
+        self.assertEqual((landing.frame, landing.position_valid), (common.MAV_FRAME_BODY_FRD, 1))
+        self.assertTrue(5 < landing.z < 40 and 5 < relative.z < 40, (landing.z, relative.z))
+        for angle, across in ((landing.angle_x, landing.y), (-landing.angle_y, landing.x)):
+            self.assertAlmostEqual(math.tan(angle), across / landing.z, places=4)
+        self.assertAlmostEqual(landing.distance, math.hypot(landing.x, landing.y, landing.z), places=3)
+        self.assertEqual(relative.frame, common.TARGET_OBS_FRAME_LOCAL_OFFSET_NED)
+        self.assertTrue(0 < relative.pos_std[0] < 2 and 0 < relative.yaw_std < 0.5)
+        for q in (landing.q, relative.q_target, absolute.q_target, odometry.q):
+            self.assertAlmostEqual(sum(x * x for x in q), 1, places=4)
+        self.assertEqual(absolute.sensor_capabilities, 31)
+        self.assertTrue(abs(absolute.vel[1]) <= abs(absolute.vel[0]) + 0.1, "it drives along its own axis")
+        self.assertTrue(0 <= image.rec_top_x <= image.rec_bottom_x <= 1)
+        self.assertTrue(0 <= image.rec_top_y <= image.rec_bottom_y <= 1)
+        self.assertEqual(geo.tracking_status, common.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE)
+        self.assertAlmostEqual(geo.alt, 33.0, places=2)
+        self.assertEqual((odometry.frame_id, odometry.child_frame_id), (common.MAV_FRAME_LOCAL_NED, common.MAV_FRAME_BODY_FRD))
+        self.assertTrue(odometry.pose_covariance[0] > 0 and odometry.pose_covariance[6] > 0)
 
     def test_signed_messages_are_believed_with_the_key_only(self):
         with tempfile.TemporaryDirectory() as folder:

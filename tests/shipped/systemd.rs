@@ -32,7 +32,7 @@ fn the_unit_watches_and_restarts() {
         "RestartPreventExitStatus=78",
         "ReadWritePaths=-/var/lib/windhover",
         "DeviceAllow=char-video4linux rw",
-        "ExecReload=",
+        "ExecReload=/bin/sh -c \"kill -HUP $MAINPID\"",
         "ProtectSystem=strict",
     ] {
         assert!(unit.lines().any(|line| line.starts_with(setting)), "{setting}");

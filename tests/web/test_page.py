@@ -68,13 +68,19 @@ class Page(unittest.TestCase):
         self.becomes("coordinates", lambda text: text not in ("", before))
         more = lambda: browser.ask("fleet.get('alpha').targets.get('ugv').trail.length") > trail + 50  # noqa: E731
         rig.until(more, 60, lambda: "the trail does not grow")
-        for width, height in (1280, 720), (1280, 900), (1920, 1080):
+        self.becomes("flight", lambda text: "recording 0:" in text)
+        self.becomes("to-vehicle", lambda text: " m " in text and "°" in text)
+        self.becomes("target-age", lambda text: text.endswith(" s"))
+        for width, height in (1280, 720), (1280, 900), (1440, 900), (1920, 1080):
             browser.size(width, height)
             rig.until(lambda: browser.ask("innerHeight") == height, 10, lambda: "the window keeps its size")
             self.assertEqual(browser.ask(CLIPPED), "", f"cards cut off at {width}x{height}")
+            self.assertGreater(browser.ask("document.getElementById('camera').clientHeight") / height, 0.55, "the picture is large")
+            size = browser.ask("parseFloat(getComputedStyle(document.getElementById('target-status')).fontSize)")
+            self.assertGreaterEqual(size, 24, "the status is read in the sun")
             browser.ask("draw.last = 0, dirty = true")
             rig.until(lambda: browser.ask("!dirty"), 10, lambda: "it does not draw")
-            browser.photograph(PICTURES / f"desktop-{height}.png")
+            browser.photograph(PICTURES / f"desktop-{width}x{height}.png")
         browser.size(390, 844, phone=True)
         rig.until(lambda: browser.ask("innerWidth") == 390, 10, lambda: "no phone")
         self.assertLessEqual(browser.ask("document.documentElement.scrollWidth"), 390, "nothing sticks out")
@@ -86,10 +92,13 @@ class Page(unittest.TestCase):
         self.relay.cut = True
         self.becomes("target-status", lambda text: text == "no news", 20)
         self.becomes("map-note", lambda text: "silent" in text or "not connected" in text, 20)
+        rig.until(lambda: browser.ask("alarm.state"), 20, lambda: "nothing calls the operator")
+        rig.until(lambda: "⚠" in browser.ask("document.title"), 5, lambda: "the title does not flash")
         browser.photograph(PICTURES / "cut.png")
         # When: it is back, then so are the estimates, and what was missed fills in.
         self.relay.cut = False
         self.becomes("target-status", lambda text: text in ("tracking", "coasting"), 30)
+        rig.until(lambda: browser.ask("document.title") == "windhover", 5, lambda: "the title is as it was")
         self.becomes("link", lambda text: "nothing up to 2 s ago" in text, 60)
         gaps = lambda: browser.ask("fleet.get('alpha').targets.get('ugv').trail.filter(p => p.gap).length")  # noqa: E731
         rig.until(lambda: gaps() == 0, 60, lambda: f"{gaps()} gaps in the trail")

@@ -6,11 +6,12 @@ mod calendar;
 mod compass;
 mod counts;
 mod epoch;
-mod lines;
 mod garmin;
 mod gnss;
 #[cfg(test)]
 mod gnss_tests;
+mod lines;
+mod mavlink;
 mod report;
 mod sentence;
 mod standard;
@@ -21,5 +22,9 @@ mod ubx_tests;
 pub use compass::{CompassDecoder, CompassReading, HeardAttitude};
 pub use counts::{DecodeCounts, Refusal};
 pub use gnss::{GnssDecoder, HeardEpoch};
+pub use mavlink::{
+    AutopilotDecoder, AutopilotSaid, HeardAutopilot, MavlinkFrame, MavlinkFrames, asked as timesync_asked,
+    is_autopilot, question as timesync_question,
+};
 pub use sentence::{Sentence, framed};
 pub use ubx::{holds_ubx_packet, ubx_framed};

@@ -5,6 +5,8 @@ use windhover_base::time::MonoTime;
 
 /// Longest line kept. NMEA allows 82 characters, real receivers send up to 120.
 const LINE_MAX: usize = 200;
+/// Longest line that begins with `#`: NovAtel's long messages, of which those that are read have up to 250.
+const LONG_MAX: usize = 320;
 
 /// A complete line and where in time it lies.
 #[derive(Clone, Copy, Debug)]
@@ -35,6 +37,8 @@ pub(super) struct LineSpan {
 pub(super) enum LineStart {
     /// With `$`; anything before it is noise, and a `$` inside a line begins a new one.
     Dollar,
+    /// The same, or at the end of another line with `#` (NovAtel's and Unicore's long messages).
+    DollarOrHash,
     /// With whatever follows the end of the line before.
     Any,
 }
@@ -88,7 +92,7 @@ impl LineFramer {
                 }
                 b'$' => {
                     if self.state == State::Inside
-                        && (self.start == LineStart::Dollar || !self.buffer.is_empty())
+                        && (self.start != LineStart::Any || !self.buffer.is_empty())
                     {
                         counts.refuse(Refusal::CutShort);
                     }
@@ -106,11 +110,18 @@ impl LineFramer {
         self.state = State::Inside;
     }
 
+    fn longest(&self) -> usize {
+        if self.buffer.first() == Some(&b'#') { LONG_MAX } else { LINE_MAX }
+    }
+
     fn take(&mut self, byte: u8, t_recv: MonoTime, left: usize, counts: &mut DecodeCounts) {
         match self.state {
             State::Between if self.start == LineStart::Any => self.begin(byte, t_recv, left),
+            State::Between if byte == b'#' && self.start == LineStart::DollarOrHash => {
+                self.begin(byte, t_recv, left);
+            }
             State::Between | State::Skipping => counts.noise_bytes += 1,
-            State::Inside if self.buffer.len() >= LINE_MAX => {
+            State::Inside if self.buffer.len() >= self.longest() => {
                 counts.refuse(Refusal::TooLong);
                 self.state = State::Skipping;
                 self.buffer.clear();

@@ -62,6 +62,11 @@ impl Exposures {
         Self { stream: Stream::of(seed, Purpose::Exposure), attempt: 0, frame: 0 }
     }
 
+    /// When the next frame is exposed, but for its jitter, seconds into the flight.
+    pub(super) fn due_s(&self, world: &World) -> f64 {
+        (self.attempt as f64 + 0.5) / world.scenario().rig.camera.fps
+    }
+
     /// The next exposure that is delivered; `None` at the flight's end.
     pub(super) fn next(&mut self, world: &World) -> Option<FrameTruth> {
         let scenario = world.scenario();

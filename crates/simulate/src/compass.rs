@@ -57,6 +57,11 @@ impl Compass {
         self.bias
     }
 
+    /// When the next reading is true, seconds into the flight.
+    pub(super) fn due_s(&self, world: &World) -> f64 {
+        self.phase_s + self.count as f64 / world.scenario().compass.rate_hz
+    }
+
     /// The next reading that is sent; `None` at the flight's end.
     pub(super) fn next(&mut self, world: &World) -> Option<CompassSample> {
         let scenario = world.scenario();

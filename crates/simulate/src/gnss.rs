@@ -56,6 +56,11 @@ impl GnssReceiver {
         self.latency - Span::from_ms(scenario.rig.gps.latency_ms)
     }
 
+    /// When the next epoch is true, seconds into the flight.
+    pub(super) fn due_s(&self, world: &World) -> f64 {
+        world.seconds_at_utc(UtcTime::from_unix_ns(self.next_utc_ns))
+    }
+
     /// The next epoch that is sent; `None` at the flight's end.
     pub(super) fn next(&mut self, world: &World) -> Option<GnssSample> {
         let scenario = world.scenario();

@@ -5,10 +5,12 @@
 //! controller's command as a damped oscillator (the attitude loop), so attitude is continuous with
 //! its rate.
 
+use std::sync::{Arc, PoisonError, RwLock};
+
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use super::instant::{OwnshipTruth, STEP_S};
-use super::ode::Table;
+use super::ode::{Table, rk4};
 use super::random::{Purpose, Stream, Wander};
 use super::scenario::{Helicopter, HelicopterPath, Wind};
 use super::vehicle::VehicleMotion;
@@ -25,12 +27,19 @@ const STATES: usize = 12;
 /// The helicopter's motion over the flight.
 #[derive(Clone, Debug)]
 pub(super) struct HelicopterMotion {
-    table: Table<STATES>,
+    trace: Trace,
     air: Air,
     drag_per_s: f64,
     heading: (f64, Wander),
     /// Takes the body into the frame whose z axis is the rotor's, where they differ.
     rotor_from_body: Option<Rotation3<f64>>,
+}
+
+/// The motion as it is known: all of it, or as far as it was flown.
+#[derive(Clone, Debug)]
+enum Trace {
+    Whole(Table<STATES>),
+    Flown(Arc<RwLock<Table<STATES>>>),
 }
 
 #[derive(Clone, Debug)]
@@ -88,7 +97,7 @@ impl HelicopterMotion {
         let start = pilot.start_state(span_s.0);
         let table = Table::integrate(|t, y| pilot.derivative(t, y), start, span_s, STEP_S);
         Self {
-            table,
+            trace: Trace::Whole(table),
             air: pilot.air.clone(),
             drag_per_s: plan.drag_per_s,
             heading: (heading, wander),
@@ -96,8 +105,60 @@ impl HelicopterMotion {
         }
     }
 
+    /// A helicopter that somebody else flies: it hangs still in the wind at `start` until [`Self::fly`] moves it on.
+    pub(super) fn flown(plan: &Helicopter, wind: &Wind, start: Vector3<f64>, seed: u64) -> Self {
+        let mut stream = Stream::of(seed, Purpose::Flight);
+        let random_heading = stream.uniform(-180.0, 180.0);
+        let heading = plan.heading_deg.unwrap_or(random_heading).to_radians();
+        let wander = Wander::new(plan.heading_wander_deg.to_radians(), 5.0, 30.0, &mut stream);
+        let air = Air::new(wind, seed);
+        let thrust = -Vector3::z() * GRAVITY - air.mean * plan.drag_per_s;
+        let y = [start.x, start.y, start.z, 0.0, 0.0, 0.0, thrust.x, thrust.y, thrust.z, 0.0, 0.0, 0.0];
+        let table = Table::begin(0.0, STEP_S, y, [0.0; STATES]);
+        Self {
+            trace: Trace::Flown(Arc::new(RwLock::new(table))),
+            air,
+            drag_per_s: plan.drag_per_s,
+            heading: (heading, wander),
+            rotor_from_body: (plan.trim_deg != 0.0).then(|| trim(plan.trim_deg, seed)),
+        }
+    }
+
+    /// Moves a flown helicopter on by a step of the grid while this acceleration, north, east, down, m/s², is asked of
+    /// it; what the mean wind does to it is known to who flies it. The attitude follows as `attitude_rate` has it.
+    pub(super) fn fly(&self, wanted: &Vector3<f64>, attitude_rate: f64) {
+        let Trace::Flown(table) = &self.trace else { return };
+        let mut table = table.write().unwrap_or_else(PoisonError::into_inner);
+        let (t, y) = table.last();
+        let derivative = |t: f64, y: &[f64; STATES]| -> [f64; STATES] {
+            let part = |k: usize| Vector3::new(y[k], y[k + 1], y[k + 2]);
+            let (v, thrust, rate) = (part(3), part(6), part(9));
+            let a = thrust + Vector3::z() * GRAVITY + (self.air.at(t) - v) * self.drag_per_s;
+            let command = wanted - Vector3::z() * GRAVITY + (v - self.air.mean) * self.drag_per_s;
+            let omega = attitude_rate;
+            let jerk = (command - thrust) * (omega * omega) - rate * (2.0 * DAMPING * omega);
+            [v.x, v.y, v.z, a.x, a.y, a.z, rate.x, rate.y, rate.z, jerk.x, jerk.y, jerk.z]
+        };
+        let next = rk4(derivative, t, &y, STEP_S);
+        table.push(next, derivative(t + STEP_S, &next));
+    }
+
+    /// Puts a flown helicopter a step on to this place and velocity, with what carries its weight upright: somebody
+    /// else's simulator has it there.
+    pub(super) fn put(&self, place: &Vector3<f64>, velocity: &Vector3<f64>, acceleration: &Vector3<f64>) {
+        let Trace::Flown(table) = &self.trace else { return };
+        let mut table = table.write().unwrap_or_else(PoisonError::into_inner);
+        let f = acceleration - Vector3::z() * GRAVITY;
+        let (p, v, a) = (place, velocity, acceleration);
+        let y = [p.x, p.y, p.z, v.x, v.y, v.z, f.x, f.y, f.z, 0.0, 0.0, 0.0];
+        table.push(y, [v.x, v.y, v.z, a.x, a.y, a.z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    }
+
     pub(super) fn at(&self, t_s: f64) -> OwnshipTruth {
-        let y = self.table.at(t_s);
+        let y = match &self.trace {
+            Trace::Whole(table) => table.at(t_s),
+            Trace::Flown(table) => table.read().unwrap_or_else(PoisonError::into_inner).at(t_s),
+        };
         let part = |k: usize| Vector3::new(y[k], y[k + 1], y[k + 2]);
         let (position, velocity, thrust, thrust_rate) = (part(0), part(3), part(6), part(9));
         let heading = self.heading.0 + self.heading.1.at(t_s);

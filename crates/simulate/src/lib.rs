@@ -2,12 +2,14 @@
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 mod camera;
+mod closed;
 mod company;
 mod compass;
 mod compass_wire;
 mod deviation;
 mod deviations;
 mod flight;
+mod follower;
 mod garmin;
 mod gnss;
 mod guide;
@@ -30,8 +32,11 @@ mod vehicle;
 mod world;
 
 pub use camera::{CameraPose, FrameTruth, MarkerTruth};
+pub use closed::{ClosedFlight, Lateness};
 pub use deviation::{Deviation, DeviationError, Effect};
 pub use flight::{Flight, FlightError, FrameStorage, JpegEncoder};
+pub use follower::{FollowTarget, Follower, FollowerTuning};
+
 pub use instant::{OwnshipTruth, VehicleTruth};
 pub use markers::corners_in_vehicle;
 pub use misfit::{Company, Driving, GroundMisfit, MarkerMisfit, Misfit};

@@ -42,6 +42,22 @@ impl<const N: usize> Table<N> {
         Self { start_s, step_s, nodes }
     }
 
+    /// A motion that begins at `start_s`; [`Self::push`] goes on with it.
+    pub(super) fn begin(start_s: f64, step_s: f64, y: [f64; N], derivative: [f64; N]) -> Self {
+        Self { start_s, step_s, nodes: vec![(y, derivative)] }
+    }
+
+    /// The next state on the grid, a step later.
+    pub(super) fn push(&mut self, y: [f64; N], derivative: [f64; N]) {
+        self.nodes.push((y, derivative));
+    }
+
+    /// The last state on the grid, and its time.
+    pub(super) fn last(&self) -> (f64, [f64; N]) {
+        let last = self.nodes.len() - 1;
+        (self.start_s + last as f64 * self.step_s, self.nodes[last].0)
+    }
+
     /// The state at `t_s` by cubic Hermite interpolation, held at the ends of the grid.
     pub(super) fn at(&self, t_s: f64) -> [f64; N] {
         let last = self.nodes.len() - 1;

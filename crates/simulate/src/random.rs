@@ -28,6 +28,7 @@ pub(super) enum Purpose {
     Trim = 14,
     Vibration = 15,
     Riders = 16,
+    Lateness = 17,
     Vehicle = 100,
     Rough = 200,
     Company = 300,

@@ -8,10 +8,13 @@ use super::world::World;
 /// Header of the helicopter's truth: position, velocity (NED), heading, `ned_from_body` row by row.
 pub const OWNSHIP_HEADER: &str = "frame,time_ns,n,e,d,vn,ve,vd,yaw,r00,r01,r02,r10,r11,r12,r20,r21,r22";
 
+/// Columns that every vehicle's truth has.
+pub const VEHICLE_COLUMNS: &str =
+    "frame,time_ns,north_m,east_m,heading_rad,speed_mps,yaw_rate_radps,lat_deg,lon_deg";
+
 /// Header of a vehicle's truth: its reference point, and visibility and centre of each marker.
 pub fn vehicle_header(world: &World, target: usize) -> String {
-    let mut header =
-        "frame,time_ns,north_m,east_m,heading_rad,speed_mps,yaw_rate_radps,lat_deg,lon_deg".to_owned();
+    let mut header = VEHICLE_COLUMNS.to_owned();
     for k in 0..world.scenario().rig.target[target].marker.len() {
         let _ = write!(header, ",m{k}_visible,m{k}_u,m{k}_v");
     }

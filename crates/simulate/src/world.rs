@@ -50,6 +50,34 @@ impl World {
         Self { scenario, rig, seed, frame, vehicles, companions, helicopter, vibration }
     }
 
+    /// The same with a helicopter that somebody else flies ([`Self::fly`]): it begins above the first vehicle.
+    pub fn flown(scenario: Scenario, seed: u64) -> Self {
+        let mut world = Self::new(scenario, seed);
+        let plan = &world.scenario.helicopter;
+        let below = world.vehicles.first().map(|vehicle| vehicle.at(0.0).origin()).unwrap_or_default();
+        let start = nalgebra::Vector3::new(below.x, below.y, -plan.height_m);
+        world.helicopter = HelicopterMotion::flown(plan, &world.scenario.wind, start, seed);
+        world
+    }
+
+    /// Moves a flown helicopter on by [`Self::STEP`] while this acceleration (north, east, down, m/s²) is asked of it.
+    pub fn fly(&self, wanted_ned_mps2: &nalgebra::Vector3<f64>) {
+        self.helicopter.fly(wanted_ned_mps2, self.scenario.helicopter.attitude_rate);
+    }
+
+    /// Puts a flown helicopter, a [`Self::STEP`] later, to this place, velocity and acceleration, north, east, down.
+    pub fn put(
+        &self,
+        place_m: &nalgebra::Vector3<f64>,
+        mps: &nalgebra::Vector3<f64>,
+        mps2: &nalgebra::Vector3<f64>,
+    ) {
+        self.helicopter.put(place_m, mps, mps2);
+    }
+
+    /// A step of a flown helicopter.
+    pub const STEP: Span = Span::from_ns(5_000_000);
+
     /// What it was made of.
     pub fn scenario(&self) -> &Scenario {
         &self.scenario

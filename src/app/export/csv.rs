@@ -1,17 +1,27 @@
 //! CSV: one table a kind of output, columns as the contract of formats says.
 
-use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, Write as _};
 use std::path::{Path, PathBuf};
 
 use prost::Message;
 
 use super::{ExportError, Exported, write_error};
 use crate::io::mcap_read::{McapReader, RawMessage};
+use crate::io::new_file::NewFile;
 use crate::io::proto::host_time;
 use crate::io::proto::windhover::{Datum, Detections, Marker, Ownship, TargetState};
 use crate::io::records::topic;
+use crate::text::{csv_field, csv_figure, finite};
 
+/// The tables and their columns.
+pub(super) const TABLES: [(&str, &str); 6] = [
+    ("estimates.csv", ESTIMATE_COLUMNS),
+    ("smoothed.csv", ESTIMATE_COLUMNS),
+    ("paper.csv", ESTIMATE_COLUMNS),
+    ("detections.csv", DETECTION_COLUMNS),
+    ("ownship.csv", OWNSHIP_COLUMNS),
+    ("datum.csv", DATUM_COLUMNS),
+];
 const ESTIMATE_COLUMNS: &str =
     "time_ns,frame,target,status,north_m,east_m,heading_rad,speed_mps,yaw_rate_radps,lat_deg,lon_deg";
 const COVARIANCE_COLUMNS: &str =
@@ -22,17 +32,19 @@ const DETECTION_COLUMNS: &str =
 const OWNSHIP_COLUMNS: &str =
     "time_ns,frame,lat_deg,lon_deg,height_m,north_m,east_m,down_m,vn_mps,ve_mps,vd_mps,qw,qx,qy,qz";
 
+const DATUM_COLUMNS: &str = "lat_deg,lon_deg,height_m";
+
 /// A file being written, remembered by name for errors.
 struct CsvTable {
     path: PathBuf,
-    file: BufWriter<File>,
+    file: BufWriter<NewFile>,
     rows: u64,
 }
 
 impl CsvTable {
     fn create(out: &Path, name: &str, columns: &str) -> Result<Self, ExportError> {
         let path = out.join(name);
-        let file = File::create(&path).map_err(|source| write_error(&path, source))?;
+        let file = NewFile::create(&path).map_err(|source| write_error(&path, source))?;
         let mut table = Self { path, file: BufWriter::new(file), rows: 0 };
         table.row(columns)?;
         table.rows = 0;
@@ -44,10 +56,11 @@ impl CsvTable {
         writeln!(self.file, "{line}").map_err(|source| write_error(&self.path, source))
     }
 
-    fn close(mut self, files: &mut Vec<PathBuf>) -> Result<u64, ExportError> {
-        self.file.flush().map_err(|source| write_error(&self.path, source))?;
+    fn close(self, files: &mut Vec<PathBuf>) -> Result<(), ExportError> {
+        let whole = self.file.into_inner().map_err(|error| error.into_error()).and_then(NewFile::finish);
+        whole.map_err(|source| write_error(&self.path, source))?;
         files.push(self.path);
-        Ok(self.rows)
+        Ok(())
     }
 }
 
@@ -90,22 +103,24 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
     let mut warnings = reader.take_warnings();
     warnings.extend(damaged);
     let mut exported = Exported { files: Vec::new(), warnings };
-    let mut rows = 0;
-    for table in [estimates, smoothed, paper, detections, ownship] {
-        rows += table.close(&mut exported.files)?;
-    }
+    let mut tables = vec![estimates, smoothed, paper, detections, ownship];
     if let Some(datum) = datum {
-        let mut table = CsvTable::create(out, "datum.csv", "lat_deg,lon_deg,height_m")?;
-        table.row(&format!("{:.10},{:.10},{:.4}", datum.lat_deg, datum.lon_deg, datum.height_m))?;
-        rows += table.close(&mut exported.files)?;
+        let mut table = CsvTable::create(out, "datum.csv", DATUM_COLUMNS)?;
+        table.row(&figures(&[(datum.lat_deg, 10), (datum.lon_deg, 10), (datum.height_m, 4)])[1..])?;
+        tables.push(table);
     }
-    if rows == 0 {
-        // Tables of nothing would look like a flight in which nothing was seen.
-        for file in exported.files.drain(..) {
-            std::fs::remove_file(&file).map_err(|source| write_error(&file, source))?;
-        }
+    // Tables of nothing would look like a flight in which nothing was seen.
+    if tables.iter().any(|table| table.rows > 0) {
+        tables.into_iter().try_for_each(|table| table.close(&mut exported.files))?;
     }
     Ok(exported)
+}
+
+/// `,1.25,-3.000000`: figures with their decimals, empty where one is none.
+fn figures(figures: &[(f64, usize)]) -> String {
+    let mut row = String::new();
+    figures.iter().for_each(|(figure, decimals)| csv_figure(&mut row, *figure, *decimals));
+    row
 }
 
 fn decoded<M: Message + Default>(message: &RawMessage, damaged: &mut Vec<String>) -> Option<M> {
@@ -120,18 +135,25 @@ fn decoded<M: Message + Default>(message: &RawMessage, damaged: &mut Vec<String>
 
 fn state_row(s: &TargetState, with_covariance: bool) -> String {
     let status = s.status().as_str_name().to_ascii_lowercase();
-    let mut row = format!("{},{},{},{status}", host_time(s.timestamp.as_ref()).ns(), s.frame, s.target);
+    let time = host_time(s.timestamp.as_ref()).ns();
+    let mut row = format!("{time},{},{},{status}", s.frame, csv_field(&s.target));
     if s.known {
-        row += &format!(
-            ",{:.6},{:.6},{:.8},{:.6},{:.8},{:.10},{:.10}",
-            s.north_m, s.east_m, s.heading_rad, s.speed_mps, s.yaw_rate_radps, s.lat_deg, s.lon_deg
-        );
+        row += &figures(&[
+            (s.north_m, 6),
+            (s.east_m, 6),
+            (s.heading_rad, 8),
+            (s.speed_mps, 6),
+            (s.yaw_rate_radps, 8),
+            (s.lat_deg, 10),
+            (s.lon_deg, 10),
+        ]);
     } else {
         row += ",,,,,,,";
     }
     if with_covariance {
         for term in 0..COVARIANCE_TERMS {
-            row += &s.covariance.get(term).map_or(",".to_owned(), |p| format!(",{p:.9e}"));
+            let known = s.covariance.get(term).copied().and_then(finite);
+            row += &known.map_or(",".to_owned(), |p| format!(",{p:.9e}"));
         }
     }
     row
@@ -143,12 +165,11 @@ fn detection_rows(seen: &Detections) -> Vec<String> {
 }
 
 fn detection_row(time: i64, frame: u32, m: &Marker) -> String {
-    let mut row = format!(
-        "{time},{frame},{},{},{},{},{:.2},{:.4},{:.4}",
-        m.kind, m.family, m.id, m.hamming, m.margin, m.center_u, m.center_v
-    );
+    let (kind, family) = (csv_field(&m.kind), csv_field(&m.family));
+    let mut row = format!("{time},{frame},{kind},{family},{},{}", m.id, m.hamming);
+    row += &figures(&[(f64::from(m.margin), 2), (m.center_u, 4), (m.center_v, 4)]);
     for i in 0..8 {
-        row += &m.corners.get(i).map_or(",".to_owned(), |c| format!(",{c:.4}"));
+        row += &m.corners.get(i).map_or(",".to_owned(), |c| figures(&[(*c, 4)]));
     }
     row
 }
@@ -157,21 +178,9 @@ fn detection_row(time: i64, frame: u32, m: &Marker) -> String {
 fn ownship_row(o: &Ownship) -> (i64, String) {
     let time = host_time(o.timestamp.as_ref()).ns();
     let frame = if o.between_frames { String::new() } else { o.frame.to_string() };
-    let row = format!(
-        "{time},{frame},{:.10},{:.10},{:.4},{:.6},{:.6},{:.6},{:.6},{:.6},{:.6},{:.9},{:.9},{:.9},{:.9}",
-        o.lat_deg,
-        o.lon_deg,
-        o.height_m,
-        o.north_m,
-        o.east_m,
-        o.down_m,
-        o.vn_mps,
-        o.ve_mps,
-        o.vd_mps,
-        o.qw,
-        o.qx,
-        o.qy,
-        o.qz
-    );
+    let place = [(o.lat_deg, 10), (o.lon_deg, 10), (o.height_m, 4)];
+    let local = [o.north_m, o.east_m, o.down_m, o.vn_mps, o.ve_mps, o.vd_mps].map(|figure| (figure, 6));
+    let attitude = [o.qw, o.qx, o.qy, o.qz].map(|figure| (figure, 9));
+    let row = format!("{time},{frame}{}{}{}", figures(&place), figures(&local), figures(&attitude));
     (time, row)
 }

@@ -7,7 +7,12 @@ use serde_json::{Value, json};
 use super::tracks::{self, Point};
 use super::{ExportError, Exported, write_error};
 use crate::io::mcap_read::McapReader;
+use crate::io::new_file::NewFile;
+use crate::plot::MADE_BY;
 use windhover_base::time::{Span, UtcTime};
+
+/// Its file, and what that says near its begin.
+pub(super) const FILE: (&str, &str) = ("flight.geojson", MADE_BY);
 
 /// Positions are written this far apart; the line has them all.
 const POINT_PERIOD: Span = Span::from_ns(1_000_000_000);
@@ -29,9 +34,13 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
     if features.is_empty() {
         return Ok(exported);
     }
-    let path = out.join("flight.geojson");
-    let collection = json!({ "type": "FeatureCollection", "features": features });
-    std::fs::write(&path, format!("{collection:#}\n")).map_err(|source| write_error(&path, source))?;
+    let path = out.join(FILE.0);
+    // Who made it stands first: other members may follow type and features (RFC 7946, 6.1).
+    let features = Value::Array(features);
+    let text = format!(
+        "{{\n\"type\": \"FeatureCollection\",\n\"generator\": \"{MADE_BY}\",\n\"features\": {features:#}\n}}\n"
+    );
+    NewFile::write(&path, text.as_bytes()).map_err(|source| write_error(&path, source))?;
     exported.files.push(path);
     Ok(exported)
 }
@@ -64,7 +73,7 @@ fn position(name: &str, p: &Point) -> Value {
             "kind": "position",
             "time": UtcTime::from_unix_ns(p.t.ns()).to_string(),
             "heading_deg": rounded(p.heading_deg, 2),
-            "speed_mps": rounded(p.speed_mps, 3),
+            "speed_mps": p.speed_mps.map(|v| rounded(v, 3)),
             "yaw_rate_dps": p.yaw_rate_dps.map(|w| rounded(w, 3)),
             "sigma_m": p.sigma_m.map(|s| rounded(s, 3)),
         },

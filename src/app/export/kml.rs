@@ -6,7 +6,13 @@ use std::path::Path;
 use super::tracks::{self, Point};
 use super::{ExportError, Exported, write_error};
 use crate::io::mcap_read::McapReader;
+use crate::io::new_file::NewFile;
+use crate::plot::MADE_BY;
+use crate::text::xml;
 use windhover_base::time::UtcTime;
+
+/// Its file, and what that says near its begin.
+pub(super) const FILE: (&str, &str) = ("flight.kml", MADE_BY);
 
 pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, ExportError> {
     let tracks = tracks::read(&mut reader);
@@ -14,17 +20,17 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
     if tracks.is_empty() {
         return Ok(exported);
     }
-    let mut text = String::from(concat!(
-        "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n",
-        "<kml xmlns=\"http://www.opengis.net/kml/2.2\" xmlns:gx=\"http://www.google.com/kml/ext/2.2\">\n",
-        "<Document>\n<name>windhover flight</name>\n",
-    ));
+    let mut text = format!(
+        "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<!-- {MADE_BY} -->\n\
+         <kml xmlns=\"http://www.opengis.net/kml/2.2\" xmlns:gx=\"http://www.google.com/kml/ext/2.2\">\n\
+         <Document>\n<name>windhover flight</name>\n"
+    );
     for (name, points) in &tracks {
         placemark(&mut text, name, points);
     }
     text += "</Document>\n</kml>\n";
-    let path = out.join("flight.kml");
-    std::fs::write(&path, text).map_err(|source| write_error(&path, source))?;
+    let path = out.join(FILE.0);
+    NewFile::write(&path, text.as_bytes()).map_err(|source| write_error(&path, source))?;
     exported.files.push(path);
     Ok(exported)
 }
@@ -37,8 +43,9 @@ fn placemark(text: &mut String, name: &str, points: &[Point]) {
     // Writing into a String cannot fail.
     let _ = write!(
         text,
-        "<Placemark>\n<name>{name}</name>\n<Style><LineStyle><color>{colour}</color><width>3</width>\
-         </LineStyle></Style>\n<gx:Track>\n<altitudeMode>{mode}</altitudeMode>\n"
+        "<Placemark>\n<name>{}</name>\n<Style><LineStyle><color>{colour}</color><width>3</width>\
+         </LineStyle></Style>\n<gx:Track>\n<altitudeMode>{mode}</altitudeMode>\n",
+        xml(name)
     );
     for p in points {
         let _ = writeln!(text, "<when>{}</when>", UtcTime::from_unix_ns(p.t.ns()));

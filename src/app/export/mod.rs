@@ -51,6 +51,17 @@ pub struct Exported {
     pub warnings: Vec<String>,
 }
 
+impl Format {
+    /// The files of a format, and what each says near its begin.
+    pub const fn files(self) -> &'static [(&'static str, &'static str)] {
+        match self {
+            Self::Csv => &csv::TABLES,
+            Self::Geojson => &[geojson::FILE],
+            Self::Kml => &[kml::FILE],
+        }
+    }
+}
+
 /// Writes a flight's outputs into the directory `out`.
 pub fn export(flight: &Path, format: Format, out: &Path) -> Result<Exported, ExportError> {
     let reader = McapReader::open(flight)?;

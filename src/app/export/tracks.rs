@@ -8,6 +8,7 @@ use crate::io::mcap_read::McapReader;
 use crate::io::proto::windhover::{Ownship, TargetState};
 use crate::io::proto::{host_time, windhover::TrackStatus};
 use crate::io::records::topic;
+use crate::text::finite;
 use windhover_base::time::MonoTime;
 
 /// One position of a track.
@@ -18,12 +19,20 @@ pub(super) struct Point {
     pub(super) lon_deg: f64,
     pub(super) height_m: Option<f64>,
     pub(super) heading_deg: f64,
-    pub(super) speed_mps: f64,
+    pub(super) speed_mps: Option<f64>,
     pub(super) yaw_rate_dps: Option<f64>,
     pub(super) sigma_m: Option<f64>,
 }
 
-/// Tracks by name: `target/NAME` and `helicopter`, in order of time; only what was tracked or predicted.
+impl Point {
+    /// Whether it lies somewhere on the Earth, turned somewhere.
+    fn is_a_place(&self) -> bool {
+        self.lat_deg.abs() <= 90.0 && self.lon_deg.abs() <= 180.0 && self.heading_deg.is_finite()
+    }
+}
+
+/// Tracks by name: `target/NAME` and `helicopter`, in order of time; only what was tracked or predicted,
+/// and is a place on the Earth.
 pub(super) fn read(reader: &mut McapReader) -> BTreeMap<String, Vec<Point>> {
     let mut tracks: BTreeMap<String, Vec<Point>> = BTreeMap::new();
     for message in reader.by_ref() {
@@ -41,7 +50,11 @@ pub(super) fn read(reader: &mut McapReader) -> BTreeMap<String, Vec<Point>> {
             tracks.entry(format!("target/{}", state.target)).or_default().push(target_point(&state));
         }
     }
-    tracks.values_mut().for_each(|points| points.sort_by_key(|point| point.t));
+    for points in tracks.values_mut() {
+        points.retain(Point::is_a_place);
+        points.sort_by_key(|point| point.t);
+    }
+    tracks.retain(|_, points| !points.is_empty());
     tracks
 }
 
@@ -51,11 +64,15 @@ fn ownship_point(o: &Ownship) -> Point {
         t: host_time(o.timestamp.as_ref()),
         lat_deg: o.lat_deg,
         lon_deg: o.lon_deg,
-        height_m: Some(o.height_m),
+        height_m: finite(o.height_m),
         heading_deg: heading.to_degrees().rem_euclid(360.0),
-        speed_mps: o.vn_mps.hypot(o.ve_mps),
+        speed_mps: finite(o.vn_mps.hypot(o.ve_mps)),
         yaw_rate_dps: None,
-        sigma_m: o.position_sigma_m.first().zip(o.position_sigma_m.get(1)).map(|(n, e)| n.hypot(*e)),
+        sigma_m: o
+            .position_sigma_m
+            .first()
+            .zip(o.position_sigma_m.get(1))
+            .and_then(|(n, e)| finite(n.hypot(*e))),
     }
 }
 
@@ -68,8 +85,8 @@ fn target_point(s: &TargetState) -> Point {
         lon_deg: s.lon_deg,
         height_m: None,
         heading_deg: s.heading_rad.to_degrees().rem_euclid(360.0),
-        speed_mps: s.speed_mps,
-        yaw_rate_dps: Some(s.yaw_rate_radps.to_degrees()),
-        sigma_m: variance.map(f64::sqrt),
+        speed_mps: finite(s.speed_mps),
+        yaw_rate_dps: finite(s.yaw_rate_radps.to_degrees()),
+        sigma_m: variance.map(f64::sqrt).and_then(finite),
     }
 }

@@ -4,11 +4,15 @@ use serde_json::{Value, json};
 
 use super::view::{Vehicle, nmea_time};
 use crate::io::proto::host_time;
+use crate::text::{finite, xml};
 
 /// Trail points in KML and GeoJSON; more only slow a viewer down.
 const POINTS: usize = 2_000;
 /// Knots in a metre a second.
 const KNOTS: f64 = 3_600.0 / 1_852.0;
+
+/// Separators of GSA's twelve satellites and its PDOP, which stay empty, and the one after.
+const UNNAMED: usize = 14;
 
 fn thinned(vehicle: &Vehicle) -> impl Iterator<Item = (f64, f64)> + '_ {
     let every = vehicle.trail.len().div_ceil(POINTS).max(1);
@@ -53,17 +57,13 @@ pub fn geojson(vehicles: &[Vehicle]) -> String {
     json!({"type": "FeatureCollection", "features": features}).to_string()
 }
 
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
-}
-
 /// A network link that fetches [`kml`] every second.
 pub fn network_link(url: &str) -> String {
     format!(
         "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<kml xmlns=\"http://www.opengis.net/kml/2.2\">\
          <NetworkLink><name>windhover</name><Link><href>{}</href><refreshMode>onInterval</refreshMode>\
          <refreshInterval>1</refreshInterval></Link></NetworkLink></kml>\n",
-        escaped(url)
+        xml(url)
     )
 }
 
@@ -74,7 +74,7 @@ pub fn kml(vehicles: &[Vehicle]) -> String {
          <name>windhover</name>",
     );
     for vehicle in vehicles {
-        let name = escaped(&format!("{} ({})", vehicle.target, vehicle.payload));
+        let name = xml(&format!("{} ({})", vehicle.target, vehicle.payload));
         out += &if vehicle.is_current() { placemark(vehicle, &name) } else { last_known(vehicle, &name) };
         let line: Vec<String> = thinned(vehicle).map(|(lat, lon)| format!("{lon:.9},{lat:.9},0")).collect();
         if line.len() > 1 {
@@ -130,27 +130,62 @@ fn angle(degrees: f64, width: usize, hemispheres: [char; 2]) -> String {
     format!("{whole:0width$}{:02}.{:06},{hemisphere}", rest / 1_000_000, rest % 1_000_000)
 }
 
-/// RMC and GGA of a vehicle. One that is predicted is "estimated" (mode E, quality 6), whose data are not valid by
-/// NMEA 0183; one that is lost has neither position nor time. Time and date stay empty where UTC is not known. Altitude
-/// stays empty: the link carries heights above the ellipsoid, and GGA wants mean sea level.
+/// What NMEA 0183 calls a position: how RMC calls it valid, its mode, and GGA's quality.
+///
+/// It is a fix (A, quality 1) where the vehicle is tracked and the helicopter's receiver, by which it is placed, has a
+/// three-dimensional fix. Everything else that is known is "estimated" (V, mode E, quality 6).
+fn quality(vehicle: &Vehicle) -> (char, char, u8) {
+    let placed = vehicle.receiver.is_some_and(|receiver| receiver.fix == 3);
+    if placed && vehicle.status == "tracking" { ('A', 'A', 1) } else { ('V', 'E', 6) }
+}
+
+/// A figure with its decimals, or nothing.
+fn maybe(figure: Option<f64>, decimals: usize) -> String {
+    figure.and_then(finite).map_or(String::new(), |figure| format!("{figure:.decimals$}"))
+}
+
+/// RMC, GGA, GSA and GST of a vehicle. One that is lost has neither position nor time. Time and date stay empty where UTC
+/// is not known. Satellites and dilution are those of the helicopter's receiver; the altitude is that of the ground under
+/// the vehicle above mean sea level, by the receiver's geoid, and empty where the receiver does not tell that; one-sigmas
+/// (GST) are the vehicle's own.
 pub fn nmea(vehicle: &Vehicle) -> String {
     let s = &vehicle.state;
     if !vehicle.is_current() {
-        return sentence("GPRMC,,V,,,,,,,,,,N") + &sentence("GPGGA,,,,,,0,,,,M,,M,,");
+        return sentence("GPRMC,,V,,,,,,,,,,N")
+            + &sentence("GPGGA,,,,,,0,,,,M,,M,,")
+            + &sentence(&format!("GPGSA,A,1{},", ",".repeat(UNNAMED)));
     }
     let (time, date) = nmea_time(vehicle.utc);
     let (lat, lon) = (angle(s.lat_deg, 2, ['N', 'S']), angle(s.lon_deg, 3, ['E', 'W']));
     // Course over ground: of a vehicle that reverses, the way it goes.
     let course = if s.speed_mps < 0.0 { heading_deg(vehicle) + 180.0 } else { heading_deg(vehicle) } % 360.0;
     let knots = s.speed_mps.abs() * KNOTS;
-    let (valid, mode, quality) = if vehicle.status == "tracking" { ('A', 'A', 1) } else { ('V', 'E', 6) };
+    let (valid, mode, quality) = quality(vehicle);
+    let (receiver, geoid_m) = (vehicle.receiver, vehicle.receiver.and_then(|receiver| receiver.geoid_m));
+    let sats = receiver.map_or(String::new(), |receiver| format!("{:02}", receiver.sats.min(99)));
+    let hdop = maybe(receiver.and_then(|receiver| receiver.hdop), 1);
+    let (alt_msl_m, separation_m) = (maybe(geoid_m.map(|geoid| s.height_m - geoid), 1), maybe(geoid_m, 1));
+    let dimensions = match (quality, geoid_m) {
+        (1, Some(_)) => 3,
+        (1, None) => 2,
+        _ => 1,
+    };
     let rmc = sentence(&format!("GPRMC,{time},{valid},{lat},{lon},{knots:.2},{course:.1},{date},,,{mode}"));
-    rmc + &sentence(&format!("GPGGA,{time},{lat},{lon},{quality},,,,M,,M,,"))
+    let gga = sentence(&format!(
+        "GPGGA,{time},{lat},{lon},{quality},{sats},{hdop},{alt_msl_m},M,{separation_m},M,,"
+    ));
+    // Which satellites they are is not told on the link.
+    let gsa = sentence(&format!("GPGSA,A,{dimensions}{}{hdop},", ",".repeat(UNNAMED)));
+    let gst = sigmas_m(vehicle).map_or(String::new(), |(n, e)| {
+        sentence(&format!("GPGST,{time},,,,,{},{},", maybe(Some(n), 2), maybe(Some(e), 2)))
+    });
+    rmc + &gga + &gsa + &gst
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::app::ground::view::Receiver;
     use crate::io::proto::{timestamp, windhover as wh};
     use windhover_base::time::{MonoTime, Span, UtcTime};
 
@@ -167,11 +202,14 @@ mod tests {
                 speed_mps: 2.0,
                 lat_deg: 30.999_999_999_9,
                 lon_deg: -85.5,
+                height_m: 5.5,
+                covariance: [vec![0.25, 0.0, 0.0, 0.0, 0.0, 0.09], vec![0.0; 9]].concat(),
                 ..Default::default()
             },
             status: "tracking",
             age: Span::from_ms(70.0),
             utc: Some(UtcTime::from_unix_ns(t.ns())),
+            receiver: Some(Receiver { fix: 3, sats: 9, hdop: Some(0.94), geoid_m: Some(-27.5) }),
             trail: vec![(t, 30.0, -85.0), (t, 30.1, -85.1)],
         }
     }
@@ -181,14 +219,36 @@ mod tests {
         let text = nmea(&vehicle());
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(lines[0], "$GPRMC,000045.25,A,3100.000000,N,08530.000000,W,3.89,270.0,191126,,,A*7D");
-        for line in lines {
+        assert_eq!((lines[2].split(',').count(), lines.len()), (18, 4), "{text}");
+        assert!(lines[2].starts_with("$GPGSA,A,3,,,") && lines[2].contains(",0.9,*"), "{text}");
+        for line in lines.into_iter().filter(|line| !line.contains("GSA")) {
             let parsed = nmea::parse_str(line).expect("a sentence");
             match parsed {
                 nmea::ParseResult::RMC(rmc) => assert_eq!((rmc.lat, rmc.lon), (Some(31.0), Some(-85.5))),
-                nmea::ParseResult::GGA(gga) => assert_eq!((gga.latitude, gga.altitude), (Some(31.0), None)),
+                nmea::ParseResult::GGA(gga) => {
+                    assert_eq!(
+                        (gga.latitude, gga.altitude, gga.geoid_separation),
+                        (Some(31.0), Some(33.0), Some(-27.5))
+                    );
+                    assert_eq!((gga.fix_satellites, gga.hdop), (Some(9), Some(0.9)));
+                }
+                nmea::ParseResult::GST(gst) => assert_eq!((gst.lat_sd, gst.long_sd), (Some(0.5), Some(0.3))),
                 other => panic!("{other:?}"),
             }
         }
+        // A vehicle is no better placed than the helicopter's receiver places it.
+        let unsure = |receiver| nmea(&Vehicle { receiver, ..vehicle() });
+        let said = vehicle().receiver;
+        let two = unsure(said.map(|said| Receiver { fix: 2, ..said }));
+        assert!(
+            two.contains(",V,3100.000000,N,")
+                && two.contains(",W,6,09,0.9,33.0,M,-27.5,M")
+                && two.contains("GPGSA,A,1,"),
+            "{two}"
+        );
+        assert!(unsure(None).contains(",W,6,,,,M,,M"), "{}", unsure(None));
+        let flat = unsure(said.map(|said| Receiver { geoid_m: None, ..said }));
+        assert!(flat.contains(",W,1,09,0.9,,M,,M") && flat.contains("GPGSA,A,2,"), "{flat}");
     }
 
     #[test]
@@ -201,7 +261,9 @@ mod tests {
         );
         assert!(text.contains("GPGGA,000045.25,3100.000000,N,08530.000000,W,6,"), "{text}");
         let lost = Vehicle { status: "lost", age: Span::from_s(35.2), ..vehicle() };
-        assert_eq!(nmea(&lost), "$GPRMC,,V,,,,,,,,,,N*53\r\n$GPGGA,,,,,,0,,,,M,,M,,*66\r\n");
+        assert!(
+            nmea(&lost).starts_with("$GPRMC,,V,,,,,,,,,,N*53\r\n$GPGGA,,,,,,0,,,,M,,M,,*66\r\n$GPGSA,A,1,")
+        );
         let parsed: Value = serde_json::from_str(&geojson(std::slice::from_ref(&lost))).expect("JSON");
         assert_eq!(parsed["features"][0]["geometry"], Value::Null);
         assert_eq!(parsed["features"][0]["properties"]["status"], json!("lost"));

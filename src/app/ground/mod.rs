@@ -61,6 +61,8 @@ pub struct GroundSettings {
     pub token: Option<String>,
     /// Folder with map tiles.
     pub tiles: Option<PathBuf>,
+    /// Where the station stands, latitude and longitude in degrees: distances on the page count from there.
+    pub position: Option<[f64; 2]>,
     /// Where NMEA is served over TCP.
     pub nmea: Option<SocketAddr>,
     /// Where Foxglove is served over its WebSocket.
@@ -164,9 +166,10 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     if let Some(address) = settings.web {
         let listener = listen(address).await?;
         terminal.line(format_args!("page at http://{}/{}", listener.local_addr()?, tokens.asked(address)));
-        let (view, live, tiles) = (Arc::clone(&view), live.clone(), settings.tiles.clone());
-        let token = tokens.at(address);
-        tasks.spawn(async move { web::serve(listener, Web { view, live, tiles, token }).await });
+        let (tiles, position) = (settings.tiles.clone(), settings.position);
+        let web =
+            Web { view: Arc::clone(&view), live: live.clone(), tiles, position, token: tokens.at(address) };
+        tasks.spawn(web::serve(listener, web));
     }
     let scope = settings.foxglove.map(|_| Scope::default());
     if let (Some(address), Some(scope)) = (settings.foxglove, scope.clone()) {
@@ -181,14 +184,10 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
         tasks.spawn(nmea_port::serve(Door::new(listener, "nmea"), Arc::clone(&view)));
     }
     let (to_disk, from_link) = std::sync::mpsc::sync_channel(DISK_QUEUE);
-    let (failed, mut failure) = mpsc::channel(1);
     let disk_handle = handle.clone();
-    let disk = std::thread::Builder::new().name("mirror".into()).spawn(move || {
-        if let Err(error) = keep(mirror, &from_link, &disk_handle) {
-            // The receiver is gone only when the station ends.
-            let _ = failed.blocking_send(error);
-        }
-    })?;
+    let disk = std::thread::Builder::new()
+        .name("mirror".into())
+        .spawn(move || keep(mirror, &from_link, &disk_handle))?;
     let linked = tokio::spawn(link.run(stop));
     tasks.spawn(report(handle, Arc::clone(&view), live.clone(), terminal.clone()));
     tasks.spawn(tell(events, Arc::clone(&view), live.clone()));
@@ -210,15 +209,12 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
         fleet,
     };
     let taken = tokio::spawn(intake(records, ended.subscribe(), outputs));
-    let outcome = tokio::select! {
-        _ = linked => Ok(()),
-        Some(error) = failure.recv() => Err(error.into()),
-    };
+    let _ = linked.await;
     // The link ended: what was received is handed on, the disk's channel closes, everything is kept.
     ended.send_replace(true);
     let _ = tokio::time::timeout(Duration::from_secs(5), taken).await;
     let _ = tokio::task::spawn_blocking(move || disk.join()).await;
-    outcome
+    Ok(())
 }
 
 /// Where records go.
@@ -293,33 +289,45 @@ async fn intake(
     }
 }
 
-/// The disk's thread: writes, syncs once a second, acknowledges.
-fn keep(
-    mut mirror: Mirror,
-    records: &std::sync::mpsc::Receiver<Arrival>,
-    handle: &StationHandle,
-) -> Result<(), MirrorError> {
+/// The disk's thread: writes, syncs once a second, acknowledges. A disk that fails is told and tried again, and nothing is
+/// acknowledged or asked for meanwhile; live estimates go on.
+fn keep(mut mirror: Mirror, records: &std::sync::mpsc::Receiver<Arrival>, handle: &StationHandle) {
     use std::sync::mpsc::RecvTimeoutError;
     let mut due = tokio::time::Instant::now() + SYNC;
-    let acknowledge = |done: Vec<mirror::OnDisk>| {
-        for d in done {
-            handle.stored(&d.payload, d.run, &d.numbers);
-        }
-    };
+    let mut troubled = false;
     loop {
         match records.recv_timeout(due.saturating_duration_since(tokio::time::Instant::now())) {
-            Ok(arrival) => mirror.keep(&arrival)?,
+            Ok(arrival) => mirror.keep(&arrival),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => {
-                acknowledge(mirror.finish()?);
-                return Ok(());
+                settle(&mirror.finish(), handle, &mut troubled);
+                return;
             }
         }
         if tokio::time::Instant::now() >= due {
-            acknowledge(mirror.sync()?);
+            settle(&mirror.sync(), handle, &mut troubled);
             due = tokio::time::Instant::now() + SYNC;
         }
     }
+}
+
+/// Tells the link and the operator what became of what was given to the disk.
+fn settle(kept: &mirror::Kept, handle: &StationHandle, troubled: &mut bool) {
+    kept.done.iter().for_each(|d| handle.stored(&d.payload, d.run, &d.numbers));
+    kept.lost.iter().for_each(|d| handle.forget(&d.payload, d.run, &d.numbers));
+    for (payload, why) in &kept.excess {
+        OperatorEvent::LinkFault.emit(payload, why);
+        handle.dismiss(payload, "more channels and schemas than are kept");
+    }
+    handle.hold(kept.trouble.is_some());
+    match &kept.trouble {
+        Some(why) if !*troubled => {
+            OperatorEvent::RecordingStopped.emit("disk", format!("{why}; tried again every second"))
+        }
+        None if *troubled => OperatorEvent::RecordingResumed.emit("disk", "flights are kept again"),
+        _ => {}
+    }
+    *troubled = kept.trouble.is_some();
 }
 
 /// One line a second per payload, and how the link does for the pages.

@@ -6,6 +6,7 @@ use std::io::{self, Write};
 
 use crate::app::log::{Queue, QueueEnd, Stream, queue};
 use crate::io::clock::HostClock;
+use crate::text::one_line;
 use windhover_base::time::Span;
 
 /// Begins a message whose lines stand for those of the last that began so.
@@ -31,16 +32,16 @@ impl Terminal {
         TerminalEnd { terminal: Self(queue), _end: end }
     }
 
-    /// Shows a line that stays.
+    /// Shows a line that stays. Nothing in it steers the terminal, whoever said it.
     pub(super) fn line(&self, text: impl Display) {
-        self.0.put(format!("{text}\n").as_bytes());
+        self.0.put(format!("{}\n", one_line(&text.to_string())).as_bytes());
     }
 
-    /// Shows these lines, a line for each payload, in place of the last of their kind.
+    /// Shows these lines in the same way, a line for each payload, in place of the last of their kind.
     pub(super) fn status(&self, lines: &[String]) {
         let mut message = vec![STATUS];
         for line in lines {
-            message.extend_from_slice(line.as_bytes());
+            message.extend_from_slice(one_line(line).as_bytes());
             message.push(b'\n');
         }
         self.0.put(&message);
@@ -95,6 +96,29 @@ impl<W: Write> Write for Screen<W> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_others_say_steers_no_terminal() {
+        #[derive(Clone, Default)]
+        struct Shown(std::sync::Arc<std::sync::Mutex<Vec<u8>>>);
+        impl Write for Shown {
+            fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+                self.0.lock().expect("not poisoned").write(bytes)
+            }
+            fn flush(&mut self) -> io::Result<()> {
+                Ok(())
+            }
+        }
+        let out = Shown::default();
+        let (queue, end) = queue("test", Screen { out: out.clone(), rewrites: false, shown: 0 });
+        let terminal = Terminal(queue);
+        terminal.line("from \x1b[2Jme\nforged line");
+        terminal.status(&["bird\x1b]0;title\x07 up\r\nhawk down".to_owned()]);
+        drop(TerminalEnd { terminal, _end: end });
+        let shown = String::from_utf8(out.0.lock().expect("not poisoned").clone()).expect("UTF-8");
+        let expected = "from \\u{1b}[2Jme\\nforged line\nbird\\u{1b}]0;title\\u{7} up\\r\\nhawk down\n";
+        assert_eq!(shown, expected);
+    }
 
     #[test]
     fn a_terminal_shows_the_status_in_place_and_a_pipe_line_by_line() {

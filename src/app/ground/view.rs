@@ -10,15 +10,31 @@ use tokio::time::Instant;
 use crate::io::link::{Arrival, PayloadStatus};
 use crate::io::proto::{foxglove, host_time, link::Thumbnail, windhover as wh};
 use crate::io::records::topic;
+use crate::text::finite;
 use windhover_base::geo::euler_321;
 use windhover_base::time::{MonoTime, NS_PER_S, Span, UtcTime};
 
-use super::freshness::{PayloadClock, status_at};
+use super::freshness::{CURRENT, PayloadClock, status_at};
 
 /// Estimates kept for pages opened later: ten minutes at 15 Hz.
 const TRAIL: usize = 9_000;
+/// Targets of a payload that are shown; the flight keeps all.
+const TARGETS: usize = 64;
 /// Notices kept for pages opened later.
 const NOTICES: usize = 60;
+
+/// What the payload's receiver says of its fix.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Receiver {
+    /// 0 none, 2 two-dimensional, 3 three-dimensional.
+    pub fix: u32,
+    /// Satellites used.
+    pub sats: u32,
+    /// Horizontal dilution of precision.
+    pub hdop: Option<f64>,
+    /// Geoid over ellipsoid, metres.
+    pub geoid_m: Option<f64>,
+}
 
 /// A vehicle as last known.
 #[derive(Clone, Debug)]
@@ -35,6 +51,8 @@ pub struct Vehicle {
     pub age: Span,
     /// UTC of that state, where the payload's receiver told it.
     pub utc: Option<UtcTime>,
+    /// What the payload's receiver says now; `None` where it has not said anything for seconds.
+    pub receiver: Option<Receiver>,
     /// Latitude and longitude over time, oldest first.
     pub trail: Vec<(MonoTime, f64, f64)>,
 }
@@ -63,6 +81,7 @@ struct Payload {
     notices: VecDeque<Arc<str>>,
     thumbnail: Option<(Arc<str>, Arc<[u8]>)>,
     clock: PayloadClock,
+    receiver: Option<(MonoTime, Receiver)>,
     live: (u64, u64),
     live_hz: f64,
     kbps: f64,
@@ -103,12 +122,15 @@ impl View {
         match arrival.channel.schema_name.as_str() {
             // The smoother's and the paper's states have schemas of the same name and other topics.
             "windhover.TargetState" if topic::is_target_now(&arrival.channel.topic) => {
-                payload.estimate(&name, wh::TargetState::decode(data).ok()?, arrival.live)
+                let state = wh::TargetState::decode(data).ok().filter(wh::TargetState::is_sound)?;
+                payload.estimate(&name, state, arrival.live)
             }
-            "windhover.Ownship" => payload.ownship(&name, &wh::Ownship::decode(data).ok()?),
+            "windhover.Ownship" => {
+                payload.ownship(&name, &wh::Ownship::decode(data).ok().filter(wh::Ownship::is_sound)?)
+            }
             "windhover.Health" => payload.health(&name, &wh::Health::decode(data).ok()?),
             "windhover.Datum" => {
-                let datum = wh::Datum::decode(data).ok()?;
+                let datum = wh::Datum::decode(data).ok().filter(wh::Datum::is_sound)?;
                 let text = json!({"k": "datum", "p": name, "lat": datum.lat_deg, "lon": datum.lon_deg});
                 payload.datum = Some(text.to_string().into());
                 payload.datum.clone()
@@ -121,9 +143,14 @@ impl View {
     /// Takes a thumbnail; gives the message for the pages.
     pub fn thumbnail(&mut self, name: &str, thumbnail: Thumbnail) -> Arc<str> {
         let found = wh::Detections::decode(&thumbnail.detections[..]).unwrap_or_default();
+        let is_sound = |m: &&wh::Marker| {
+            let figures = [m.center_u, m.center_v, m.size_px];
+            figures.iter().chain(&m.corners).all(|figure| figure.is_finite())
+        };
         let markers: Vec<Value> = found
             .markers
             .iter()
+            .filter(is_sound)
             .map(|m| {
                 json!({"id": format!("{} {}", m.family, m.id).trim(), "u": m.center_u, "v": m.center_v,
                     "corners": m.corners, "size": m.size_px})
@@ -194,6 +221,7 @@ impl View {
     /// Every vehicle whose position was ever known, as it is now.
     pub fn vehicles(&self, now: Instant) -> Vec<Vehicle> {
         let of = |(payload, p): (&String, &Payload)| -> Vec<Vehicle> {
+            let receiver = p.receiver.filter(|(t, _)| p.clock.age(*t, now) <= CURRENT).map(|(_, said)| said);
             let known = |(target, t): (&String, &Target)| {
                 let places = t.places.iter();
                 let (state, latest) = (t.known.clone()?, t.latest.as_ref()?);
@@ -204,6 +232,7 @@ impl View {
                     status: status_name(latest, p.clock.age(at(latest), now)),
                     age: p.clock.age(at(&state), now),
                     utc: p.clock.utc(at(&state)),
+                    receiver,
                     state,
                     trail: places.map(|(ns, (lat, lon))| (MonoTime::from_ns(*ns), *lat, *lon)).collect(),
                 })
@@ -258,6 +287,9 @@ impl View {
 impl Payload {
     fn estimate(&mut self, name: &str, state: wh::TargetState, live: bool) -> Option<Arc<str>> {
         let t = host_time(state.timestamp.as_ref());
+        if self.targets.len() >= TARGETS && !self.targets.contains_key(&state.target) {
+            return None;
+        }
         let target = self.targets.entry(state.target.clone()).or_default();
         let mut message = json!({"k": "est", "p": name, "target": state.target, "t": ms(t),
             "status": status_name(&state, Span::ZERO), "live": live});
@@ -317,7 +349,9 @@ impl Payload {
             .sources
             .iter()
             .map(|s| {
-                json!({"name": s.name, "rate_hz": s.rate_hz, "age_ms": s.age_ms, "refused": s.refused,
+                // What is no number is nothing from it.
+                let (rate_hz, age_ms) = (finite(s.rate_hz).unwrap_or(0.0), finite(s.age_ms).unwrap_or(-1.0));
+                json!({"name": s.name, "rate_hz": rate_hz, "age_ms": age_ms, "refused": s.refused,
                     "dropped": s.dropped})
             })
             .collect();
@@ -326,9 +360,19 @@ impl Payload {
             .iter()
             .map(|m| json!({"source": m.source, "figure": m.figure, "cause": m.cause, "advice": m.advice}))
             .collect();
+        let figures: BTreeMap<&str, f64> = health
+            .figures
+            .iter()
+            .filter(|(_, x)| x.is_finite())
+            .map(|(name, x)| (name.as_str(), *x))
+            .collect();
+        if self.receiver.is_none_or(|(last, _)| last <= t) {
+            let (hdop, geoid_m) = (health.hdop.and_then(finite), health.geoid_m.and_then(finite));
+            self.receiver = Some((t, Receiver { fix: health.fix, sats: health.sats, hdop, geoid_m }));
+        }
         let text: Arc<str> = json!({"k": "health", "p": name, "t": ms(t), "sources": sources,
-            "fix": health.fix, "sats": health.sats, "clock_sigma_ms": health.clock_sigma_ms,
-            "misfits": misfits, "words": health.words})
+            "fix": health.fix, "sats": health.sats, "clock_sigma_ms": finite(health.clock_sigma_ms),
+            "misfits": misfits, "words": health.words, "figures": figures})
         .to_string()
         .into();
         if self.health.as_ref().is_none_or(|(last, _)| *last <= t.ns()) {

@@ -25,6 +25,7 @@ use super::view::View;
 const INDEX: &str = include_str!("page/index.html");
 const STYLE: &str = include_str!("page/style.css");
 const MAP: &str = include_str!("page/map.js");
+const ALARM: &str = include_str!("page/alarm.js");
 const APP: &str = include_str!("page/app.js");
 /// Name of the cookie that holds the token.
 const COOKIE: &str = "windhover";
@@ -41,6 +42,8 @@ pub struct Web {
     pub live: broadcast::Sender<Arc<str>>,
     /// Folder with map tiles `Z/X/Y.png`.
     pub tiles: Option<PathBuf>,
+    /// Where the station stands, latitude and longitude in degrees.
+    pub position: Option<[f64; 2]>,
     /// What a visitor must know; `None` on loopback.
     pub token: Option<Arc<str>>,
 }
@@ -56,6 +59,7 @@ impl Web {
             .route("/", get(|| async { text("text/html; charset=utf-8", INDEX) }))
             .route("/style.css", get(|| async { text("text/css; charset=utf-8", STYLE) }))
             .route("/map.js", get(|| async { text("text/javascript; charset=utf-8", MAP) }))
+            .route("/alarm.js", get(|| async { text("text/javascript; charset=utf-8", ALARM) }))
             .route("/app.js", get(|| async { text("text/javascript; charset=utf-8", APP) }))
             .route("/live", get(live))
             .route("/thumbnail/{payload}", get(thumbnail))
@@ -154,7 +158,7 @@ async fn live(State(web): State<Web>, upgrade: WebSocketUpgrade) -> Response {
 async fn feed(web: Web, mut socket: WebSocket) {
     let mut news = web.live.subscribe();
     let tiles = web.tiles.as_deref().map(deepest_tiles);
-    let hello = serde_json::json!({"k": "hello", "tiles": tiles}).to_string();
+    let hello = serde_json::json!({"k": "hello", "tiles": tiles, "position": web.position}).to_string();
     let history = web.view().history();
     for message in std::iter::once(hello.as_str()).chain(history.iter().map(|m| &**m)) {
         if socket.send(Message::text(message)).await.is_err() {

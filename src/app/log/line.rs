@@ -1,6 +1,6 @@
 //! One line of the operator's log, made of a `tracing` event, and how it looks as logfmt and as JSON.
 
-use std::fmt::{Debug, Write as _};
+use std::fmt::Debug;
 
 use tracing::field::{Field, Visit};
 use tracing::{Event, Metadata, Subscriber};
@@ -13,6 +13,7 @@ use super::throttle;
 use crate::app::events::{self, OperatorEvent, TARGET};
 use crate::config::LogLevel;
 use crate::io::clock::HostClock;
+use crate::text;
 use windhover_base::time::{MonoTime, UtcTime};
 
 /// The event's name of what libraries emit.
@@ -100,7 +101,7 @@ impl Line {
         let mut out = self.event.to_owned();
         if !self.message.is_empty() {
             out.push_str(" msg=");
-            put_word(&mut out, &self.message);
+            put_word(&mut out, &text::without_numbers(&self.message));
         }
         let mut before = "";
         for (name, value) in &self.fields {
@@ -122,7 +123,7 @@ impl Line {
     pub(super) fn plain(&self) -> String {
         let about = self.fields.iter().find(|(name, _)| *name == "about");
         let about = about.map(|(name, value)| shown(name, value) + ": ").unwrap_or_default();
-        about + &self.message
+        text::one_line(&text::without_numbers(&(about + &self.message))).into_owned()
     }
 
     /// One JSON object.
@@ -231,24 +232,20 @@ fn plain_value(name: &str, value: &Value) -> serde_json::Value {
 }
 
 /// A logfmt word: bare where it can be, else quoted with `"` and `\` escaped and line ends as `\n`.
-fn put_word(out: &mut String, text: &str) {
-    let bare = !text.is_empty()
-        && !text.contains(|c: char| c.is_whitespace() || c.is_control() || "\"=\\".contains(c));
+fn put_word(out: &mut String, word: &str) {
+    let bare = !word.is_empty()
+        && text::is_one_line(word)
+        && !word.contains(|c: char| c.is_whitespace() || "\"=\\".contains(c));
     if bare {
-        out.push_str(text);
+        out.push_str(word);
         return;
     }
     out.push('"');
-    for c in text.chars() {
+    for c in word.chars() {
         match c {
             '"' => out.push_str("\\\""),
             '\\' => out.push_str("\\\\"),
-            '\n' => out.push_str("\\n"),
-            c if c.is_control() => {
-                // Writing to a string cannot fail.
-                let _ = write!(out, "\\u{:04x}", u32::from(c));
-            }
-            c => out.push(c),
+            c => text::put_shown(out, c),
         }
     }
     out.push('"');

@@ -135,7 +135,7 @@ pub(super) fn section(context: &Context<'_>) -> Option<Section> {
         ("Error east", "m", 1, 1.0),
         ("Error of heading", "°", 2, 1f64.to_degrees()),
         ("Error of speed", "m/s", 3, 1.0),
-        ("Error of yaw rate", "rad/s", 4, 1.0),
+        ("Error of yaw rate", "°/s", 4, 1f64.to_degrees()),
     ];
     let mut charts = String::new();
     for (title, unit, k, scale) in specs {
@@ -154,7 +154,7 @@ const ERROR_COLUMNS: [&str; 9] = [
     "without mean m",
     "heading °",
     "speed m/s",
-    "yaw rate rad/s",
+    "yaw rate °/s",
     "NEES of 5",
     "NEES of ψ v ω",
 ];
@@ -173,7 +173,7 @@ fn error_rows(estimators: &[(&str, Errors, Ink)]) -> Vec<Vec<String>> {
                 figure(position.map(|p| p.1), 3),
                 figure(errors.rms(2).map(f64::to_degrees), 2),
                 figure(errors.rms(3), 3),
-                figure(errors.rms(4), 3),
+                figure(errors.rms(4).map(f64::to_degrees), 2),
                 figure(nees.map(|n| n.0), 2),
                 figure(nees.map(|n| n.1), 2),
             ]

@@ -6,7 +6,8 @@ use std::fmt::Write as _;
 use super::page::{Section, grid, paragraph, table};
 use super::{Context, single};
 use crate::io::proto::foxglove as fox;
-use crate::plot::{Ink, escape};
+use crate::plot::Ink;
+use crate::text::xml;
 
 /// Notices listed; a flight with more has a fault that the first ones tell.
 const MOST_NOTICES: usize = 200;
@@ -72,8 +73,8 @@ pub(super) fn notices(context: &Context<'_>) -> Option<Section> {
             body,
             "<tr><td>{:.2}</td><td class=\"words {class}\">{}</td><td class=\"words\">{}</td></tr>",
             context.flight.at(n.timestamp.as_ref()),
-            escape(&n.name.replace('_', " ")),
-            escape(&n.message)
+            xml(&n.name.replace('_', " ")),
+            xml(&n.message)
         );
     }
     body += "</tbody></table></div>\n";
@@ -88,7 +89,7 @@ pub(super) fn configuration(context: &Context<'_>) -> Option<Section> {
     let text = context.flight.config_text.as_ref()?;
     let body = format!(
         "<details><summary>The configuration flown with</summary><pre>{}</pre></details>\n",
-        escape(text)
+        xml(text)
     );
     Some(Section { id: "configuration", title: "Configuration", body })
 }

@@ -4,7 +4,8 @@ use std::fmt::Write as _;
 
 use base64::Engine as _;
 
-use crate::plot::{CHART_CSS, PALETTE_CSS, escape};
+use crate::plot::{CHART_CSS, MADE_BY, PALETTE_CSS};
+use crate::text::xml;
 
 /// A section of the page.
 pub(super) struct Section {
@@ -51,10 +52,11 @@ section{padding:16px 0 4px}h2,h3,thead,p:has(+.scroll){break-after:avoid}figure,
 
 /// The whole page.
 pub(super) fn page(name: &str, sections: Vec<Section>) -> String {
-    let name = escape(name);
+    let name = xml(name);
     let mut out = format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
          <meta name=\"viewport\" content=\"width=device-width,initial-scale=1\">\
+         <meta name=\"generator\" content=\"report {MADE_BY}\">\
          <meta name=\"color-scheme\" content=\"light dark\"><title>Flight {name}</title>\
          <style>{PALETTE_CSS}{CHART_CSS}{PAGE_CSS}</style></head><body>\n\
          <header><p class=\"soft\">Flight report</p><h1>{name}</h1></header>\n<nav><div>"
@@ -92,7 +94,7 @@ pub(super) fn grid(figures: &str) -> String {
 /// Figures with their names, large.
 pub(super) fn tiles(tiles: &[(String, String)]) -> String {
     let one = |(value, name): &(String, String)| {
-        format!("<div class=\"tile\"><b>{}</b><span>{}</span></div>", escape(value), escape(name))
+        format!("<div class=\"tile\"><b>{}</b><span>{}</span></div>", xml(value), xml(name))
     };
     format!("<div class=\"tiles\">{}</div>\n", tiles.iter().map(one).collect::<String>())
 }
@@ -101,13 +103,13 @@ pub(super) fn tiles(tiles: &[(String, String)]) -> String {
 pub(super) fn table(head: &[&str], rows: &[Vec<String>]) -> String {
     let mut out = String::from("<div class=\"scroll\"><table><thead><tr>");
     for cell in head {
-        let _ = write!(out, "<th>{}</th>", escape(cell));
+        let _ = write!(out, "<th>{}</th>", xml(cell));
     }
     out.push_str("</tr></thead><tbody>");
     for row in rows {
         out.push_str("<tr>");
         for cell in row {
-            let _ = write!(out, "<td>{}</td>", escape(cell));
+            let _ = write!(out, "<td>{}</td>", xml(cell));
         }
         out.push_str("</tr>");
     }
@@ -117,7 +119,7 @@ pub(super) fn table(head: &[&str], rows: &[Vec<String>]) -> String {
 
 /// A paragraph of text.
 pub(super) fn paragraph(text: &str) -> String {
-    format!("<p>{}</p>\n", escape(text))
+    format!("<p>{}</p>\n", xml(text))
 }
 
 /// A list of text.
@@ -125,7 +127,7 @@ pub(super) fn list(class: &str, items: &[String]) -> String {
     if items.is_empty() {
         return String::new();
     }
-    let items: String = items.iter().map(|i| format!("<li>{}</li>", escape(i))).collect();
+    let items: String = items.iter().map(|i| format!("<li>{}</li>", xml(i))).collect();
     format!("<ul class=\"{class}\">{items}</ul>\n")
 }
 

@@ -44,9 +44,9 @@ const QUANTITIES: [Quantity; 3] = [
     },
     Quantity {
         title: "yaw rate",
-        unit: "rad/s",
+        unit: "°/s",
         row: 4,
-        scale: 1.0,
+        scale: 180.0 / std::f64::consts::PI,
         of: |s| s.yaw_rate_radps,
         of_truth: |t| t.yaw_rate_radps,
         angle: false,

@@ -142,11 +142,11 @@ fn of_target(context: &Context<'_>, name: &str, track: &Track) -> String {
     );
     if k.sigma[2].is_finite() {
         text += &format!(
-            "In real time its heading was known to {:.2}°, its speed to {:.2} m/s, its yaw rate to {:.3} rad/s, \
+            "In real time its heading was known to {:.2}°, its speed to {:.2} m/s, its yaw rate to {:.2}°/s, \
              its position to {:.2} m (one sigma, median).",
             k.sigma[2].to_degrees(),
             k.sigma[3],
-            k.sigma[4],
+            k.sigma[4].to_degrees(),
             k.sigma[0].hypot(k.sigma[1]) / 2f64.sqrt()
         );
     }
@@ -173,7 +173,7 @@ fn figures(context: &Context<'_>) -> Vec<(String, String)> {
             if k.sigma[2].is_finite() {
                 tiles.push((format!("{:.2}°", k.sigma[2].to_degrees()), format!("{name} heading, 1σ")));
                 tiles.push((format!("{:.2} m/s", k.sigma[3]), format!("{name} speed, 1σ")));
-                tiles.push((format!("{:.3} rad/s", k.sigma[4]), format!("{name} yaw rate, 1σ")));
+                tiles.push((format!("{:.2}°/s", k.sigma[4].to_degrees()), format!("{name} yaw rate, 1σ")));
             }
         }
     }

@@ -1,22 +1,20 @@
 //! The flight file of a replay: what the recording has, and the outputs anew.
 
-use std::fs::File;
-use std::io::BufWriter;
 use std::path::PathBuf;
 
 use crate::app::sink::{OutgoingRecord, Sink};
 use crate::io::mcap_read::RawMessage;
-use crate::io::mcap_write::{McapWriter, WriteError};
+use crate::io::mcap_write::{Maker, McapFile, WriteError};
 use crate::io::records::{self, topic};
 use windhover_base::settings::CameraConfig;
 use windhover_base::time::MonoTime;
 
-/// Writes a flight; the file is made when the first message is there.
+/// Writes a flight: begun when the first message is there, in its place when it is finished.
 pub struct FlightFile {
     path: PathBuf,
     config_toml: String,
     camera: CameraConfig,
-    writer: Option<McapWriter<BufWriter<File>>>,
+    writer: Option<McapFile>,
     fault: Option<WriteError>,
 }
 
@@ -41,7 +39,7 @@ impl FlightFile {
     }
 
     fn begin(&mut self, t: MonoTime) -> Result<(), WriteError> {
-        let writer = self.writer.insert(McapWriter::create(&self.path, &self.config_toml, t)?);
+        let writer = self.writer.insert(McapFile::create(&self.path, Maker::Replay, &self.config_toml, t)?);
         records::opening(&self.camera, t).iter().try_for_each(|record| writer.write(record))
     }
 
@@ -58,7 +56,7 @@ impl FlightFile {
     /// # Errors
     /// What was left cannot be written.
     pub fn finish(self) -> Result<(), WriteError> {
-        self.writer.map_or(Ok(()), |writer| writer.finish().map(drop))
+        self.writer.map_or(Ok(()), |writer| writer.close(&self.path))
     }
 }
 

@@ -4,7 +4,10 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use super::target::{Board, Target, TargetArgs};
-use crate::cli::{CliError, CliResult};
+use crate::cli::out::outln;
+use crate::cli::{CliError, CliResult, place};
+use crate::io::new_file::Inputs;
+use crate::plot::MADE_BY;
 use windhover_calibrate::TagGrid;
 use windhover_detect::tag_pattern;
 
@@ -24,13 +27,13 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
+    place::check(&args.out, &Inputs::default(), &place::DRAWING)?;
     let drawing = match args.target.target()? {
         Target::Chessboard { board, square_m } => chessboard(board, square_m),
         Target::Tags(grid) => tags(&grid)?,
     };
-    std::fs::write(&args.out, drawing)
-        .map_err(|e| CliError::failed(format!("cannot write {}: {e}", args.out.display())))?;
-    println!("{}", args.out.display());
+    place::write(&args.out, &drawing)?;
+    outln!("{}", args.out.display())?;
     Ok(())
 }
 
@@ -87,7 +90,7 @@ fn tags(grid: &TagGrid) -> Result<String, CliError> {
 /// A sheet of this size in millimetres with black squares and a line of text in its lower margin.
 fn sheet((width, height): (f64, f64), margin: f64, squares: &str, words: &str) -> String {
     format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}mm\" height=\"{height}mm\" viewBox=\"0 0 {width} {height}\">\
+        "<!-- {MADE_BY} -->\n<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}mm\" height=\"{height}mm\" viewBox=\"0 0 {width} {height}\">\
          <rect width=\"{width}\" height=\"{height}\" fill=\"#fff\"/>\
          <path fill=\"#000\" shape-rendering=\"crispEdges\" d=\"{squares}\"/>\
          <text x=\"{margin}\" y=\"{}\" font-family=\"sans-serif\" font-size=\"4\">{words}</text></svg>\n",

@@ -8,6 +8,7 @@ use serde_json::json;
 
 use crate::app::flight::Flight;
 use crate::app::{config_file, declination, recording};
+use crate::cli::out::outln;
 use crate::cli::{CliError, CliResult};
 use crate::config::Config;
 use windhover_base::geo::Geodetic;
@@ -89,9 +90,9 @@ pub(super) fn run(args: &Args) -> CliResult {
     let surveyed = surveyed_markers(args, &config);
     let found = boresight(&config.rig(), declination, &recordings, &surveyed).map_err(CliError::failed)?;
     if args.json {
-        println!("{}", as_json(&found));
+        outln!("{}", as_json(&found))?;
     } else {
-        print_text(&found, &config);
+        print_text(&found, &config)?;
     }
     Ok(())
 }
@@ -137,22 +138,22 @@ fn name_of(marker: MarkerId) -> String {
     }
 }
 
-fn print_text(found: &Boresight, config: &Config) {
-    println!("{} pixel coordinates, residual {:.3} px (root mean square)", found.pixels, found.rms_px);
+fn print_text(found: &Boresight, config: &Config) -> CliResult {
+    outln!("{} pixel coordinates, residual {:.3} px (root mean square)", found.pixels, found.rms_px)?;
     if found.refused > 0 {
-        println!("{} measurements lay outside the gate and were left out", found.refused);
+        outln!("{} measurements lay outside the gate and were left out", found.refused)?;
     }
-    println!("\n                         value  one sigma");
+    outln!("\n                         value  one sigma")?;
     for f in &found.parameters {
         let note = if f.told { "" } else { "   not told by these flights" };
-        println!("{:<20} {:>9.3} {:>9.3} {:<3}{note}", f.name, f.value, f.sigma, f.unit);
+        outln!("{:<20} {:>9.3} {:>9.3} {:<3}{note}", f.name, f.value, f.sigma, f.unit)?;
     }
-    println!("\ncamera against compass (what positions a vehicle)");
+    outln!("\ncamera against compass (what positions a vehicle)")?;
     for f in &found.camera_to_compass {
-        println!("{:<20} {:>9.3} {:>9.3} {}", f.name, f.value, f.sigma, f.unit);
+        outln!("{:<20} {:>9.3} {:>9.3} {}", f.name, f.value, f.sigma, f.unit)?;
     }
     for m in &found.markers {
-        println!(
+        outln!(
             "\nmarker {} (flight {}): {:.9} {:.9} {:.2} m, one sigma north {:.2} east {:.2} down {:.2} m",
             name_of(m.marker),
             m.flight,
@@ -162,19 +163,20 @@ fn print_text(found: &Boresight, config: &Config) {
             m.sigma_m.x,
             m.sigma_m.y,
             m.sigma_m.z
-        );
+        )?;
     }
     for advice in found.advice() {
-        println!("\n{advice}");
+        outln!("\n{advice}")?;
     }
     let value = |k: usize| found.parameters[k].value;
-    println!("\n[camera.mount]");
-    println!("position_m = [{:.3}, {:.3}, {:.3}]", value(3), value(4), value(5));
-    println!("yaw_deg = {:.3}\npitch_deg = {:.3}\nroll_deg = {:.3}", value(0), value(1), value(2));
-    println!("\n[compass]");
-    println!("yaw_offset_deg = {:.3}", config.compass.yaw_offset_deg - value(6));
-    println!("pitch_offset_deg = {:.3}", config.compass.pitch_offset_deg + value(7));
-    println!("roll_offset_deg = {:.3}", config.compass.roll_offset_deg + value(8));
-    println!("latency_ms = {:.1}", config.compass.latency_ms + value(9));
-    println!("\n[gps]\nlatency_ms = {:.1}", config.gps.latency_ms + value(10));
+    outln!("\n[camera.mount]")?;
+    outln!("position_m = [{:.3}, {:.3}, {:.3}]", value(3), value(4), value(5))?;
+    outln!("yaw_deg = {:.3}\npitch_deg = {:.3}\nroll_deg = {:.3}", value(0), value(1), value(2))?;
+    outln!("\n[compass]")?;
+    outln!("yaw_offset_deg = {:.3}", config.compass.yaw_offset_deg - value(6))?;
+    outln!("pitch_offset_deg = {:.3}", config.compass.pitch_offset_deg + value(7))?;
+    outln!("roll_offset_deg = {:.3}", config.compass.roll_offset_deg + value(8))?;
+    outln!("latency_ms = {:.1}", config.compass.latency_ms + value(9))?;
+    outln!("\n[gps]\nlatency_ms = {:.1}", config.gps.latency_ms + value(10))?;
+    Ok(())
 }

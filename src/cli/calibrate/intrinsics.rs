@@ -6,7 +6,9 @@ use nalgebra::Vector2;
 use serde_json::json;
 
 use super::target::{Board, Target, TargetArgs, positive};
-use crate::cli::{CliError, CliResult};
+use crate::cli::out::{note, outln};
+use crate::cli::{CliError, CliResult, place};
+use crate::io::new_file::Inputs;
 use crate::pixels;
 use crate::plot;
 use crate::plot::intrinsics::{coverage_advice, coverage_svg, per_view_svg, residuals_svg};
@@ -49,6 +51,9 @@ pub(super) struct Args {
     json: bool,
 }
 
+/// The drawings.
+const PLOTS: [&str; 3] = ["residuals.svg", "per_image.svg", "coverage.svg"];
+
 /// A photograph and what was found on it.
 struct Photo {
     name: String,
@@ -56,10 +61,14 @@ struct Photo {
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
+    if let Some(dir) = &args.plots {
+        let inputs = Inputs::of(args.images.iter().map(PathBuf::as_path));
+        PLOTS.iter().try_for_each(|file| place::check(&dir.join(file), &inputs, &place::DRAWING))?;
+    }
     let (photos, size) = look_at(args)?;
     for photo in &photos {
         if let Err(reason) = &photo.found {
-            eprintln!("windhover: not used: {}: {reason}", photo.name);
+            note!("windhover: not used: {}: {reason}", photo.name);
         }
     }
     let used: Vec<&Photo> = photos.iter().filter(|p| p.found.is_ok()).collect();
@@ -72,9 +81,9 @@ pub(super) fn run(args: &Args) -> CliResult {
         draw(dir, &result, &views, &names, size)?;
     }
     if args.json {
-        println!("{}", as_json(&result, &photos));
+        outln!("{}", as_json(&result, &photos))?;
     } else {
-        print_text(&result, &names, &views, size);
+        print_text(&result, &names, &views, size)?;
     }
     Ok(())
 }
@@ -143,14 +152,11 @@ fn draw(
     names: &[&str],
     size: (usize, usize),
 ) -> CliResult {
-    let failed = |e: std::io::Error| CliError::failed(format!("cannot write into {}: {e}", dir.display()));
-    std::fs::create_dir_all(dir).map_err(failed)?;
-    for (file, svg) in [
-        ("residuals.svg", residuals_svg(result, views, size)),
-        ("per_image.svg", per_view_svg(result, names)),
-        ("coverage.svg", coverage_svg(views, size)),
-    ] {
-        std::fs::write(dir.join(file), plot::standalone(&svg)).map_err(failed)?;
+    std::fs::create_dir_all(dir)
+        .map_err(|e| CliError::failed(format!("cannot write into {}: {e}", dir.display())))?;
+    let drawn = [residuals_svg(result, views, size), per_view_svg(result, names), coverage_svg(views, size)];
+    for (file, svg) in PLOTS.iter().zip(drawn) {
+        place::write(&dir.join(file), &plot::standalone(&svg))?;
     }
     Ok(())
 }
@@ -178,35 +184,36 @@ fn as_json(result: &Intrinsics, photos: &[Photo]) -> serde_json::Value {
     })
 }
 
-fn print_text(result: &Intrinsics, names: &[&str], views: &[PlaneView], size: (usize, usize)) {
+fn print_text(result: &Intrinsics, names: &[&str], views: &[PlaneView], size: (usize, usize)) -> CliResult {
     let c = &result.camera;
-    println!(
+    outln!(
         "{} images, {} corners, error {:.4} px (root mean square)\n",
         names.len(),
         result.points,
         result.rms_px
-    );
-    println!("parameter        value   one sigma");
+    )?;
+    outln!("parameter        value   one sigma")?;
     let values = [c.fx, c.fy, c.cx, c.cy].into_iter().chain(c.distortion).chain([c.skew]).zip(result.sigma);
     for (name, (value, sigma)) in PARAMETERS.iter().zip(values) {
         if sigma > 0.0 {
-            println!("{name:<10} {value:>12.5} {sigma:>11.5}");
+            outln!("{name:<10} {value:>12.5} {sigma:>11.5}")?;
         } else {
-            println!("{name:<10} {value:>12.5}       fixed");
+            outln!("{name:<10} {value:>12.5}       fixed")?;
         }
     }
-    println!("\nerror per image, px");
+    outln!("\nerror per image, px")?;
     for (name, fit) in names.iter().zip(&result.views) {
-        println!("{:7.4}  {name}", fit.rms_px);
+        outln!("{:7.4}  {name}", fit.rms_px)?;
     }
     for advice in coverage_advice(result, views, size) {
-        println!("\n{advice}");
+        outln!("\n{advice}")?;
     }
     let [k1, k2, p1, p2, k3] = c.distortion;
-    println!("\n[camera.intrinsics]");
-    println!("fx = {:.5}\nfy = {:.5}\ncx = {:.5}\ncy = {:.5}", c.fx, c.fy, c.cx, c.cy);
-    println!("distortion = [{k1:.6}, {k2:.6}, {p1:.6}, {p2:.6}, {k3:.6}]");
+    outln!("\n[camera.intrinsics]")?;
+    outln!("fx = {:.5}\nfy = {:.5}\ncx = {:.5}\ncy = {:.5}", c.fx, c.fy, c.cx, c.cy)?;
+    outln!("distortion = [{k1:.6}, {k2:.6}, {p1:.6}, {p2:.6}, {k3:.6}]")?;
     if c.skew != 0.0 {
-        println!("skew = {:.7}", c.skew);
+        outln!("skew = {:.7}", c.skew)?;
     }
+    Ok(())
 }

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use crate::cli::out::outln;
 use crate::cli::{CliError, CliResult};
 use crate::io::store::flight::{self, FLIGHTS};
 use crate::io::store::index::{INDEX, Index, IndexError};
@@ -10,10 +11,11 @@ use crate::io::store::keeper::{describe, settle_flight};
 use crate::io::store::rebuild;
 use crate::io::store::scan::SegmentFile;
 use crate::io::store::volume::Volume;
+use crate::text::counted;
 
 /// Reads every byte of the flights; says what is wrong; compares with the index where `all` are
-/// looked at and nobody else has it open.
-pub(super) fn verify(root: &Path, names: &[String], all: bool) -> CliResult {
+/// looked at and nobody else has it open. `called` is how `store` was called, for advice.
+pub(super) fn verify(root: &Path, names: &[String], all: bool, called: &str) -> CliResult {
     let present = inspect::in_the_air(root)?;
     let mut wrong = 0;
     let mut segments = 0;
@@ -28,46 +30,47 @@ pub(super) fn verify(root: &Path, names: &[String], all: bool) -> CliResult {
             };
             if let Some(fault) = fault {
                 wrong += 1;
-                println!("{name}/{segment_name}: {fault}");
+                outln!("{name}/{segment_name}: {fault}")?;
             }
         }
         if !dir.join(flight::FLIGHT_FILE).exists() {
             wrong += 1;
-            println!("{name}: not closed");
+            outln!("{name}: not closed")?;
         }
     }
     if all {
-        wrong += verify_index(root)?;
+        wrong += verify_index(root, called)?;
     }
-    println!("{segments} segments of {} flights read, {wrong} things wrong", names.len());
+    let (segments, flights) = (counted(segments, "segment"), counted(names.len(), "flight"));
+    outln!("{segments} of {flights} read, {} wrong", counted(wrong, "thing"))?;
     if wrong == 0 {
         return Ok(());
     }
-    Err(CliError::failed("the store is not whole; `windhover store repair` and `rebuild` mend it"))
+    Err(CliError::failed(format!("the store is not whole; `{called} repair` and `{called} rebuild` mend it")))
 }
 
-fn verify_index(root: &Path) -> Result<usize, CliError> {
+fn verify_index(root: &Path, called: &str) -> Result<usize, CliError> {
     let dir = root.join(INDEX);
     if !dir.exists() {
-        println!("no index; the daemon makes it, or `windhover store rebuild`");
+        outln!("no index; the daemon makes it, or `{called} rebuild`")?;
         return Ok(1);
     }
     if inspect::is_recording(root) {
-        println!("the daemon has the index; it was not compared");
+        outln!("the daemon has the index; it was not compared")?;
         return Ok(0);
     }
     match Index::open(&dir) {
         Ok(index) => {
             let told = rebuild::differences(root, &index)?;
-            told.iter().for_each(|line| println!("index: {line}"));
+            told.iter().try_for_each(|line| outln!("index: {line}"))?;
             Ok(told.len())
         }
         Err(IndexError::InUse { .. }) => {
-            println!("the daemon has the index; it was not compared");
+            outln!("the daemon has the index; it was not compared")?;
             Ok(0)
         }
         Err(error) => {
-            println!("{error}");
+            outln!("{error}")?;
             Ok(1)
         }
     }
@@ -82,15 +85,17 @@ pub(super) fn repair(root: &Path, names: &[String]) -> CliResult {
     }
     let mut mended = 0;
     for name in names.iter().filter(|name| Some(*name) != present.as_ref()) {
+        let mut done = Vec::new();
         let left = settle_flight(&volume, name, true, |segment, sealing| {
-            mended += 1;
-            println!("{segment}: {}", describe(sealing));
+            done.push(format!("{segment}: {}", describe(sealing)));
         })?;
+        mended += done.len();
+        done.iter().try_for_each(|line| outln!("{line}"))?;
         if left.is_none() {
-            println!("{name}: held nothing and was removed");
+            outln!("{name}: held nothing and was removed")?;
         }
     }
-    println!("{mended} segments mended");
+    outln!("{} mended", counted(mended, "segment"))?;
     Ok(())
 }
 
@@ -122,6 +127,6 @@ pub(super) fn rebuild(root: &Path) -> CliResult {
     }
     std::fs::rename(&fresh, &dir)?;
     Volume::new(root).sync_dir("")?;
-    println!("index of {} flights made again", flights.len());
+    outln!("index of {} made again", counted(flights.len(), "flight"))?;
     Ok(())
 }

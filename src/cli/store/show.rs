@@ -3,11 +3,13 @@
 use std::path::Path;
 
 use crate::cli::CliResult;
+use crate::cli::out::{note, outln};
 use crate::io::store::flight::FlightInfo;
 use crate::io::store::inspect::{self, Dropout};
 use crate::io::store::summary::TopicStats;
 use crate::io::store::volume::Volume;
 use crate::io::store::wear;
+use crate::text::{counted, one_line};
 use windhover_base::time::{Civil, UtcTime};
 
 /// Silences shorter than this are not worth a line.
@@ -17,21 +19,21 @@ pub(super) fn list(root: &Path, json: bool) -> CliResult {
     let (flights, errors) = inspect::list(root)?;
     let present = inspect::in_the_air(root)?;
     for error in errors {
-        eprintln!("windhover: {error}");
+        note!("windhover: {}", one_line(&error.to_string()));
     }
     if json {
         for info in &flights {
-            println!("{}", as_json(info, present.as_deref()));
+            outln!("{}", as_json(info, present.as_deref()))?;
         }
         return Ok(());
     }
-    println!("{:<20} {:>9} {:>9} {:>9} {:>10}  ", "FLIGHT", "DURATION", "SIZE", "SEGMENTS", "ESTIMATES");
+    outln!("{:<20} {:>9} {:>9} {:>9} {:>10}  ", "FLIGHT", "DURATION", "SIZE", "SEGMENTS", "ESTIMATES")?;
     for info in &flights {
         let duration = info.span_ns().map_or_else(|| "-".into(), |(first, last)| span(last - first));
         let estimates = info.estimates().map_or(0, |e| e.count);
         let marks = marks(info, present.as_deref());
         let (name, bytes, segments) = (&info.name, size(info.bytes), info.segments);
-        println!("{name:<20} {duration:>9} {bytes:>9} {segments:>9} {estimates:>10}  {marks}");
+        outln!("{name:<20} {duration:>9} {bytes:>9} {segments:>9} {estimates:>10}  {marks}")?;
     }
     Ok(())
 }
@@ -82,44 +84,44 @@ pub(super) fn show(root: &Path, name: &str, json: bool) -> CliResult {
         all["topics"] = serde_json::to_value(&info.topics)?;
         all["metadata"] = serde_json::to_value(&info.metadata)?;
         all["dropouts"] = serde_json::to_value(&dropouts)?;
-        println!("{all}");
+        outln!("{all}")?;
         return Ok(());
     }
     let marks = marks(&info, present.as_deref());
-    println!("{name}{}{marks}", if marks.is_empty() { "" } else { ": " });
-    println!("  size       {} in {} segments", size(info.bytes), info.segments);
+    outln!("{name}{}{marks}", if marks.is_empty() { "" } else { ": " })?;
+    outln!("  size       {} in {}", size(info.bytes), counted(info.segments as usize, "segment"))?;
     let clock = FlightClock::of(&info);
     let stamp = |ns| clock.stamp(ns);
     if let Some((first, last)) = info.span_ns() {
         let (length, from, to) = (span(last - first), stamp(first), stamp(last));
-        println!("  duration   {length}, from {from} to {to} {}", clock.name());
+        outln!("  duration   {length}, from {from} to {to} {}", clock.name())?;
     }
     match info.estimates() {
-        Some(e) => println!("  estimates  {}, from {} to {}", e.count, stamp(e.first_ns), stamp(e.last_ns)),
-        None => println!("  estimates  none"),
+        Some(e) => outln!("  estimates  {}, from {} to {}", e.count, stamp(e.first_ns), stamp(e.last_ns))?,
+        None => outln!("  estimates  none")?,
     }
     for (key, value) in &info.metadata {
-        println!("  {key:<10} {value}");
+        outln!("  {:<10} {}", one_line(key), one_line(value))?;
     }
-    show_topics(&info, &clock);
-    show_dropouts(&dropouts, &clock);
-    show_wear(&info, capacity);
-    Ok(())
+    show_topics(&info, &clock)?;
+    show_dropouts(&dropouts, &clock)?;
+    show_wear(&info, capacity)
 }
 
-fn show_topics(info: &FlightInfo, clock: &FlightClock) {
+fn show_topics(info: &FlightInfo, clock: &FlightClock) -> CliResult {
     if info.topics.is_empty() {
-        return;
+        return Ok(());
     }
-    println!("\n  {:<28} {:>9} {:>8} {:>12}", "TOPIC", "MESSAGES", "HZ", "LONGEST GAP");
+    outln!("\n  {:<28} {:>9} {:>8} {:>12}", "TOPIC", "MESSAGES", "HZ", "LONGEST GAP")?;
     for (topic, stats) in &info.topics {
         let gap = if stats.gap_ns >= GAP_SHOWN_NS {
             format!("{:.1} s at {}", stats.gap_ns as f64 * 1e-9, clock.stamp(stats.gap_from_ns))
         } else {
             format!("{:.0} ms", stats.gap_ns as f64 * 1e-6)
         };
-        println!("  {topic:<28} {:>9} {:>8.2} {gap:>12}", stats.count, rate_hz(stats));
+        outln!("  {topic:<28} {:>9} {:>8.2} {gap:>12}", stats.count, rate_hz(stats))?;
     }
+    Ok(())
 }
 
 fn rate_hz(stats: &TopicStats) -> f64 {
@@ -127,41 +129,43 @@ fn rate_hz(stats: &TopicStats) -> f64 {
     if seconds > 0.0 { (stats.count - 1) as f64 / seconds } else { 0.0 }
 }
 
-fn show_dropouts(dropouts: &[Dropout], clock: &FlightClock) {
-    println!();
+fn show_dropouts(dropouts: &[Dropout], clock: &FlightClock) -> CliResult {
+    outln!()?;
     if dropouts.is_empty() {
-        println!("  nothing was dropped");
+        outln!("  nothing was dropped")?;
     }
     for d in dropouts {
         let count: u64 = d.messages.values().sum();
         let topics: Vec<&str> = d.messages.keys().map(String::as_str).collect();
         let length = d.to_ns.saturating_sub(d.from_ns) as f64 * 1e-9;
-        println!(
+        outln!(
             "  dropped {count} messages ({}) in {length:.1} s from {} on {}: {}",
             size(d.bytes),
             clock.stamp(d.from_ns),
             topics.join(" "),
             d.reason
-        );
+        )?;
     }
+    Ok(())
 }
 
-fn show_wear(info: &FlightInfo, capacity: Option<u64>) {
-    let (Some((first, last)), Some(capacity)) = (info.span_ns(), capacity) else { return };
+fn show_wear(info: &FlightInfo, capacity: Option<u64>) -> CliResult {
+    let (Some((first, last)), Some(capacity)) = (info.span_ns(), capacity) else { return Ok(()) };
     let seconds = (last - first) as f64 * 1e-9;
     if seconds <= 0.0 {
-        return;
+        return Ok(());
     }
     let rate = info.bytes as f64 / seconds;
-    println!(
+    outln!(
         "\n  recording like this costs the card {} an hour; one of {}",
         size(((rate + wear::OVERHEAD_BYTES_PER_S) * 3600.0) as u64),
         size(capacity)
-    );
+    )?;
     for cycles in [10_000.0, 100_000.0] {
         let life = wear::life(capacity, cycles, rate);
-        println!("    and {cycles:>6} cycles lasts about {:.0} hours in the air", life.hours);
+        outln!("    and {cycles:>6} cycles lasts about {:.0} hours in the air", life.hours)?;
     }
+    Ok(())
 }
 
 /// Bytes for people.

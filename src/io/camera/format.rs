@@ -1,6 +1,6 @@
 //! Pixel formats by their V4L2 names, and which of those offered is taken.
 
-use windhover_base::msg::FrameEncoding;
+use windhover_base::msg::{Bayer, FrameEncoding};
 use windhover_base::settings::PixelFormat;
 
 /// A four-character code of V4L2.
@@ -15,13 +15,29 @@ pub(super) const fn fourcc(format: PixelFormat) -> FourCc {
         PixelFormat::Nv12 => *b"NV12",
         PixelFormat::Mjpg => *b"MJPG",
         PixelFormat::Rgb24 => *b"RGB3",
+        PixelFormat::Rggb => *b"RGGB",
+        PixelFormat::Bggr => *b"BA81",
+        PixelFormat::Gbrg => *b"GBRG",
+        PixelFormat::Grbg => *b"GRBG",
+        PixelFormat::Y10 => *b"Y10 ",
+        PixelFormat::Y12 => *b"Y12 ",
+        PixelFormat::Y16 => *b"Y16 ",
+        PixelFormat::Y10Packed => *b"Y10P",
     }
 }
 
 /// How frames of a V4L2 format are read; `None` where they are not understood.
 pub(super) const fn encoding(code: FourCc) -> Option<FrameEncoding> {
     Some(match &code {
-        b"GREY" => FrameEncoding::Grey,
+        b"GREY" | b"Y8  " | b"Y800" => FrameEncoding::Grey,
+        b"RGGB" => FrameEncoding::Bayer(Bayer::Rggb),
+        b"BA81" => FrameEncoding::Bayer(Bayer::Bggr),
+        b"GBRG" => FrameEncoding::Bayer(Bayer::Gbrg),
+        b"GRBG" => FrameEncoding::Bayer(Bayer::Grbg),
+        b"Y10 " => FrameEncoding::Y10,
+        b"Y12 " => FrameEncoding::Y12,
+        b"Y16 " => FrameEncoding::Y16,
+        b"Y10P" => FrameEncoding::Y10Packed,
         b"YUYV" => FrameEncoding::Yuyv,
         b"UYVY" => FrameEncoding::Uyvy,
         b"NV12" => FrameEncoding::Nv12,
@@ -34,8 +50,10 @@ pub(super) const fn encoding(code: FourCc) -> Option<FrameEncoding> {
 
 /// Formats in the order they are preferred when what was asked for is not offered: those whose grey
 /// is read off directly first, lossy ones last.
-const PREFERENCE: [FourCc; 8] =
-    [*b"GREY", *b"NV12", *b"YUYV", *b"UYVY", *b"RGB3", *b"BGR3", *b"MJPG", *b"JPEG"];
+const PREFERENCE: [FourCc; 18] = [
+    *b"GREY", *b"Y8  ", *b"Y800", *b"NV12", *b"YUYV", *b"UYVY", *b"RGB3", *b"BGR3", *b"Y10P", *b"Y10 ",
+    *b"Y12 ", *b"Y16 ", *b"RGGB", *b"BA81", *b"GBRG", *b"GRBG", *b"MJPG", *b"JPEG",
+];
 
 /// Which format to ask the driver for: `asked` where it is offered (or where the driver offers no
 /// list), else the preferred one of those understood; `None` where none is.
@@ -64,8 +82,10 @@ pub(super) fn frame_bytes(encoding: FrameEncoding, stride: usize, height: usize)
 /// Bytes of a row without padding, for drivers that leave the stride out.
 pub(super) const fn packed_stride(encoding: FrameEncoding, width: u32) -> u32 {
     match encoding {
-        FrameEncoding::Grey | FrameEncoding::Nv12 => width,
+        FrameEncoding::Grey | FrameEncoding::Nv12 | FrameEncoding::Bayer(_) => width,
+        FrameEncoding::Y10Packed => width.div_ceil(4) * 5,
         FrameEncoding::Yuyv | FrameEncoding::Uyvy => width * 2,
+        FrameEncoding::Y10 | FrameEncoding::Y12 | FrameEncoding::Y16 => width * 2,
         FrameEncoding::Rgb24 | FrameEncoding::Bgr24 => width * 3,
         FrameEncoding::Jpeg | FrameEncoding::Png | FrameEncoding::Unknown => 0,
     }
@@ -79,15 +99,20 @@ mod tests {
     fn what_was_asked_for_comes_first() {
         assert_eq!(choose(*b"YUYV", &[*b"GREY", *b"YUYV"]), Some(*b"YUYV"));
         assert_eq!(choose(*b"GREY", &[*b"MJPG", *b"YUYV"]), Some(*b"YUYV"));
-        assert_eq!(choose(*b"GREY", &[*b"H264", *b"BA81"]), None);
+        assert_eq!(choose(*b"GREY", &[*b"H264", *b"BA81"]), Some(*b"BA81"));
+        assert_eq!(choose(*b"GREY", &[*b"H264", *b"Y10B"]), None);
         assert_eq!(choose(*b"GREY", &[]), Some(*b"GREY"));
     }
 
     #[test]
     fn every_configurable_format_is_understood() {
-        use PixelFormat::{Grey, Mjpg, Nv12, Rgb24, Uyvy, Yuyv};
-        for format in [Grey, Yuyv, Uyvy, Nv12, Mjpg, Rgb24] {
+        use PixelFormat::{
+            Bggr, Gbrg, Grbg, Grey, Mjpg, Nv12, Rgb24, Rggb, Uyvy, Y10, Y10Packed, Y12, Y16, Yuyv,
+        };
+        for format in [Grey, Yuyv, Uyvy, Nv12, Mjpg, Rgb24, Rggb, Bggr, Gbrg, Grbg, Y10, Y12, Y16, Y10Packed]
+        {
             assert!(encoding(fourcc(format)).is_some(), "{format:?}");
+            assert!(PREFERENCE.contains(&fourcc(format)), "{format:?}");
         }
         assert_eq!(frame_bytes(FrameEncoding::Nv12, 1280, 1024), Some(1280 * 1024 * 3 / 2));
         assert_eq!(frame_bytes(FrameEncoding::Jpeg, 0, 1024), None);

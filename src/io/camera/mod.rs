@@ -1,8 +1,11 @@
-//! The camera as a task: a V4L2 device, or a recording of one played at its own pace.
+//! The camera as a task: a V4L2 device, a recording of one played at its own pace, or another program's frames.
 
 mod format;
 mod recorded;
+mod socket;
 mod v4l2;
+
+pub use socket::grey_header;
 
 use std::convert::Infallible;
 
@@ -14,7 +17,8 @@ use super::device::{Backoff, Report, Reports};
 /// What is asked of the camera.
 #[derive(Clone, PartialEq, Debug)]
 pub struct CameraSettings {
-    /// Path of a V4L2 device, or `capture:PATH` for a recording (`capture-loop:PATH` plays it for ever).
+    /// Path of a V4L2 device; `capture:PATH` for a recording (`capture-loop:PATH` plays it for ever); `socket:PATH` for
+    /// frames of another program (`socket.rs`).
     pub device: String,
     /// Frame width, pixels.
     pub width: u32,
@@ -35,6 +39,8 @@ pub async fn run(settings: &CameraSettings, clock: HostClock, reports: Reports<'
             recorded::play(&path, settings, false, clock, reports).await
         } else if let Some(path) = recording("capture-loop:") {
             recorded::play(&path, settings, true, clock, reports).await
+        } else if let Some(path) = recording("socket:") {
+            socket::stream(&path, clock, reports, &mut || backoff.reset()).await
         } else {
             v4l2::stream(settings, clock, reports, &mut || backoff.reset()).await
         };

@@ -4,13 +4,19 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::{Frames, ImportError, parse_time};
+use crate::io::regular;
 use windhover_base::msg::{FrameEncoding, FramePayload};
 use windhover_base::time::MonoTime;
+
+/// Bytes of the longest table that is read: a day of 30 Hz.
+const LONGEST_TABLE: u64 = 1 << 28;
+/// Bytes of the largest image file that is read: 16 384² grey levels.
+const LARGEST_IMAGE: u64 = 1 << 28;
 
 /// Opens a folder with `times.csv` (`time_s,file`, with or without that header).
 pub(super) fn open(folder: &Path) -> Result<Frames, ImportError> {
     let table = folder.join("times.csv");
-    let text = std::fs::read_to_string(&table).map_err(|e| ImportError::io(&table, e))?;
+    let text = regular::read_text(&table, LONGEST_TABLE).map_err(|e| ImportError::io(&table, e))?;
     let mut frames = Vec::new();
     for (index, line) in text.lines().enumerate() {
         let line = line.trim();
@@ -28,12 +34,15 @@ fn row(table: &Path, folder: &Path, number: usize, line: &str) -> Result<(MonoTi
     let refused = || ImportError::line(table, number, "expected a time, a comma and the name of an image");
     let (time, file) = line.split_once(',').ok_or_else(refused)?;
     let t = parse_time(time.trim()).ok_or_else(refused)?;
-    Ok((t, folder.join(file.trim())))
+    // A folder may be somebody else's: it names its own images, not what else is on this machine.
+    let file =
+        regular::inside(folder, file.trim()).map_err(|e| ImportError::line(table, number, e.to_string()))?;
+    Ok((t, file))
 }
 
 /// JPEG and PNG go in as they are; other formats are read and go in as grey levels.
 fn image(index: u32, t: MonoTime, path: &Path) -> Result<FramePayload, ImportError> {
-    let bytes = std::fs::read(path).map_err(|e| ImportError::io(path, e))?;
+    let bytes = regular::read(path, LARGEST_IMAGE).map_err(|e| ImportError::io(path, e))?;
     let encoding = match image::guess_format(&bytes) {
         Ok(image::ImageFormat::Jpeg) => FrameEncoding::Jpeg,
         Ok(image::ImageFormat::Png) => FrameEncoding::Png,

@@ -5,6 +5,7 @@ use std::path::Path;
 use nalgebra::Vector3;
 
 use super::{ImportError, parse_time};
+use crate::text::number;
 use windhover_base::geo::Tilt;
 use windhover_base::msg::{AttitudeSample, InertialSample};
 use windhover_base::time::MonoTime;
@@ -54,7 +55,7 @@ pub fn read_attitude(path: &Path) -> Result<Samples<AttitudeSample>, ImportError
 /// The figure in a column; `None` where there is none, or no such column.
 fn figure(header: &[&str], fields: &[&str], name: &str) -> Option<f64> {
     let at = header.iter().position(|column| *column == name)?;
-    fields.get(at)?.parse().ok().filter(|figure: &f64| figure.is_finite())
+    number(fields.get(at)?).ok()
 }
 
 fn read<T>(path: &Path, sample: impl Fn(&[&str], &[&str]) -> Option<T>) -> Result<Samples<T>, ImportError> {

@@ -21,6 +21,8 @@ pub(super) mod close {
     pub const REVOKED: u32 = 4;
     /// The peer sent what is no message of the link.
     pub const MALFORMED: u32 = 5;
+    /// The peer sent more of something than is kept of any.
+    pub const EXCESS: u32 = 6;
 }
 
 /// A peer that has shown its certificate.

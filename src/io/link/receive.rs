@@ -1,6 +1,7 @@
 //! The station's side of one connection: datagrams and streams in, requests and acknowledgements out.
 
 use std::collections::BTreeMap;
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -25,6 +26,8 @@ const LOOK: Duration = Duration::from_millis(250);
 const ASK_AGAIN: Duration = Duration::from_secs(4);
 /// Channel numbers a payload may use.
 const CHANNELS: usize = 1_024;
+/// Bytes of all schemas of a payload; those of this program take some tens of kilobytes.
+const SCHEMA_BYTES: usize = 8 << 20;
 /// Longest topic or schema name, bytes.
 const NAME_LIMIT: usize = 256;
 
@@ -108,7 +111,14 @@ impl Receiver {
             return;
         }
         let recall = |flight: &str, run| (self.shared.recall)(&self.payload, flight, run);
-        lock(&self.state.received).announce(extent, recall);
+        let known = {
+            let mut received = lock(&self.state.received);
+            received.announce(extent, recall);
+            received.flight(extent.run).is_some()
+        };
+        if !known {
+            return;
+        }
         lock(&self.flights).entry(extent.run).or_insert_with(|| extent.flight.as_str().into());
     }
 
@@ -120,7 +130,8 @@ impl Receiver {
         }
         let pb::Channel { id, topic, schema_name, schema, .. } = channel;
         let known = channels.get(&id).is_some_and(|c| c.topic == topic && !c.schema.is_empty());
-        if !known {
+        let all: usize = channels.values().map(|channel| channel.schema.len()).sum();
+        if !known && all + schema.len() <= SCHEMA_BYTES {
             channels.insert(id, Arc::new(Channel { topic, schema_name, schema }));
         }
     }
@@ -235,6 +246,9 @@ impl Receiver {
         loop {
             tokio::select! {
                 _ = look.tick() => {
+                    if self.shared.holding.load(Ordering::Relaxed) {
+                        continue;
+                    }
                     let want = lock(&self.state.received).want();
                     let again = asked_at.elapsed() > ASK_AGAIN && !want.ranges.is_empty();
                     if is_news(&asked, &want) || again {

@@ -123,6 +123,15 @@ impl ReceivedNumbers {
         }
     }
 
+    /// These numbers are not on the station's disk, or not any more: as if they had never come.
+    pub fn forget(&mut self, run: u32, numbers: &RangeSet) {
+        let Some(run) = self.runs.get_mut(&run) else { return };
+        for (first, end) in numbers.iter() {
+            run.have.remove_range(first, end);
+            run.stored.remove_range(first, end);
+        }
+    }
+
     /// What to tell the payload as stored. The ranges of the oldest numbers are enough for its cursor.
     pub fn stored_message(&self) -> pb::Stored {
         let ranges = self.runs.iter().flat_map(|(run, r)| {
@@ -213,6 +222,19 @@ mod tests {
         assert_eq!(received.runs.len(), RUNS);
         received.gone(&pb::Range { run: 0, first: 0, end: u32::MAX });
         assert!(received.take(0, 1), "only what was announced can be gone");
+    }
+
+    #[test]
+    fn what_the_disk_did_not_keep_is_asked_for_again() {
+        let mut received = ReceivedNumbers::default();
+        received.announce(&extent(0, 6), |_, _| RangeSet::new());
+        (0..6).for_each(|number| assert!(received.take(5, number)));
+        received.stored(5, &RangeSet::of(0, 6));
+        received.forget(5, &RangeSet::of(2, 4));
+        assert_eq!(received.stored_message().ranges.len(), 2);
+        (0..4).for_each(|_| drop(received.want()));
+        assert_eq!(ranges(&received.want()), [(2, 4)]);
+        assert!(received.take(5, 2), "it is new again");
     }
 
     #[test]

@@ -1,15 +1,16 @@
 //! The station's side of the link: payloads come in or are called; records come out, each once.
 
 use std::net::SocketAddr;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 
+use quinn::VarInt;
 use tokio::sync::{mpsc, watch};
 
 use super::door::Door;
 use super::keys::Role;
 use super::link_events::{Events, LinkError, LinkEvent};
-use super::peer::Peer;
+use super::peer::{Peer, close};
 use super::ranges::RangeSet;
 use super::receive;
 use super::station_shared::{FromPayload, PayloadState, PayloadStatus, Recall, StationShared, lock};
@@ -41,6 +42,28 @@ impl StationHandle {
         if let Some(state) = state {
             lock(&state.received).stored(run, numbers);
             state.stored.notify_one();
+        }
+    }
+
+    /// Numbers of a run are not on disk, or not any more: they are asked for again.
+    pub fn forget(&self, payload: &str, run: u32, numbers: &RangeSet) {
+        let state = lock(&self.shared.payloads).get(payload).cloned();
+        if let Some(state) = state {
+            lock(&state.received).forget(run, numbers);
+        }
+    }
+
+    /// While the disk takes nothing, nothing is asked for again.
+    pub fn hold(&self, holding: bool) {
+        self.shared.holding.store(holding, Ordering::Relaxed);
+    }
+
+    /// Ends the session of a payload that sends what is not kept.
+    pub fn dismiss(&self, payload: &str, why: &str) {
+        let state = lock(&self.shared.payloads).get(payload).cloned();
+        if let Some(state) = state {
+            let code = VarInt::from_u32(close::EXCESS);
+            lock(&state.peer).connection.close(code, why.as_bytes());
         }
     }
 
@@ -91,6 +114,7 @@ impl StationLink {
             recall,
             records,
             thumbnails: settings.thumbnails,
+            holding: AtomicBool::new(false),
             events,
         });
         let handle = StationHandle { shared: Arc::clone(&shared) };

@@ -113,6 +113,8 @@ pub(super) struct StationShared {
     pub(super) recall: Recall,
     pub(super) records: mpsc::Sender<FromPayload>,
     pub(super) thumbnails: bool,
+    /// Whether the disk takes nothing now.
+    pub(super) holding: AtomicBool,
     pub(super) events: Events,
 }
 

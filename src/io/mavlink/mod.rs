@@ -1,36 +1,41 @@
-//! MAVLink 2 over UDP: the vehicles as a ground station's map and ArduPilot's Follow mode want them.
+//! MAVLink 2 over UDP: the vehicles as ground stations, and autopilots that follow or land, want them.
 //!
-//! Written here rather than taken from the `mavlink` crate: four messages of fixed layout against a
-//! dialect of hundreds that would have to be compiled. Only sends, unless a signing key is set: then
-//! signed datagrams of stations are counted, and others refused.
+//! [`Teller`] makes the frames out of the pipeline's outputs, [`MavlinkSender`] sends them. What comes in is looked at
+//! for three things: commands to the camera, others that use our system ids, and signatures where a key is set.
 
+mod camera;
+pub mod companion;
+mod helicopter;
 pub mod messages;
+mod motion;
 pub mod packet;
 mod stations;
+mod teller;
+mod told;
 mod vehicle;
 
 pub use stations::{Found, Station, StationNews, look_up};
+pub use teller::Teller;
 
+use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
-use crate::config::MavlinkConfig;
+use crate::config::Config;
+use crate::io::autopilot::ToAutopilot;
 use crate::io::link::keys::{KeyError, read_private};
-use windhover_base::geo::Geodetic;
-use windhover_base::msg::{EstimatorOutput, Output, SensorReading, TargetState, TrackStatus};
-use windhover_base::settings::{GroundConfig, TargetConfig};
+use windhover_base::msg::Output;
 use windhover_base::time::{MonoTime, Span, UtcTime};
+use windhover_decode::{MavlinkFrame, MavlinkFrames};
 
-use messages::VehicleMessages;
 use packet::{Refused, Sender, SigningKey};
 use stations::Stations;
-use vehicle::{Limits, Said, Vehicle};
 
-/// MAV_COMP_ID_AUTOPILOT1: ground stations draw vehicles for this component only.
-const COMPONENT: u8 = 1;
-/// Heartbeats, as the protocol wants them.
-const HEARTBEAT_EVERY: Span = Span::from_ns(1_000_000_000);
 /// A signature older than this is a replay (message signing guide: one minute).
 const REPLAY_WINDOW: u64 = 6_000_000;
+/// Nothing is sent of a target for so long after another system was heard under its id.
+const STANDS_BACK: Span = Span::from_ns(10_000_000_000);
+/// Frames of ours that are known again where a router sends them back.
+const OWN_FRAMES: usize = 512;
 
 /// Why MAVLink could not be opened.
 #[derive(Debug, thiserror::Error)]
@@ -49,103 +54,56 @@ pub enum MavlinkError {
 /// What came in.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct MavlinkCounts {
-    /// Signed datagrams heard.
+    /// Frames heard, and signed where a key is set.
     pub heard: u64,
-    /// Datagrams refused: unsigned, of another key, replayed, no MAVLink.
+    /// Datagrams refused where a key is set: unsigned, of another key, replayed, no MAVLink.
     pub refused: u64,
-}
-
-/// One target, and how far its system id has counted.
-#[derive(Clone, Debug)]
-struct System {
-    vehicle: Vehicle,
-    reference_m: f64,
-    sequence: u8,
+    /// Frames of others under a system id of ours.
+    pub foreign: u64,
 }
 
 /// Sends the vehicles. Nothing here blocks.
 pub struct MavlinkSender {
+    teller: Teller,
     stations: Stations,
-    system_id: u8,
-    systems: Vec<System>,
-    limits: Limits,
-    /// Time between two rounds of positions.
-    period: Span,
-    key: Option<(SigningKey, u8)>,
-    elevation_msl_m: Option<f64>,
-    datum: Option<Geodetic>,
-    geoid_m: Option<f64>,
-    utc_from_host_ns: Option<i64>,
-    started: Option<MonoTime>,
-    heartbeat: Option<MonoTime>,
-    positions: Option<MonoTime>,
-    stamp: u64,
+    targets: usize,
+    key: Option<SigningKey>,
     heard_stamp: u64,
+    /// Checks of what was sent lately.
+    sent: VecDeque<u32>,
+    frames: Vec<Vec<u8>>,
     counts: MavlinkCounts,
+    news: Vec<StationNews>,
+}
+
+/// The key that messages are signed with, where one is configured. Reads a file.
+pub fn signing_key(path: Option<&str>) -> Result<Option<SigningKey>, MavlinkError> {
+    let Some(path) = path.map(Path::new) else { return Ok(None) };
+    let text = read_private(path)?;
+    SigningKey::from_hex(&text).map(Some).ok_or_else(|| MavlinkError::NotAKey(path.into()))
 }
 
 impl MavlinkSender {
-    /// As configured, for these targets over this ground.
-    pub fn open(
-        mavlink: &MavlinkConfig,
-        targets: &[TargetConfig],
-        ground: &GroundConfig,
-    ) -> Result<Self, MavlinkError> {
-        let key = match &mavlink.signing_key {
-            Some(path) => {
-                let path = Path::new(path);
-                let text = read_private(path)?;
-                let key = SigningKey::from_hex(&text).ok_or_else(|| MavlinkError::NotAKey(path.into()))?;
-                Some((key, mavlink.signing_link_id))
-            }
-            None => None,
-        };
-        let system = |t: &TargetConfig| System {
-            vehicle: Vehicle::default(),
-            reference_m: t.reference_m,
-            sequence: 0,
-        };
+    /// As configured; what goes to the autopilot goes by its own link.
+    pub fn open(config: &Config, to_autopilot: ToAutopilot) -> Result<Self, MavlinkError> {
+        let mavlink = &config.mavlink;
+        let key = signing_key(mavlink.signing_key.as_deref())?;
         Ok(Self {
-            stations: Stations::open(&mavlink.send_to).map_err(MavlinkError::Socket)?,
-            system_id: mavlink.system_id,
-            systems: targets.iter().map(system).collect(),
-            limits: Limits {
-                max_age: Span::from_s(mavlink.max_age_s),
-                max_sigma_m: mavlink.max_sigma_m,
-                coast: Span::from_s(mavlink.coast_s),
-            },
-            period: Span::from_s(1.0 / mavlink.rate_hz),
+            stations: Stations::open(&mavlink.send_to, to_autopilot).map_err(MavlinkError::Socket)?,
+            teller: Teller::new(mavlink, &config.target, &config.ground, &config.camera, key.clone()),
+            targets: config.target.len(),
             key,
-            elevation_msl_m: ground.elevation_msl_m,
-            datum: None,
-            geoid_m: None,
-            utc_from_host_ns: None,
-            started: None,
-            heartbeat: None,
-            positions: None,
-            stamp: 0,
             heard_stamp: 0,
+            sent: VecDeque::with_capacity(OWN_FRAMES),
+            frames: Vec::new(),
             counts: MavlinkCounts::default(),
+            news: Vec::new(),
         })
     }
 
     /// Takes what it needs of the pipeline's outputs.
     pub fn output(&mut self, output: &Output) {
-        match output {
-            Output::Estimator(EstimatorOutput::Estimate(estimate) | EstimatorOutput::Coasted(estimate)) => {
-                if let Some(system) = self.systems.get_mut(estimate.target) {
-                    system.vehicle.take(estimate);
-                }
-            }
-            Output::Datum(_, datum) => self.datum = Some(*datum),
-            Output::Reading(SensorReading::Gnss(fix)) => {
-                self.geoid_m = fix.value.geoid_m.or(self.geoid_m);
-                if let Some(utc) = fix.value.utc {
-                    self.utc_from_host_ns = Some(utc.unix_ns() - fix.t_valid.ns());
-                }
-            }
-            _ => {}
-        }
+        self.teller.output(output);
     }
 
     /// What came in so far.
@@ -160,7 +118,9 @@ impl MavlinkSender {
 
     /// What became of stations since this was last asked.
     pub fn news(&mut self) -> Vec<StationNews> {
-        self.stations.news()
+        let mut news = std::mem::take(&mut self.news);
+        news.extend(self.stations.news());
+        news
     }
 
     /// Names of stations that are to be looked up at `now`.
@@ -173,105 +133,76 @@ impl MavlinkSender {
         self.stations.found(found);
     }
 
-    /// How often [`Self::send`] is to be called: at the rate of positions, and at that of heartbeats at least.
+    /// How often [`Self::send`] is to be called.
     pub fn every(&self) -> Span {
-        self.period.min(HEARTBEAT_EVERY)
+        self.teller.every()
     }
 
-    /// Altitude of the ground under a vehicle above mean sea level: of level ground as configured, else by the geoid,
-    /// higher or lower by what the terrain is there. Where the receiver tells no geoid, the height above the ellipsoid
-    /// stands in.
-    fn ground_msl_m(&self, state: &TargetState) -> Option<f64> {
-        let datum = self.datum?;
-        let level = self.elevation_msl_m.unwrap_or_else(|| datum.height_m - self.geoid_m.unwrap_or(0.0));
-        Some(level + state.height_m - datum.height_m)
-    }
-
-    /// Sends heartbeats once a second, and the state of every vehicle of which something may be said
-    /// (`vehicle.rs`); call it as often as [`Self::every`] says. Signed messages wait until the receiver told UTC,
-    /// for signatures carry the time.
+    /// Looks at what came in and sends what is due.
     pub fn send(&mut self, now: MonoTime) {
-        let utc = self.utc_from_host_ns.map(|ahead| UtcTime::from_unix_ns(now.ns().saturating_add(ahead)));
-        let started = *self.started.get_or_insert(now);
-        self.listen(utc);
-        if self.key.is_some() && utc.is_none() {
-            return;
-        }
-        // A round that comes a little early is this one's all the same.
-        let early = Span::from_s(0.5 * self.every().s());
-        let due = |last: Option<MonoTime>, period| last.is_none_or(|last| now - last + early >= period);
-        let (beat, positions) = (due(self.heartbeat, HEARTBEAT_EVERY), due(self.positions, self.period));
-        for index in 0..self.systems.len() {
-            let said = self.systems[index].vehicle.said(now, &self.limits);
-            if beat {
-                self.put(index, messages::HEARTBEAT, &messages::heartbeat(status(&said)), utc);
+        let mut frames = std::mem::take(&mut self.frames);
+        self.listen(now, &mut frames);
+        self.teller.tell(now, &mut frames);
+        for frame in frames.drain(..) {
+            if self.sent.len() == OWN_FRAMES {
+                self.sent.pop_front();
             }
-            if let Said::Seen(t, state) | Said::Predicted(t, state) = said
-                && positions
-            {
-                self.put_state(index, messages::since_start_ms(started, t), &state, utc);
-            }
+            self.sent.push_back(crc32fast::hash(&frame));
+            self.stations.send(&frame);
         }
-        self.heartbeat = if beat { Some(now) } else { self.heartbeat };
-        self.positions = if positions { Some(now) } else { self.positions };
+        self.frames = frames;
     }
 
-    fn put_state(&mut self, index: usize, time_boot_ms: u64, state: &TargetState, utc: Option<UtcTime>) {
-        let Some(alt_msl_m) = self.ground_msl_m(state) else { return };
-        let reference_m = self.systems[index].reference_m;
-        let vehicle = VehicleMessages { time_boot_ms, state: *state, alt_msl_m, reference_m };
-        if !vehicle.is_finite() {
-            return;
-        }
-        self.put(index, messages::GLOBAL_POSITION_INT, &vehicle.global_position_int(), utc);
-        self.put(index, messages::ATTITUDE, &vehicle.attitude(), utc);
-        self.put(index, messages::FOLLOW_TARGET, &vehicle.follow_target(), utc);
-    }
-
-    /// Sends a message of a target to every station.
-    fn put(&mut self, index: usize, kind: packet::Kind, payload: &[u8], utc: Option<UtcTime>) {
-        let system = self.system_id.saturating_add(u8::try_from(index).unwrap_or(u8::MAX));
-        let sender = Sender { system, component: COMPONENT };
-        let sequence = &mut self.systems[index].sequence;
-        let mut bytes = packet::encode(*sequence, sender, kind, payload, self.key.is_some());
-        *sequence = sequence.wrapping_add(1);
-        if let (Some((key, link_id)), Some(utc)) = (&self.key, utc) {
-            // Never the same or an earlier stamp, whatever the clock does.
-            self.stamp = packet::time_stamp(utc).max(self.stamp + 1);
-            packet::sign(&mut bytes, key, *link_id, self.stamp);
-        }
-        self.stations.send(&bytes);
-    }
-
-    /// Empties the sockets: without a key nothing is even looked at.
-    fn listen(&mut self, utc: Option<UtcTime>) {
-        let mut buffer = [0; 512];
+    /// Empties the sockets.
+    fn listen(&mut self, now: MonoTime, answers: &mut Vec<Vec<u8>>) {
+        let utc = self.teller.utc(now);
+        let mut buffer = [0; 2048];
         for _ in 0..64 {
             let Some(length) = self.stations.receive(&mut buffer) else { return };
-            let Some((key, _)) = &self.key else { continue };
-            let verdict = packet::verify(&buffer[..length], key).and_then(|(_, _, stamp)| {
+            self.datagram(&buffer[..length], now, utc, answers);
+        }
+    }
+
+    fn datagram(&mut self, bytes: &[u8], now: MonoTime, utc: Option<UtcTime>, answers: &mut Vec<Vec<u8>>) {
+        if let Some(key) = &self.key {
+            let verdict = packet::verify(bytes, key).and_then(|(_, _, stamp)| {
                 let now = utc.map_or(0, packet::time_stamp);
                 let fresh = stamp > self.heard_stamp && stamp.saturating_add(REPLAY_WINDOW) > now;
                 if fresh { Ok(stamp) } else { Err(Refused::Replayed) }
             });
             match verdict {
-                Ok(stamp) => {
-                    self.heard_stamp = stamp;
-                    self.counts.heard += 1;
+                Ok(stamp) => self.heard_stamp = stamp,
+                Err(_) => {
+                    self.counts.refused += 1;
+                    return;
                 }
-                Err(_) => self.counts.refused += 1,
             }
         }
+        if self.sent.contains(&crc32fast::hash(bytes)) {
+            return;
+        }
+        let mut heard = Vec::new();
+        MavlinkFrames::default().push(bytes, &mut heard);
+        for frame in heard {
+            self.counts.heard += 1;
+            self.frame(&frame, now, answers);
+        }
     }
-}
 
-/// The track that a heartbeat tells: it is active while positions of a vehicle in sight go out, critical while
-/// predicted ones do, and on standby where none do.
-fn status(said: &Said) -> TrackStatus {
-    match said {
-        Said::Seen(..) => TrackStatus::Tracking,
-        Said::Predicted(..) => TrackStatus::Coasting,
-        Said::Nothing => TrackStatus::Lost,
+    fn frame(&mut self, frame: &MavlinkFrame, now: MonoTime, answers: &mut Vec<Vec<u8>>) {
+        if let Some(index) = (0..self.targets).find(|&k| self.teller.system_id(k) == frame.system) {
+            self.counts.foreign += 1;
+            self.teller.stand_back(index, now + STANDS_BACK);
+            let fault = format!(
+                "another system uses id {}: nothing is sent of it for {:.0} s; set mavlink.system_id",
+                frame.system,
+                STANDS_BACK.s()
+            );
+            let name = format!("system {}", frame.system);
+            self.news.push(StationNews { name, fault: Some(fault) });
+        }
+        let from = Sender { system: frame.system, component: frame.component };
+        self.teller.asked(from, &frame.message, now, answers);
     }
 }
 

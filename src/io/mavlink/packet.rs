@@ -1,11 +1,14 @@
-//! MAVLink 2 frames: header, truncated payload, checksum, optional signature.
+//! MAVLink 2 frames: put together, signed and verified with the `mavlink` crate.
 //!
 //! Source: <https://mavlink.io/en/guide/serialization.html>, <https://mavlink.io/en/guide/message_signing.html>.
+
+use mavlink::dialects::development::MavMessage;
+use mavlink::{MAVLinkV2MessageRaw, MavHeader};
 
 use windhover_base::time::UtcTime;
 
 /// First byte of a MAVLink 2 frame.
-pub const MAGIC: u8 = 0xfd;
+const MAGIC: u8 = 0xfd;
 /// Bytes of the header, the magic included.
 const HEADER: usize = 10;
 /// Bytes of the checksum.
@@ -16,9 +19,6 @@ const SIGNATURE: usize = 13;
 const SIGNED: u8 = 0x01;
 /// Signatures count in units of 10 µs from 2015-01-01T00:00:00Z.
 const SIGNATURE_EPOCH_UNIX_NS: i64 = 1_420_070_400 * 1_000_000_000;
-
-/// CRC-16/MCRF4XX, "X.25" in MAVLink's words.
-const CRC: crc::Crc<u16> = crc::Crc::<u16>::new(&crc::CRC_16_MCRF4XX);
 
 /// A signing key: 32 secret bytes.
 #[derive(Clone, PartialEq, Eq)]
@@ -45,25 +45,12 @@ impl SigningKey {
         Some(Self(key))
     }
 
-    /// First 48 bits of SHA-256(key, frame up to the checksum's end, link id, time stamp).
-    fn sign(&self, frame: &[u8], link_id_and_time: &[u8]) -> [u8; 6] {
-        let mut context = ring::digest::Context::new(&ring::digest::SHA256);
-        context.update(&self.0);
-        context.update(frame);
-        context.update(link_id_and_time);
+    /// First 48 bits of SHA-256 over key, frame, link id and time stamp.
+    fn signature(&self, raw: &MAVLinkV2MessageRaw) -> [u8; 6] {
         let mut first = [0; 6];
-        first.copy_from_slice(&context.finish().as_ref()[..6]);
+        raw.calculate_signature(&self.0, &mut first);
         first
     }
-}
-
-/// A message's place in the dialect.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub struct Kind {
-    /// Message id, 24 bits.
-    pub id: u32,
-    /// Seed of the checksum, from the message's definition.
-    pub crc_extra: u8,
 }
 
 /// Who sends.
@@ -75,36 +62,37 @@ pub struct Sender {
     pub component: u8,
 }
 
-/// Puts a frame together.
-pub fn encode(sequence: u8, sender: Sender, kind: Kind, payload: &[u8], signed: bool) -> Vec<u8> {
-    // Trailing zeros are left out; one byte stays.
-    let used = payload.iter().rposition(|b| *b != 0).map_or(1, |last| last + 1).min(payload.len());
-    let id = kind.id.to_le_bytes();
-    let flags = if signed { SIGNED } else { 0 };
-    let mut frame = vec![MAGIC, used as u8, flags, 0, sequence, sender.system, sender.component];
-    frame.extend_from_slice(&id[..3]);
-    frame.extend_from_slice(&payload[..used]);
-    let checksum = checksum(&frame, kind.crc_extra);
-    frame.extend_from_slice(&checksum.to_le_bytes());
-    frame
+/// How a frame is signed.
+#[derive(Clone, Copy, Debug)]
+pub struct Signature<'a> {
+    /// The secret.
+    pub key: &'a SigningKey,
+    /// Link id that goes with it.
+    pub link_id: u8,
+    /// Time stamp, units of 10 µs since 2015; each greater than the one before.
+    pub time_stamp: u64,
 }
 
-/// Checksum of a frame without it, over everything but the magic and then the message's seed.
-fn checksum(frame: &[u8], crc_extra: u8) -> u16 {
-    let mut digest = CRC.digest();
-    digest.update(&frame[1..]);
-    digest.update(&[crc_extra]);
-    digest.finalize()
-}
-
-/// Appends the signature to a frame made with `signed`.
-pub fn sign(frame: &mut Vec<u8>, key: &SigningKey, link_id: u8, time_stamp: u64) {
-    let mut block = [0; 7];
-    block[0] = link_id;
-    block[1..].copy_from_slice(&time_stamp.to_le_bytes()[..6]);
-    let signature = key.sign(frame, &block);
-    frame.extend_from_slice(&block);
-    frame.extend_from_slice(&signature);
+/// Puts a frame together, signed where `signature` says how.
+pub fn encode(
+    sequence: u8,
+    sender: Sender,
+    message: &MavMessage,
+    signature: Option<Signature<'_>>,
+) -> Vec<u8> {
+    let header = MavHeader { system_id: sender.system.into(), component_id: sender.component, sequence };
+    let mut raw = MAVLinkV2MessageRaw::new();
+    match signature {
+        None => raw.serialize_message(header, message),
+        Some(Signature { key, link_id, time_stamp }) => {
+            raw.serialize_message_for_signing(header, message);
+            *raw.signature_link_id_mut() = link_id;
+            raw.signature_timestamp_bytes_mut().copy_from_slice(&time_stamp.to_le_bytes()[..6]);
+            let value = key.signature(&raw);
+            raw.signature_value_mut().copy_from_slice(&value);
+        }
+    }
+    raw.raw_bytes().to_vec()
 }
 
 /// A signature's time stamp for a UTC time.
@@ -128,7 +116,7 @@ pub enum Refused {
 /// Checks that a datagram is one signed frame; gives its sender, message id and time stamp. The checksum
 /// needs the message's definition and is covered by the signature anyway.
 pub fn verify(datagram: &[u8], key: &SigningKey) -> Result<(Sender, u32, u64), Refused> {
-    let &[MAGIC, length, incompatible, _, _, system, component, i0, i1, i2, ..] = datagram else {
+    let &[MAGIC, length, incompatible, ..] = datagram else {
         return Err(Refused::Malformed);
     };
     let frame_length = HEADER + usize::from(length) + CHECKSUM;
@@ -142,44 +130,48 @@ pub fn verify(datagram: &[u8], key: &SigningKey) -> Result<(Sender, u32, u64), R
     if datagram.len() != frame_length + SIGNATURE {
         return Err(Refused::Malformed);
     }
-    let (frame, block) = datagram.split_at(frame_length);
-    if key.sign(frame, &block[..7]) != block[7..] {
+    let mut raw = MAVLinkV2MessageRaw::new();
+    raw.as_mut_slice()[..datagram.len()].copy_from_slice(datagram);
+    if key.signature(&raw) != raw.signature_value() {
         return Err(Refused::WrongKey);
     }
-    let mut stamp = [0; 8];
-    stamp[..6].copy_from_slice(&block[1..7]);
-    Ok((Sender { system, component }, u32::from_le_bytes([i0, i1, i2, 0]), u64::from_le_bytes(stamp)))
+    let sender = Sender { system: datagram[5], component: raw.component_id() };
+    Ok((sender, raw.message_id(), raw.signature_timestamp()))
 }
 
 #[cfg(test)]
 mod tests {
+    use mavlink::dialects::development::{HEARTBEAT_DATA, MavAutopilot, MavModeFlag, MavState, MavType};
     use proptest::prelude::*;
 
     use super::*;
 
-    const HEARTBEAT: Kind = Kind { id: 0, crc_extra: 50 };
     const SENDER: Sender = Sender { system: 42, component: 1 };
 
+    fn heartbeat() -> MavMessage {
+        MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+            custom_mode: 0,
+            mavtype: MavType::MAV_TYPE_GROUND_ROVER,
+            autopilot: MavAutopilot::MAV_AUTOPILOT_GENERIC,
+            base_mode: MavModeFlag::empty(),
+            system_status: MavState::MAV_STATE_ACTIVE,
+            mavlink_version: 3,
+        })
+    }
+
+    fn signed(key: &SigningKey) -> Vec<u8> {
+        let signature = Signature { key, link_id: 3, time_stamp: 0x0102_0304_0506 };
+        encode(7, SENDER, &heartbeat(), Some(signature))
+    }
+
     #[test]
-    fn a_heartbeat_is_byte_for_byte_what_pymavlink_makes() {
+    fn heartbeats_are_byte_for_byte_what_pymavlink_makes() {
         // pymavlink 2.4.50: MAVLink_heartbeat_message(10, 0, 0, 0, 4, 3), sequence 7, system 42, component 1.
-        let payload = [0, 0, 0, 0, 10, 0, 0, 4, 3];
         let want = hex("fd090000072a01000000000000000a00000403489d");
-        assert_eq!(encode(7, SENDER, HEARTBEAT, &payload, false), want);
-    }
-
-    #[test]
-    fn a_signed_heartbeat_is_byte_for_byte_what_pymavlink_makes() {
+        assert_eq!(encode(7, SENDER, &heartbeat(), None), want);
         // The same with key 0707…07, link id 3, time stamp 0x010203040506.
-        let payload = [0, 0, 0, 0, 10, 0, 0, 4, 3];
-        let mut frame = encode(7, SENDER, HEARTBEAT, &payload, true);
-        sign(&mut frame, &SigningKey([7; 32]), 3, 0x0102_0304_0506);
-        assert_eq!(frame, hex("fd090100072a01000000000000000a00000403af650306050403020162df0c2c8a33"));
-    }
-
-    #[test]
-    fn the_checksum_of_the_standard_check_string() {
-        assert_eq!(CRC.checksum(b"123456789"), 0x6f91);
+        let want = hex("fd090100072a01000000000000000a00000403af650306050403020162df0c2c8a33");
+        assert_eq!(signed(&SigningKey([7; 32])), want);
     }
 
     fn hex(text: &str) -> Vec<u8> {
@@ -190,8 +182,7 @@ mod tests {
     #[test]
     fn signatures_are_believed_from_our_key_only() {
         let key = SigningKey([7; 32]);
-        let mut frame = encode(1, SENDER, HEARTBEAT, &[1, 2, 3], true);
-        sign(&mut frame, &key, 3, 0x0102_0304_0506);
+        let frame = signed(&key);
         assert_eq!(verify(&frame, &key), Ok((SENDER, 0, 0x0102_0304_0506)));
         assert_eq!(verify(&frame, &SigningKey([8; 32])), Err(Refused::WrongKey));
         for at in 1..frame.len() {
@@ -199,7 +190,7 @@ mod tests {
             changed[at] ^= 0x10;
             assert!(verify(&changed, &key).is_err(), "byte {at} changed");
         }
-        let unsigned = encode(1, SENDER, HEARTBEAT, &[1, 2, 3], false);
+        let unsigned = encode(1, SENDER, &heartbeat(), None);
         assert_eq!(verify(&unsigned, &key), Err(Refused::Unsigned));
     }
 

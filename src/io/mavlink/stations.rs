@@ -5,6 +5,8 @@ use std::net::{SocketAddr, ToSocketAddrs as _, UdpSocket};
 
 use socket2::{Domain, Protocol, Socket, Type};
 
+use crate::config::AUTOPILOT;
+use crate::io::autopilot::ToAutopilot;
 use windhover_base::time::{MonoTime, Span};
 
 /// Names of stations are looked up again after this long where that failed, or where sending fails.
@@ -78,6 +80,7 @@ pub struct Stations {
     v4: UdpSocket,
     /// Opened for the first station that has an IPv6 address; `None` before, and on a computer without IPv6.
     v6: Option<UdpSocket>,
+    to_autopilot: ToAutopilot,
     all: Vec<Station>,
     asked: Option<MonoTime>,
     news: Vec<StationNews>,
@@ -85,12 +88,12 @@ pub struct Stations {
 
 impl Stations {
     /// With these names, none of them found yet. Datagrams may be broadcast.
-    pub fn open(names: &[String]) -> io::Result<Self> {
+    pub fn open(names: &[String], to_autopilot: ToAutopilot) -> io::Result<Self> {
         let v4 = UdpSocket::bind("0.0.0.0:0")?;
         v4.set_broadcast(true)?;
         v4.set_nonblocking(true)?;
         let all = names.iter().map(|name| Station { name: name.clone(), ..Station::default() }).collect();
-        Ok(Self { v4, v6: None, all, asked: None, news: Vec::new() })
+        Ok(Self { v4, v6: None, to_autopilot, all, asked: None, news: Vec::new() })
     }
 
     /// The stations.
@@ -105,7 +108,8 @@ impl Stations {
 
     /// Names that are to be looked up at `now`: those that have no address, or where sending fails.
     pub fn unresolved(&mut self, now: MonoTime) -> Option<Vec<String>> {
-        let wanted = self.all.iter().filter(|s| s.address.is_none() || s.fault.is_some());
+        let missing = |s: &&Station| s.name != AUTOPILOT && (s.address.is_none() || s.fault.is_some());
+        let wanted = self.all.iter().filter(missing);
         let names: Vec<String> = wanted.map(|station| station.name.clone()).collect();
         if names.is_empty() || self.asked.is_some_and(|last| now - last < RESOLVE_EVERY) {
             return None;
@@ -133,6 +137,11 @@ impl Stations {
     /// Sends a datagram to every station that has an address.
     pub fn send(&mut self, bytes: &[u8]) {
         for station in &mut self.all {
+            if station.name == AUTOPILOT {
+                self.to_autopilot.send(bytes);
+                station.sent += 1;
+                continue;
+            }
             let Some(address) = station.address else { continue };
             let socket = if address.is_ipv4() { Some(&self.v4) } else { self.v6.as_ref() };
             let sent = match socket {
@@ -176,7 +185,7 @@ mod tests {
 
     fn to(names: &[&str]) -> Stations {
         let names: Vec<String> = names.iter().map(|&name| name.to_owned()).collect();
-        let mut stations = Stations::open(&names).expect("sockets");
+        let mut stations = Stations::open(&names, ToAutopilot::default()).expect("sockets");
         let unresolved = stations.unresolved(MonoTime::default()).expect("all are to be looked up");
         stations.found(look_up(unresolved));
         stations

@@ -1,5 +1,6 @@
 //! What may be said of a vehicle: a state that is fresh, sure, and was seen a moment ago; nothing else.
 
+use super::motion::SpeedRate;
 use windhover_base::msg::{TargetEstimate, TargetState, TrackStatus};
 use windhover_base::time::{MonoTime, Span};
 
@@ -26,11 +27,12 @@ pub enum Said {
 }
 
 /// A vehicle as the pipeline last told of it.
-#[derive(Clone, Copy, PartialEq, Debug, Default)]
+#[derive(Clone, PartialEq, Debug, Default)]
 pub struct Vehicle {
     latest: Option<TargetEstimate>,
     /// When it was last seen and settled.
     seen: Option<MonoTime>,
+    rate: SpeedRate,
 }
 
 impl Vehicle {
@@ -39,10 +41,19 @@ impl Vehicle {
         if self.latest.is_some_and(|latest| estimate.t_valid < latest.t_valid) {
             return;
         }
-        if estimate.status == TrackStatus::Tracking {
-            self.seen = Some(estimate.t_valid);
+        match (estimate.status, &estimate.state) {
+            (TrackStatus::Tracking, Some(state)) => {
+                self.seen = Some(estimate.t_valid);
+                self.rate.take(estimate.t_valid, state);
+            }
+            _ => self.rate.clear(),
         }
         self.latest = Some(*estimate);
+    }
+
+    /// How its speed changes, m/s²; 0 while it is not seen.
+    pub fn rate_mps2(&self) -> f64 {
+        self.rate.mps2()
     }
 
     /// What is said of it at `now`.
@@ -53,7 +64,7 @@ impl Vehicle {
         let fresh = (now - t_valid).abs() <= limits.max_age;
         // What cannot be compared is not sure.
         let sure = state.relative_sigma_m.is_some_and(|sigma_m| sigma_m <= limits.max_sigma_m);
-        let lately = self.seen.is_some_and(|seen| t_valid - seen <= limits.coast);
+        let lately = self.seen.is_some_and(|seen| now.max(t_valid) - seen <= limits.coast);
         match status {
             _ if !(fresh && sure) => Said::Nothing,
             TrackStatus::Tracking => Said::Seen(t_valid, state),

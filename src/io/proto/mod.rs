@@ -17,6 +17,8 @@ pub mod link {
     include!(concat!(env!("OUT_DIR"), "/windhover.link.rs"));
 }
 
+mod sound;
+
 use prost::Message as _;
 use prost_types::{FileDescriptorSet, Timestamp};
 

@@ -10,7 +10,7 @@ use super::{Record, Schema, topic, warm_message};
 use crate::io::proto::{foxglove, host_time, timestamp, windhover};
 use windhover_base::geo::Tilt;
 use windhover_base::msg::{
-    AttitudeSample, Delivery, Event, EventBody, FrameEncoding, FramePayload, InertialSample, Source,
+    AttitudeSample, Bayer, Delivery, Event, EventBody, FrameEncoding, FramePayload, InertialSample, Source,
 };
 use windhover_base::time::MonoTime;
 
@@ -18,13 +18,21 @@ use windhover_base::time::MonoTime;
 const CAMERA_FRAME: &str = "camera";
 
 /// Uncompressed encodings by their names in `foxglove.RawImage`: the first is written, all are read.
-const RAW_ENCODINGS: [(FrameEncoding, &[&str]); 6] = [
+const RAW_ENCODINGS: [(FrameEncoding, &[&str]); 14] = [
     (FrameEncoding::Grey, &["mono8", "8UC1"]),
     (FrameEncoding::Yuyv, &["yuv422_yuy2", "yuyv"]),
     (FrameEncoding::Uyvy, &["yuv422", "uyvy"]),
     (FrameEncoding::Nv12, &["nv12"]),
     (FrameEncoding::Rgb24, &["rgb8"]),
     (FrameEncoding::Bgr24, &["bgr8", "8UC3"]),
+    (FrameEncoding::Bayer(Bayer::Rggb), &["bayer_rggb8"]),
+    (FrameEncoding::Bayer(Bayer::Bggr), &["bayer_bggr8"]),
+    (FrameEncoding::Bayer(Bayer::Gbrg), &["bayer_gbrg8"]),
+    (FrameEncoding::Bayer(Bayer::Grbg), &["bayer_grbg8"]),
+    (FrameEncoding::Y10, &["mono10"]),
+    (FrameEncoding::Y12, &["mono12"]),
+    (FrameEncoding::Y16, &["mono16", "16UC1"]),
+    (FrameEncoding::Y10Packed, &["mono10p"]),
 ];
 
 /// Compressed encodings by their names in `foxglove.CompressedImage`, likewise.

@@ -286,6 +286,8 @@ pub fn health(now: &Health, names: &[String]) -> wh::Health {
         targets: targets.collect(),
         fix: fix_number(now.fix),
         sats: now.sats.unwrap_or(0),
+        hdop: now.hdop,
+        geoid_m: now.geoid_m,
         clock_sigma_ms: now.clock_sigma.map_or(-1.0, |s| s.ms()),
         utc_minus_host_ns: now.utc_minus_host.map(|ahead| ahead.ns()),
         misfits: now.misfits.iter().map(misfit).collect(),

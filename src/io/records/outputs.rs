@@ -79,6 +79,8 @@ impl OutputEncoder {
             }
             Output::Reading(SensorReading::Gnss(epoch)) => fix(epoch, log, out),
             Output::Reading(SensorReading::Attitude(sample)) => out.push(attitude_record(sample, log)),
+            // What an autopilot says is recorded as its bytes.
+            Output::Reading(_) => {}
             Output::Detections { frame, t_valid, markers, features } => {
                 let whole = detections(*frame, *t_valid, markers, features);
                 out.push(record(topic::CAMERA_DETECTIONS.into(), Schema::Detections, log, *t_valid, &whole));

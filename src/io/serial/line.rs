@@ -1,4 +1,4 @@
-//! An open serial line, waited for by readiness.
+//! An open line, waited for by readiness.
 
 use std::io::{ErrorKind as IoKind, Read, Write};
 use std::path::Path;
@@ -8,6 +8,7 @@ use serialport::TTYPort;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
+use super::network::{Network, is_network};
 use super::{SerialSettings, unplugged};
 use crate::io::device::{Fault, FaultKind, Opened, OwnsDescriptor, blocking, register};
 
@@ -19,32 +20,40 @@ unsafe impl OwnsDescriptor for TTYPort {}
 
 /// A line that this program alone has open.
 #[derive(Debug)]
-pub(super) struct Line {
+pub(in crate::io) struct Line {
     device: String,
-    /// Empty only while the port is on a thread for work that blocks.
+    /// Empty where it is on the network, and while the port is on a thread for work that blocks.
     port: Option<Opened<AsyncFd<TTYPort>>>,
+    network: Option<Network>,
 }
 
 impl Line {
     /// Opens the line for this program alone. A device that is busy, missing, forbidden or no serial
     /// line is told apart.
-    pub(super) async fn open(settings: &SerialSettings) -> Result<Self, Fault> {
+    pub(in crate::io) async fn open(settings: &SerialSettings) -> Result<Self, Fault> {
         let SerialSettings { device, baud, .. } = settings.clone();
+        if is_network(&device) {
+            let network = Some(Network::open(&device).await?);
+            return Ok(Self { device, port: None, network });
+        }
         let port = blocking(move || open(&device, baud)).await?;
-        let mut line = Self { device: settings.device.clone(), port: None };
+        let mut line = Self { device: settings.device.clone(), port: None, network: None };
         line.register(port)?;
         Ok(line)
     }
 
     /// Closes the line and waits until it is closed.
-    pub(super) async fn close(self) {
+    pub(in crate::io) async fn close(self) {
         if let Some(port) = self.port {
             port.close().await;
         }
     }
 
     /// Waits for bytes and reads them; how many. Nothing is lost where the future is dropped.
-    pub(super) async fn read(&mut self, buffer: &mut [u8]) -> Result<usize, Fault> {
+    pub(in crate::io) async fn read(&mut self, buffer: &mut [u8]) -> Result<usize, Fault> {
+        if let Some(network) = &mut self.network {
+            return network.read(&self.device, buffer).await;
+        }
         let lost = || unplugged(&self.device);
         let port = self.port.as_deref_mut().ok_or_else(lost)?;
         loop {
@@ -59,7 +68,10 @@ impl Line {
     }
 
     /// Writes bytes.
-    pub(super) async fn write(&mut self, bytes: &[u8]) -> Result<(), Fault> {
+    pub(in crate::io) async fn write(&mut self, bytes: &[u8]) -> Result<(), Fault> {
+        if let Some(network) = &mut self.network {
+            return network.write(&self.device, bytes).await;
+        }
         let lost = || unplugged(&self.device);
         let port = self.port.as_deref_mut().ok_or_else(lost)?;
         let writing = async {

@@ -1,9 +1,11 @@
-//! One serial line as a task: open, wait for bytes, report them, and open again when the line went away.
+//! One line as a task: open, wait for bytes, report them, and open again when the line went away. It may be a
+//! serial line, a connection (`tcp://HOST:PORT`, gpsd too) or a port that listens (`udp://ADDRESS:PORT`).
 
 mod garbled;
 mod garmin;
 mod garmin_speed;
 mod line;
+mod network;
 
 use std::convert::Infallible;
 use std::time::Duration;
@@ -13,13 +15,14 @@ use super::device::{Backoff, Fault, FaultKind, NoteKind, Report, Reports, wait_f
 use garbled::TextShare;
 use garmin::{GarminSetup, Step};
 use garmin_speed::Settling;
-use line::Line;
+pub(super) use line::Line;
 use windhover_base::time::{MonoTime, Span};
 
 /// What a line is and how it is set.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct SerialSettings {
-    /// Path of the device; opened anew by this name each time, so a `by-id` path survives renumbering.
+    /// Path of the device, or its address on the network; opened anew by this name each time, so a `by-id` path
+    /// survives renumbering.
     pub device: String,
     /// Line speed, bits a second.
     pub baud: u32,
@@ -41,7 +44,10 @@ pub async fn run(settings: &SerialSettings, clock: HostClock, reports: Reports<'
     loop {
         let fault = match Line::open(settings).await {
             Ok(line) => {
-                reports(Report::Up(format!("{} at {} baud", settings.device, settings.baud)));
+                reports(Report::Up(match network::is_network(&settings.device) {
+                    true => settings.device.clone(),
+                    false => format!("{} at {} baud", settings.device, settings.baud),
+                }));
                 let mut reader = Reader { line, settings, clock, reports };
                 let fault = match reader.read(&mut backoff).await {
                     Ok(never) => match never {},
@@ -105,6 +111,7 @@ impl Reader<'_> {
     /// Reports where text that arrives is no text.
     fn judge(&self, share: &mut TextShare, bytes: &[u8]) {
         if self.settings.text
+            && !network::is_network(&self.settings.device)
             && let Some(percent) = share.garbled(bytes)
         {
             let (device, baud) = (&self.settings.device, self.settings.baud);

@@ -218,3 +218,57 @@ fn a_receiver_left_in_binary_mode_is_told_to_speak_nmea() {
     assert!(text.contains("was in binary mode"), "{text}");
     line.wait(|r| matches!(r, Report::Bytes(_, bytes) if bytes.starts_with(b"$GPRMC")).then_some(()));
 }
+
+/// What a line hears, in one piece.
+fn heard(line: &Line, count: usize) -> Vec<u8> {
+    let mut all = Vec::new();
+    while all.len() < count {
+        all.extend(line.wait(|r| if let Report::Bytes(_, bytes) = r { Some(bytes) } else { None }));
+    }
+    all
+}
+
+#[test]
+fn a_device_behind_tcp_is_read_and_connected_anew() {
+    let server = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+    let device = format!("tcp://{}", server.local_addr().expect("bound"));
+    let line = Line::start(&device, false);
+    let (mut peer, _) = server.accept().expect("connected");
+    line.up();
+    peer.write_all(b"$GPRMC").expect("sent");
+    assert_eq!(heard(&line, 6), b"$GPRMC");
+    drop(peer);
+    assert_eq!(line.fault().kind, FaultKind::Unplugged);
+    let (mut peer, _) = server.accept().expect("connected again");
+    line.up();
+    peer.write_all(b"again").expect("sent");
+    assert_eq!(heard(&line, 5), b"again");
+    drop((peer, server));
+    assert_eq!(line.fault().kind, FaultKind::Unplugged);
+    assert_eq!(line.fault().kind, FaultKind::Missing, "nothing listens there any more");
+}
+
+#[test]
+fn gpsd_is_asked_for_its_sentences() {
+    let server = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+    let line = Line::start(&format!("tcp://{}", server.local_addr().expect("bound")), false);
+    let (mut gpsd, _) = server.accept().expect("connected");
+    line.up();
+    gpsd.write_all(b"{\"class\":\"VERSION\",\"release\":\"3.25\"}\r\n").expect("sent");
+    let wanted = b"?WATCH={\"enable\":true,\"json\":false,\"nmea\":true};\n";
+    let mut asked = vec![0; wanted.len()];
+    gpsd.read_exact(&mut asked).expect("asked");
+    assert_eq!(asked, wanted);
+}
+
+#[test]
+fn datagrams_are_read_from_whoever_sends_them() {
+    let free = std::net::UdpSocket::bind("127.0.0.1:0").expect("a port").local_addr().expect("bound");
+    let line = Line::start(&format!("udp://{free}"), false);
+    line.up();
+    for text in [b"$GPGGA", b"$GPRMC"] {
+        let sender = std::net::UdpSocket::bind("127.0.0.1:0").expect("a port");
+        sender.send_to(text, free).expect("sent");
+        assert_eq!(heard(&line, 6), text);
+    }
+}

@@ -9,6 +9,7 @@ use image::{ExtendedColorType, ImageEncoder};
 use super::format::Compression;
 use crate::config::{FramePolicy, StoreConfig};
 use crate::jpeg::{self, Layout};
+use crate::pixels;
 use windhover_base::msg::{FrameEncoding, FramePayload};
 
 /// Grey outside the region that is kept.
@@ -106,6 +107,14 @@ fn packed(frame: &FramePayload) -> Option<(Layout, Cow<'_, [u8]>)> {
         FrameEncoding::Yuyv => return Some((Layout::Yuv422, yuv422(frame, [0, 1, 3])?.into())),
         FrameEncoding::Uyvy => return Some((Layout::Yuv422, yuv422(frame, [1, 0, 2])?.into())),
         FrameEncoding::Nv12 => return Some((Layout::Yuv420, nv12(frame)?.into())),
+        // As the detector saw them: the colours of a mosaic are coarser than its grey.
+        FrameEncoding::Bayer(_)
+        | FrameEncoding::Y10
+        | FrameEncoding::Y12
+        | FrameEncoding::Y16
+        | FrameEncoding::Y10Packed => {
+            return Some((Layout::Grey, pixels::decode(frame, false).ok()?.gray.data.into()));
+        }
         FrameEncoding::Jpeg | FrameEncoding::Png | FrameEncoding::Unknown => return None,
     };
     let (row, height) = (frame.width as usize * channels, frame.height as usize);

@@ -8,11 +8,18 @@
 use std::fs::File;
 use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};
+use std::sync::mpsc::RecvTimeoutError;
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
 /// Directory of the index under the store's path.
 pub const INDEX: &str = "index";
+
+/// Longest that sled may take to open an index; a large one after a power cut takes some seconds.
+const PATIENCE: Duration = Duration::from_secs(20);
+/// Nice value of the thread that opens it, which may be left behind.
+const LEAST: i32 = 19;
 
 /// Keys of back-fill records: this byte, run, number.
 const BACKFILL: u8 = b'b';
@@ -134,8 +141,47 @@ pub struct Index {
 }
 
 impl Index {
-    /// Opens the index in directory `dir`, or makes an empty one. A panic inside sled is an error.
+    /// Opens the index in directory `dir`, or makes an empty one, and reads what is asked of it at every start. A panic
+    /// inside sled is an error, and so is an index over which sled broods for longer than [`PATIENCE`]: its thread is left
+    /// behind with the least claim to the processor, and ends with the process.
     pub fn open(dir: &Path) -> Result<Self, IndexError> {
+        let unusable = |reason: &str| IndexError::Unusable { path: dir.to_owned(), reason: reason.into() };
+        let (done, opened) = std::sync::mpsc::sync_channel(1);
+        let of = dir.to_owned();
+        let work = move || {
+            let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), LEAST);
+            let index = Self::open_now(&of).and_then(|index| index.check().map(|()| index));
+            // Where nobody waits any more, what was opened is closed again.
+            let _ = done.send(index);
+        };
+        std::thread::Builder::new()
+            .name("index".into())
+            .spawn(work)
+            .map_err(|error| unusable(&error.to_string()))?;
+        match opened.recv_timeout(PATIENCE) {
+            Ok(outcome) => outcome,
+            Err(RecvTimeoutError::Timeout) => Err(unusable(&format!("it does not open within {PATIENCE:?}"))),
+            Err(RecvTimeoutError::Disconnected) => Err(unusable("sled panicked")),
+        }
+    }
+
+    /// Reads everything but the queue.
+    fn check(&self) -> Result<(), IndexError> {
+        let unusable = |reason: String| IndexError::Unusable { path: self.dir.clone(), reason };
+        let work = || -> sled::Result<()> {
+            for kind in [CURSOR, STATE, SEGMENT, FLIGHT] {
+                // sled gives the same error again and again.
+                self.db.range(vec![kind]..vec![kind + 1]).try_for_each(|item| item.map(drop))?;
+            }
+            Ok(())
+        };
+        match std::panic::catch_unwind(AssertUnwindSafe(work)) {
+            Ok(read) => read.map_err(|error| unusable(error.to_string().replace(" backtrace ()", ""))),
+            Err(_) => Err(unusable("sled panicked".into())),
+        }
+    }
+
+    fn open_now(dir: &Path) -> Result<Self, IndexError> {
         let unusable = |reason: String| IndexError::Unusable { path: dir.to_owned(), reason };
         remove_half_snapshots(dir);
         let fresh = !dir.exists();
@@ -216,9 +262,9 @@ impl Index {
         Ok(())
     }
 
-    fn items(&self, from: Vec<u8>, to: Vec<u8>) -> impl DoubleEndedIterator<Item = (Vec<u8>, Vec<u8>)> {
-        // An entry that cannot be read is as good as none: the segments have it.
-        self.db.range(from..to).flatten().map(|(k, v)| (k.to_vec(), v.to_vec()))
+    fn items(&self, from: Vec<u8>, to: Vec<u8>) -> impl Iterator<Item = (Vec<u8>, Vec<u8>)> {
+        // What cannot be read is as good as none: the segments have it. sled gives its error again and again.
+        self.db.range(from..to).map_while(Result::ok).map(|(k, v)| (k.to_vec(), v.to_vec()))
     }
 
     /// Queued records `first..end` of a run, ascending, as far as the card can be read. An entry that is
@@ -244,7 +290,8 @@ impl Index {
             let (Some(run), Some(first)) = (number(&k[1..]), number(&k[5..])) else { break };
             let behind =
                 run.checked_add(1).map_or(vec![BACKFILL + 1], |r| key(BACKFILL, &[&r.to_be_bytes()]));
-            let last = self.items(k, behind.clone()).next_back().and_then(|(k, _)| number(&k[5..]));
+            let last = self.db.range(k..behind.clone()).next_back().and_then(Result::ok);
+            let last = last.and_then(|(k, _)| number(&k[5..]));
             runs.push((run, first, last.map_or(first, |n| n.saturating_add(1))));
             from = behind;
         }
@@ -260,7 +307,7 @@ impl Index {
     /// All cursors of a run.
     pub fn cursors(&self, run: u32) -> Vec<(String, u32)> {
         let prefix = key(CURSOR, &[&run.to_be_bytes()]);
-        let items = self.db.scan_prefix(prefix).flatten();
+        let items = self.db.scan_prefix(prefix).map_while(Result::ok);
         items.filter_map(|(k, v)| Some((String::from_utf8(k[5..].to_vec()).ok()?, number(&v)?))).collect()
     }
 
@@ -310,4 +357,51 @@ pub fn move_aside(dir: &Path) -> std::io::Result<PathBuf> {
     }
     std::fs::rename(dir, &aside)?;
     Ok(aside)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{Rng as _, SeedableRng as _};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    /// Whatever a damaged index says, it says it at once: sled repeats its errors for ever.
+    #[test]
+    fn a_damaged_index_is_read_to_an_end() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let whole = dir.path().join("whole");
+        {
+            let index = Index::open(&whole).expect("a new one");
+            let entry = SegmentEntry { bytes: 1, messages: 2, span_ns: (3, 4) };
+            let changes = (0..400).flat_map(|run| {
+                [Change::Flight(run, format!("boot-{run}")), Change::Segment(run, 0, entry.clone())]
+            });
+            index.apply(&changes.collect::<Vec<_>>()).expect("durable");
+        }
+        let mut dice = ChaCha8Rng::seed_from_u64(7);
+        for round in 0..12 {
+            let copy = dir.path().join(format!("{round}"));
+            std::fs::create_dir(&copy).expect("made");
+            for file in whole.read_dir().expect("listed").flatten().filter(|file| file.path().is_file()) {
+                let mut bytes = std::fs::read(file.path()).expect("read");
+                let used = bytes.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
+                for _ in 0..if file.file_name() == "conf" { 0 } else { used / 200 * round / 4 } {
+                    bytes[dice.random_range(0..used)] = dice.random();
+                }
+                std::fs::write(copy.join(file.file_name()), bytes).expect("written");
+            }
+            match Index::open(&copy) {
+                Ok(index) => {
+                    let counts = (index.flights().len(), index.segments().len());
+                    assert!(
+                        counts.0 <= 400 && counts.1 <= 400 && (round > 0 || counts == (400, 400)),
+                        "{counts:?}"
+                    );
+                }
+                Err(IndexError::Unusable { .. }) => assert!(round > 0, "it was whole"),
+                Err(other) => panic!("{other}"),
+            }
+        }
+    }
 }

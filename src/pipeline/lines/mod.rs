@@ -1,16 +1,18 @@
 //! What sources deliver, put in time: bytes or samples in, stamped measurements out. One file a line; one that takes bytes
 //! has a row in [`SourceLines::of`].
 
+mod autopilot;
 mod compass;
 mod gps;
 mod samples;
 
+pub(super) use autopilot::AutopilotLine;
 pub(super) use compass::CompassLine;
 pub(super) use gps::GpsLine;
 pub(super) use samples::{Sample, SampleLine};
 
 use windhover_base::msg::{Delivery, SensorReading, Source};
-use windhover_base::settings::Rig;
+use windhover_base::settings::{AutopilotUse, Rig};
 use windhover_base::time::{MonoTime, Span};
 use windhover_decode::DecodeCounts;
 
@@ -35,6 +37,10 @@ pub(super) struct SourceLines {
     pub(super) compass: CompassLine,
     pub(super) imu: Option<SampleLine>,
     pub(super) attitude: Option<SampleLine>,
+    autopilot: Option<AutopilotLine>,
+    /// Whether receiver and compass have lines of their own.
+    has_gps: bool,
+    has_compass: bool,
 }
 
 impl SourceLines {
@@ -42,17 +48,27 @@ impl SourceLines {
         Self {
             gps: GpsLine::new(&rig.gps),
             compass: CompassLine::new(&rig.compass),
-            imu: rig.imu.map(|imu| SampleLine::new(imu.latency_ms)),
-            attitude: rig.attitude.map(|attitude| SampleLine::new(attitude.latency_ms)),
+            imu: rig
+                .imu
+                .filter(|_| !by_autopilot(rig, AutopilotUse::Imu))
+                .map(|i| SampleLine::new(i.latency_ms)),
+            attitude: rig
+                .attitude
+                .filter(|_| !by_autopilot(rig, AutopilotUse::Attitude))
+                .map(|attitude| SampleLine::new(attitude.latency_ms)),
+            autopilot: rig.autopilot.as_ref().map(|autopilot| AutopilotLine::new(autopilot, rig)),
+            has_gps: rig.gps.is_there(),
+            has_compass: rig.compass.is_there(),
         }
     }
 
     /// The line of a source; `None` where it does not deliver bytes, or is not configured.
     pub(super) fn of(&mut self, source: Source) -> Option<&mut dyn SourceLine> {
         match source {
-            Source::Gps => Some(&mut self.gps),
-            Source::Compass => Some(&mut self.compass),
-            Source::Camera | Source::Imu | Source::Attitude => None,
+            Source::Gps if self.has_gps => Some(&mut self.gps),
+            Source::Compass if self.has_compass => Some(&mut self.compass),
+            Source::Autopilot => self.autopilot.as_mut().map(|line| line as &mut dyn SourceLine),
+            Source::Gps | Source::Compass | Source::Camera | Source::Imu | Source::Attitude => None,
         }
     }
 
@@ -61,7 +77,7 @@ impl SourceLines {
         match source {
             Source::Imu => self.imu.as_mut(),
             Source::Attitude => self.attitude.as_mut(),
-            Source::Gps | Source::Compass | Source::Camera => None,
+            Source::Gps | Source::Compass | Source::Camera | Source::Autopilot => None,
         }
     }
 
@@ -73,6 +89,11 @@ impl SourceLines {
             Delivery::Inertial | Delivery::Attitude => self.samples(source).is_some(),
         }
     }
+}
+
+/// Whether an autopilot delivers this.
+fn by_autopilot(rig: &Rig, what: AutopilotUse) -> bool {
+    rig.autopilot.as_ref().is_some_and(|autopilot| autopilot.gives(what))
 }
 
 /// How many pieces were refused, and the reasons, with the fields left out of the others.

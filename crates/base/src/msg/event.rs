@@ -89,12 +89,35 @@ pub enum FrameEncoding {
     Rgb24,
     /// 24-bit BGR.
     Bgr24,
+    /// 8-bit mosaic of colour filters (Bayer): a pixel is red, green or blue.
+    Bayer(Bayer),
+    /// Grey of 10 bits in two bytes, least first.
+    Y10,
+    /// Grey of 12 bits in two bytes, least first.
+    Y12,
+    /// Grey of 16 bits in two bytes, least first.
+    Y16,
+    /// Grey of 10 bits, four pixels in five bytes: their upper eights, then their lower twos.
+    Y10Packed,
     /// JPEG (also one frame of Motion JPEG).
     Jpeg,
     /// PNG.
     Png,
     /// An encoding this program does not read; the frame counts, but cannot be used.
     Unknown,
+}
+
+/// Colours of a mosaic's first row and second row, from the top left.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum Bayer {
+    /// Red green, green blue.
+    Rggb,
+    /// Blue green, green red.
+    Bggr,
+    /// Green blue, red green.
+    Gbrg,
+    /// Green red, blue green.
+    Grbg,
 }
 
 /// A frame as the driver or the capture gave it.

@@ -49,6 +49,10 @@ pub struct Health {
     pub fix: FixKind,
     /// Satellites of the last fix.
     pub sats: Option<u32>,
+    /// Horizontal dilution of precision of the last fix.
+    pub hdop: Option<f64>,
+    /// Geoid over ellipsoid at the last fix, metres, as the receiver puts it.
+    pub geoid_m: Option<f64>,
     /// One-sigma of the fit from UTC to host time.
     pub clock_sigma: Option<Span>,
     /// UTC less host time, by the receiver; `None` until it told both with a fix.

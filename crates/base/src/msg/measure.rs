@@ -4,7 +4,7 @@ use nalgebra::{Matrix2, Vector2, Vector3};
 
 use crate::geo::Tilt;
 use crate::msg::TagFamily;
-use crate::time::{MonoTime, UtcTime};
+use crate::time::{MonoTime, Span, UtcTime};
 
 /// A value with when it was true and when it was heard, both host time.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -111,6 +111,21 @@ pub struct InertialSample {
     pub force_mps2: Option<Vector3<f64>>,
 }
 
+/// Where the helicopter's autopilot takes it to be: what it flies by.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct AutopilotPosition {
+    /// When it was true, since the autopilot's start by its own clock.
+    pub boot: Span,
+    /// Latitude, degrees.
+    pub lat_deg: f64,
+    /// Longitude, degrees.
+    pub lon_deg: f64,
+    /// Altitude above mean sea level, metres.
+    pub alt_msl_m: f64,
+    /// Velocity north, east, down, m/s.
+    pub vel_ned_mps: Vector3<f64>,
+}
+
 /// What a source's bytes were decoded to.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum SensorReading {
@@ -118,6 +133,12 @@ pub enum SensorReading {
     Gnss(Stamped<GnssEpoch>),
     /// Of a compass.
     Attitude(Stamped<AttitudeSample>),
+    /// Of a second source of attitude.
+    SecondAttitude(Stamped<AttitudeSample>),
+    /// Of gyros and accelerometers.
+    Inertial(Stamped<InertialSample>),
+    /// Of an autopilot.
+    Autopilot(Stamped<AutopilotPosition>),
 }
 
 /// Which marker a detection is of.

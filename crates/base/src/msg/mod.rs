@@ -16,13 +16,13 @@ pub use estimate::{
     Disposition, EstimatorOutput, FeltTilt, FusionResult, FusionSource, MarkerPair, Misfit, MisfitCause,
     Ownship, TargetEstimate, TargetState, TrackStatus,
 };
-pub use event::{Event, EventBody, FrameEncoding, FramePayload};
+pub use event::{Bayer, Event, EventBody, FrameEncoding, FramePayload};
 pub use family::{FamilySpec, TagFamily};
 pub use health::{Health, SourceHealth, TargetHealth};
 pub use image::{GrayImage, ImageView, RgbImage};
 pub use measure::{
-    AttitudeSample, FeatureTrack, FixKind, FrameObservations, GnssEpoch, InertialSample, MarkerDetection,
-    MarkerId, SensorReading, Stamped,
+    AttitudeSample, AutopilotPosition, FeatureTrack, FixKind, FrameObservations, GnssEpoch, InertialSample,
+    MarkerDetection, MarkerId, SensorReading, Stamped,
 };
 pub use notice::{MisfitWords, Notice, NoticeKind};
 pub use output::{Output, TimedOutput};

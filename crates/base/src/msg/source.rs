@@ -62,6 +62,8 @@ sources! {
     Imu: "imu", Inertial, "/imu/samples", silent after 1500 ms;
     /// Second source of attitude.
     Attitude: "attitude", Attitude, "/attitude/samples", silent after 1500 ms;
+    /// The helicopter's autopilot.
+    Autopilot: "autopilot", Bytes, "/autopilot/mavlink", silent after 2500 ms;
 }
 
 impl Source {

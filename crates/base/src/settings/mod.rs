@@ -3,6 +3,7 @@
 //! Angles are degrees here, as people write them; each user converts where it uses them. Checks of
 //! ranges are made where the whole configuration is read.
 
+mod autopilot;
 mod estimator;
 mod inertial;
 mod montecarlo;
@@ -10,6 +11,7 @@ mod rig;
 mod sensors;
 mod target;
 
+pub use autopilot::{AutopilotConfig, AutopilotUse};
 pub use estimator::{DetectorConfig, EstimatorConfig};
 pub use inertial::{AttitudeConfig, ImuConfig};
 pub use montecarlo::{Distribution, MonteCarloConfig};

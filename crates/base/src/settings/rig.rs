@@ -2,16 +2,23 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{AttitudeConfig, CameraConfig, CompassConfig, GpsConfig, ImuConfig, TargetConfig};
+use super::{
+    AttitudeConfig, AutopilotConfig, CameraConfig, CompassConfig, GpsConfig, ImuConfig, TargetConfig,
+};
 
 /// The instruments of a helicopter and the targets that they see.
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Rig {
     /// The GPS receiver.
+    #[serde(default, skip_serializing_if = "GpsConfig::is_absent")]
     pub gps: GpsConfig,
     /// The digital compass.
+    #[serde(default, skip_serializing_if = "CompassConfig::is_absent")]
     pub compass: CompassConfig,
+    /// The helicopter's autopilot, where it is heard.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub autopilot: Option<AutopilotConfig>,
     /// Gyros and accelerometers, where there are any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub imu: Option<ImuConfig>,

@@ -9,7 +9,8 @@ use crate::geo::{CameraModel, ImageTop, TiltConvention, body_from_camera};
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GpsConfig {
-    /// Serial device; a `/dev/serial/by-id` path survives renumbering.
+    /// Serial device; a `/dev/serial/by-id` path survives renumbering. Or `tcp://HOST:PORT`, gpsd too, or
+    /// `udp://ADDRESS:PORT`, where datagrams come in.
     pub device: String,
     /// Line speed, bits a second.
     pub baud: u32,
@@ -45,6 +46,38 @@ pub struct GpsConfig {
     pub pps_device: Option<String>,
 }
 
+/// No receiver of our own: an autopilot's stands in.
+impl Default for GpsConfig {
+    fn default() -> Self {
+        Self {
+            device: String::new(),
+            baud: 38_400,
+            format: GpsFormat::default(),
+            antenna_position_m: [0.0; 3],
+            latency_ms: defaults::gps_latency_ms(),
+            latency_sigma_ms: defaults::gps_latency_sigma_ms(),
+            bias_sigma_m: defaults::gps_bias_sigma_m(),
+            bias_tau_s: defaults::gps_bias_tau_s(),
+            noise_m: defaults::gps_noise_m(),
+            velocity_noise_mps: defaults::gps_velocity_noise_mps(),
+            configure_garmin: false,
+            pps_device: None,
+        }
+    }
+}
+
+impl GpsConfig {
+    /// Whether there is a receiver of our own.
+    pub fn is_there(&self) -> bool {
+        !self.device.is_empty()
+    }
+
+    /// Whether there is none.
+    pub fn is_absent(&self) -> bool {
+        !self.is_there()
+    }
+}
+
 /// What a receiver speaks.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -62,7 +95,7 @@ pub enum GpsFormat {
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CompassConfig {
-    /// Serial device.
+    /// Serial device, or `tcp://HOST:PORT`, `udp://ADDRESS:PORT` as for the receiver.
     pub device: String,
     /// Line speed, bits a second.
     pub baud: u32,
@@ -102,6 +135,40 @@ pub struct CompassConfig {
     /// One-sigma of the tilt noise of the sensor at rest, degrees.
     #[serde(default = "defaults::tilt_noise_deg")]
     pub tilt_noise_deg: f64,
+}
+
+/// No compass of our own: an autopilot's attitude stands in, whose heading is true and whose tilt is an AHRS's.
+impl Default for CompassConfig {
+    fn default() -> Self {
+        Self {
+            device: String::new(),
+            baud: 38_400,
+            format: CompassFormat::Nmea,
+            angles: TiltConvention::default(),
+            tilt: TiltKind::Inertial,
+            declination_deg: None,
+            declination: None,
+            latency_ms: 0.0,
+            yaw_offset_deg: 0.0,
+            pitch_offset_deg: 0.0,
+            roll_offset_deg: 0.0,
+            heading_bias_sigma_deg: defaults::heading_bias_sigma_deg(),
+            heading_noise_deg: defaults::heading_noise_deg(),
+            tilt_noise_deg: defaults::tilt_noise_deg(),
+        }
+    }
+}
+
+impl CompassConfig {
+    /// Whether there is a compass of our own.
+    pub fn is_there(&self) -> bool {
+        !self.device.is_empty()
+    }
+
+    /// Whether there is none.
+    pub fn is_absent(&self) -> bool {
+        !self.is_there()
+    }
 }
 
 /// What a compass's tilt sensor feels.
@@ -246,6 +313,30 @@ pub enum PixelFormat {
     /// 24-bit RGB (V4L2 RGB3).
     #[serde(rename = "RGB24", alias = "RGB3")]
     Rgb24,
+    /// 8-bit mosaic of colours, red first; read as grey, evened out.
+    #[serde(rename = "RGGB")]
+    Rggb,
+    /// The same, blue first (V4L2 BA81).
+    #[serde(rename = "BGGR", alias = "BA81")]
+    Bggr,
+    /// The same, green and blue first.
+    #[serde(rename = "GBRG")]
+    Gbrg,
+    /// The same, green and red first.
+    #[serde(rename = "GRBG")]
+    Grbg,
+    /// Grey of 10 bits in two bytes.
+    #[serde(rename = "Y10")]
+    Y10,
+    /// Grey of 12 bits in two bytes.
+    #[serde(rename = "Y12")]
+    Y12,
+    /// Grey of 16 bits.
+    #[serde(rename = "Y16")]
+    Y16,
+    /// Grey of 10 bits, four pixels in five bytes.
+    #[serde(rename = "Y10P")]
+    Y10Packed,
 }
 
 /// `[camera.mount]`

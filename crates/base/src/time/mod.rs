@@ -11,12 +11,14 @@ mod fit_tests;
 mod frames;
 mod jitter;
 mod pulse;
+mod remote;
 mod steady;
 mod utc;
 
 pub use fit::{ClockFit, GnssClock};
 pub use frames::FrameClock;
 pub use pulse::PulseTrouble;
+pub use remote::RemoteClock;
 pub use steady::SteadyClock;
 pub use utc::{Civil, EARLIEST_UTC, UtcTime, days_in_month};
 

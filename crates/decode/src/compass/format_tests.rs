@@ -7,7 +7,9 @@ fn said(format: CompassFormat, body: &str) -> Result<Option<CompassReading>, Ref
     let framed = framed(body);
     let sentence = Sentence::of_line(framed.as_bytes())?;
     match reader(format) {
-        Reader::Sentences(read) | Reader::SentencesOrBare(read, _) => read(&sentence),
+        Reader::Sentences(read) | Reader::SentencesOrLong(read) | Reader::SentencesOrBare(read, _) => {
+            read(&sentence)
+        }
         Reader::Packets => panic!("packets are no sentences"),
     }
 }

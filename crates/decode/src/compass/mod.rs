@@ -8,6 +8,7 @@ mod fields;
 #[cfg(test)]
 mod format_tests;
 mod hmr3000;
+mod long_ascii;
 mod nmea;
 mod os5000;
 mod pashr;
@@ -41,6 +42,8 @@ type ReadLine = fn(&[u8]) -> Result<Option<CompassReading>, Refusal>;
 enum Reader {
     /// Sentences `$…*HH`.
     Sentences(ReadSentence),
+    /// Sentences, and long messages `#…*CRC`.
+    SentencesOrLong(ReadSentence),
     /// Sentences, and lines without frame and checksum of a device that never sends one.
     SentencesOrBare(ReadSentence, ReadLine),
     /// Binary packets of PNI.
@@ -57,7 +60,7 @@ const fn reader(format: CompassFormat) -> Reader {
         CompassFormat::Pni => Reader::Packets,
         CompassFormat::Pashr => Reader::Sentences(pashr::read),
         CompassFormat::Vectornav => Reader::Sentences(vectornav::read),
-        CompassFormat::Nmea => Reader::Sentences(nmea::read),
+        CompassFormat::Nmea => Reader::SentencesOrLong(nmea::read),
     }
 }
 
@@ -86,8 +89,7 @@ struct TextInput {
 }
 
 impl TextInput {
-    fn new(sentence: ReadSentence, bare: Option<ReadLine>) -> Self {
-        let start = if bare.is_some() { LineStart::Any } else { LineStart::Dollar };
+    fn new(start: LineStart, sentence: ReadSentence, bare: Option<ReadLine>) -> Self {
         Self {
             lines: LineFramer::new(start),
             sentence,
@@ -106,6 +108,13 @@ impl TextInput {
     ) {
         let Self { lines, sentence: read, bare, has_checksums, together } = self;
         lines.push(bytes, 0, t_recv, counts, |line, counts| {
+            if line.text.starts_with(b"#") && bare.is_none() {
+                return match long_ascii::read(line.text) {
+                    Ok(Some(reading)) => together.whole(reading, line.span, counts, out),
+                    Ok(None) => counts.ignored += 1,
+                    Err(why) => counts.refuse(why),
+                };
+            }
             if line.text.contains(&b'*') {
                 *has_checksums = true;
             } else if *has_checksums || bare.is_none() {
@@ -142,11 +151,11 @@ fn is_part(sentence: &Sentence<'_>) -> bool {
 impl CompassDecoder {
     /// A decoder for one format.
     pub fn new(format: CompassFormat) -> Self {
+        let text = |start, read, bare| Input::Text(Box::new(TextInput::new(start, read, bare)));
         let input = match reader(format) {
-            Reader::Sentences(sentence) => Input::Text(Box::new(TextInput::new(sentence, None))),
-            Reader::SentencesOrBare(sentence, bare) => {
-                Input::Text(Box::new(TextInput::new(sentence, Some(bare))))
-            }
+            Reader::Sentences(read) => text(LineStart::Dollar, read, None),
+            Reader::SentencesOrLong(read) => text(LineStart::DollarOrHash, read, None),
+            Reader::SentencesOrBare(read, bare) => text(LineStart::Any, read, Some(bare)),
             Reader::Packets => Input::Packets(pni::PacketFramer::default()),
         };
         Self { counts: DecodeCounts::default(), input }

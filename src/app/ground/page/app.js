@@ -6,10 +6,12 @@ const fleet = new Map();
 let chosen = null, socket = null, dirty = true, heardAt = 0;
 const map = new FieldMap($("map"));
 map.moved = () => { dirty = true; };
+const alarm = new Alarm($("sound"));
+let position = null;
 
 function payload(name) {
   if (!fleet.has(name)) {
-    fleet.set(name, { name, targets: new Map(), ownTrail: [], own: null, health: null, link: null, events: [], thumb: null, image: new Image(), datum: null, clock: null });
+    fleet.set(name, { name, targets: new Map(), ownTrail: [], own: null, health: null, link: null, events: [], thumb: null, image: new Image(), datum: null, home: null, clock: null });
     if (!chosen) chosen = name;
     tabs();
   }
@@ -46,7 +48,7 @@ function insert(list, point) {
 }
 
 const handlers = {
-  hello(m) { map.tiles = m.tiles; },
+  hello(m) { map.tiles = m.tiles; position = m.position; },
   est(m, p) {
     let target = p.targets.get(m.target);
     if (!target) p.targets.set(m.target, target = { name: m.target, trail: [], last: null });
@@ -63,6 +65,7 @@ const handlers = {
     m.position = mercator(m.lat, m.lon);
     insert(p.ownTrail, { ...m.position, t: m.t });
     if (!p.own || m.t >= p.own.t) p.own = m;
+    if (!p.home || m.t < p.home.t) p.home = m;
   },
   datum(m, p) { p.datum = mercator(m.lat, m.lon); },
   health(m, p) { if (!p.health || m.t >= p.health.t) p.health = m; if (p.name === chosen) panels(); },
@@ -99,6 +102,10 @@ function numbers(p) {
   const old = e ? age(p, e.t) : null, fresh = old != null && old < STALE_MS;
   const status = e ? (fresh ? e.status : "no news") : "no data";
   chip($("target-status"), status, status === "tracking" ? "good" : status === "lost" || !fresh ? "bad" : "warn");
+  const since = k ? age(p, k.t) : null;
+  $("target-age").textContent = since == null ? "" : since < 9950 ? `${(since / 1000).toFixed(1)} s` : `${clock(since / 1000)} ago`;
+  away("vehicle", p, k && fresh && k.status !== "lost" ? k : null);
+  away("helicopter", p, p && p.own && age(p, p.own.t) < OLD_MS ? p.own : null);
   const c = k && k.cov, deg = 180 / Math.PI, s = v => c ? `±${v}` : "";
   $("speed").textContent = number(k && k.v, 2);
   $("heading").textContent = k ? number(((k.h * deg) % 360 + 360) % 360, 0) : "–";
@@ -113,6 +120,51 @@ function numbers(p) {
   const note = $("map-note"), down = p && p.link && !p.link.up, cut = p && p.link && p.link.silent_ms > 2000;
   note.style.display = e && (!fresh || down) ? "block" : "none";
   note.textContent = down ? "payload not connected" : cut ? `link silent for ${(p.link.silent_ms / 1000).toFixed(0)} s` : "no new estimates";
+}
+
+// 3:12, 1:03:12.
+function clock(s) {
+  const two = x => String(Math.floor(x)).padStart(2, "0");
+  return s < 3600 ? `${Math.floor(s / 60)}:${two(s % 60)}` : `${Math.floor(s / 3600)}:${two(s / 60 % 60)}:${two(s % 60)}`;
+}
+
+// Distance and bearing of a place from the station; where that was not told, from where the helicopter was first seen.
+function away(name, p, to) {
+  const from = position ? { lat: position[0], lon: position[1] } : p && p.home, rad = Math.PI / 180;
+  if (!from || !to) { $(`to-${name}`).textContent = "–"; $(`from-${name}`).textContent = ""; return; }
+  const north = (to.lat - from.lat) * rad * 6371009, east = ((to.lon - from.lon + 540) % 360 - 180) * rad * 6371009 * Math.cos(from.lat * rad);
+  const d = Math.hypot(north, east), bearing = (Math.atan2(east, north) / rad + 360) % 360;
+  $(`to-${name}`).textContent = `${d < 1000 ? `${d.toFixed(0)} m` : `${(d / 1000).toFixed(2)} km`} ${bearing.toFixed(0).padStart(3, "0")}°`;
+  $(`from-${name}`).textContent = position ? "from the station" : "from the start";
+}
+
+// What an operator must hear of; null where all is there. What was never there is not lost.
+function lost(p) {
+  const target = p && [...p.targets.values()][0], e = target && target.last;
+  if (p && p.link && !p.link.up && p.own) return `${p.name}: link lost`;
+  if (!e || !target.known) return null;
+  const old = age(p, e.t);
+  if (old == null || old > OLD_MS) return `${target.name}: no news`;
+  return e.status === "lost" ? `${target.name} lost` : null;
+}
+
+// How the flight does: its record, the card, the power, what else it feeds.
+function flight(h, old) {
+  const list = [], f = h.figures, w = h.words, dot = kind => old ? "bad" : kind;
+  if (w.card != null) {
+    const on = w.card === "ok" && f.recording_s != null;
+    list.push(["recording", on ? `recording ${clock(f.recording_s)}` : `not recording: card ${w.card}`, dot(on ? "good" : w.card === "off" ? "warn" : "bad")]);
+  }
+  if (f.card_left_s != null) {
+    const m = f.card_left_s / 60;
+    list.push(["card", `${m < 120 ? `${m.toFixed(0)} min` : `${(m / 60).toFixed(0)} h`} left (${(f.card_free_mb / 1000).toFixed(1)} GB)`, dot(m < 10 ? "bad" : m < 30 ? "warn" : "good")]);
+  } else if (f.card_free_mb != null) list.push(["card", `${(f.card_free_mb / 1000).toFixed(1)} GB left`, dot("good")]);
+  if (f.card_dropped) list.push(["dropped by the card", `${f.card_dropped} messages`, "bad"]);
+  if (f.supply_v != null) list.push(["supply", `${f.supply_v.toFixed(2)} V`, dot("good")]);
+  if (f.temp_c != null) list.push(["temperature", `${f.temp_c.toFixed(0)} °C`, dot("good")]);
+  list.push(["MAVLink", w.mavlink || "none is sent", w.mavlink ? dot(/\(/.test(w.mavlink) ? "bad" : "good") : ""]);
+  if (w.flight != null) list.push(["flight", w.flight, ""]);
+  return list;
 }
 
 function rows(table, list) {
@@ -141,9 +193,12 @@ function panels() {
     if (p.utc == null) list.push(["UTC", "not known; times are the payload's own", "warn"]);
     else if (h.clock_sigma_ms >= 0) list.push(["UTC", `±${h.clock_sigma_ms.toFixed(1)} ms`, dot("good")]);
     for (const m of h.misfits) list.push([m.source, `${m.cause} (${m.figure}): ${m.advice}`, dot("warn")]);
-    for (const [name, word] of Object.entries(h.words)) list.push([name, word, dot(/fail|full|none|lost|error|stopped|cannot/i.test(word) ? "bad" : "good")]);
+    const apart = ["card", "flight", "mavlink"];
+    for (const [name, word] of Object.entries(h.words)) if (!apart.includes(name)) list.push([name, word, dot(/fail|full|none|lost|error|stopped|cannot/i.test(word) ? "bad" : "good")]);
     if (old) list.unshift(["all of this", since == null ? "age not known" : `${(since / 1000).toFixed(0)} s old`, "bad"]);
     rows(table, list); $("sensors").replaceChildren(table);
+    const about = document.createElement("table");
+    rows(about, flight(h, old)); $("flight").replaceChildren(about);
   }
   if (p && p.link) {
     const l = p.link, table = document.createElement("table"), all = l.received + l.overdue, done = all ? 100 * l.received / all : 100;
@@ -238,7 +293,7 @@ function draw() {
       cov: t.known && t.known.cov, fresh: age(p, t.last.t) != null && age(p, t.last.t) < STALE_MS && t.last.status !== "lost",
     })),
   });
-  numbers(p); camera(p);
+  numbers(p); camera(p); alarm.take(lost(p));
   const trail = targets[0] ? targets[0].trail : [], deg = 180 / Math.PI;
   const last = trail.length ? trail[trail.length - 1].t : 0, end = last + Math.min(age(p, last) || 0, 600000);
   plot($("plot-speed"), trail, end, q => q.v, q => q.sv, 0.5);

@@ -182,7 +182,8 @@ impl Session {
         while let Some(message) = control.next::<pb::ToPayload>().await? {
             match message.body {
                 Some(to_payload::Body::Want(want)) => {
-                    lock(&self.wanted).replace(&want.ranges);
+                    let there = self.shared.extents();
+                    lock(&self.wanted).replace(&want.ranges, &there);
                     self.wanted_more.notify_one();
                 }
                 Some(to_payload::Body::Stored(stored)) => self.acknowledge(&stored.ranges),

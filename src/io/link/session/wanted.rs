@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use crate::io::link::backlog::Extent;
 use crate::io::link::ranges::RangeSet;
 use crate::io::proto::link as pb;
 
@@ -13,17 +14,23 @@ const WANT_LIMIT: usize = 1_024;
 pub(super) struct Wanted {
     open: BTreeMap<u32, RangeSet>,
     sent: BTreeMap<u32, RangeSet>,
+    /// First number held of each run, and one more than the last.
+    there: BTreeMap<u32, (u32, u32)>,
 }
 
 impl Wanted {
-    /// Replaces what was asked for.
-    pub(super) fn replace(&mut self, ranges: &[pb::Range]) {
+    /// Replaces what was asked for; `there` is what the payload holds.
+    pub(super) fn replace(&mut self, ranges: &[pb::Range], there: &[Extent]) {
+        self.there = there.iter().map(|extent| (extent.run, (extent.first, extent.end))).collect();
         self.open.clear();
         for range in ranges.iter().take(WANT_LIMIT) {
-            let sent = self.sent.entry(range.run).or_default();
             let open = self.open.entry(range.run).or_default();
-            for (first, end) in sent.missing(range.first, range.end) {
-                open.insert_range(first, end);
+            match self.sent.get(&range.run) {
+                Some(sent) => {
+                    let rest = sent.missing(range.first, range.end);
+                    rest.for_each(|(first, end)| open.insert_range(first, end));
+                }
+                None => open.insert_range(range.first, range.end),
             }
         }
     }
@@ -38,7 +45,10 @@ impl Wanted {
         if let Some(open) = self.open.get_mut(&run) {
             open.remove_range(first, end);
         }
-        self.sent.entry(run).or_default().insert_range(first, end);
+        // Only what there is: that numbers are nobody's may be said again, and to remember it has no limit.
+        if let Some((held, held_end)) = self.there.get(&run) {
+            self.sent.entry(run).or_default().insert_range(first.max(*held), end.min(*held_end));
+        }
     }
 
     /// They cannot be answered now; the station asks again.
@@ -65,12 +75,30 @@ mod tests {
     #[test]
     fn what_went_is_not_sent_again_and_what_was_postponed_is() {
         let mut wanted = Wanted::default();
-        wanted.replace(&[range(0, 10)]);
+        let there = [Extent { run: 3, flight: "boot-3".into(), first: 0, end: 10 }];
+        wanted.replace(&[range(0, 10)], &there);
         wanted.done(3, 0, 4);
         assert_eq!(wanted.first(), Some((3, 4, 10)));
         wanted.postpone(3, 4, 8);
         assert_eq!((wanted.first(), wanted.count()), (Some((3, 8, 10)), 2));
-        wanted.replace(&[range(0, 10)]);
+        wanted.replace(&[range(0, 10)], &there);
         assert_eq!(wanted.first(), Some((3, 4, 10)), "asked for again");
+    }
+
+    #[test]
+    fn what_is_nowhere_takes_no_memory() {
+        let mut wanted = Wanted::default();
+        let there = [Extent { run: 3, flight: "boot-3".into(), first: 50_000, end: 50_010 }];
+        for n in 0..10_000 {
+            // Runs that never were, and numbers before what is held, each apart from the others.
+            let asked = [pb::Range { run: n + 4, first: 2 * n, end: 2 * n + 1 }, range(2 * n, 2 * n + 1)];
+            wanted.replace(&asked, &there);
+            while let Some((run, first, end)) = wanted.first() {
+                wanted.done(run, first, end);
+            }
+        }
+        wanted.done(3, 49_990, 50_020);
+        assert_eq!(wanted.sent.values().map(RangeSet::ranges).sum::<usize>(), 1);
+        assert_eq!((wanted.sent[&3].len(), wanted.open.len()), (10, 2));
     }
 }

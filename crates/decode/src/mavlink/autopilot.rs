@@ -1,0 +1,329 @@
+//! What an autopilot says, put on host time: attitude, rates and forces, its receiver's fixes, its own position.
+//!
+//! ArduPilot's and PX4's messages in the units of `common.xml`. One system is followed, that of `system_id` or the first
+//! whose HEARTBEAT is an autopilot's; what others send is left out.
+
+use mavlink::dialects::development::*;
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+
+use windhover_base::geo::{Tilt, euler_321};
+use windhover_base::msg::{AttitudeSample, AutopilotPosition, FixKind, GnssEpoch, InertialSample};
+use windhover_base::time::{MonoTime, RemoteClock, Span, UtcTime};
+
+use super::frames::{MavlinkFrame, MavlinkFrames};
+use crate::counts::{DecodeCounts, Refusal};
+
+/// MAV_COMP_ID_AUTOPILOT1.
+const AUTOPILOT: u8 = 1;
+/// Standard gravity, m/s²: accelerations of SCALED_IMU are in thousandths of it.
+const GRAVITY: f64 = 9.806_65;
+/// A better message of the same kind was heard so lately: the other one is left out.
+const LATELY: Span = Span::from_ns(1_000_000_000);
+/// Our questions for the time are marked in digits of a nanosecond's clock that no clock tells.
+const MARK_NS: i64 = 618;
+/// A `time_usec` beyond this is UTC, one below since start: 2001 in microseconds since 1970.
+const UNIX_USEC: u64 = 1_000_000_000_000_000;
+/// 2020-01-01: an autopilot that says an earlier time does not know it.
+const EARLIEST_UNIX_USEC: u64 = 1_577_836_800_000_000;
+
+/// What was said, and when it was true.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct HeardAutopilot {
+    /// When it was true, host time; fixes are true their receiver's latency before.
+    pub t: MonoTime,
+    /// What.
+    pub said: AutopilotSaid,
+}
+
+/// What an autopilot says.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum AutopilotSaid {
+    /// Attitude, its heading true.
+    Attitude(AttitudeSample),
+    /// Rates and forces in the body's axes.
+    Inertial(InertialSample),
+    /// A fix of its receiver.
+    Gnss(GnssEpoch),
+    /// Its own position.
+    Position(AutopilotPosition),
+}
+
+/// Whether a frame is an autopilot's HEARTBEAT.
+pub fn is_autopilot(frame: &MavlinkFrame) -> bool {
+    matches!(&frame.message, MavMessage::HEARTBEAT(beat)
+        if frame.component == AUTOPILOT
+            && !matches!(beat.mavtype, MavType::MAV_TYPE_GCS | MavType::MAV_TYPE_GROUND_ROVER)
+            && beat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID)
+}
+
+/// The time that a question for an autopilot's time carries: `now`, marked as ours.
+pub fn question(now: MonoTime) -> i64 {
+    now.ns().div_euclid(1_000) * 1_000 + MARK_NS
+}
+
+/// When a question of ours was asked; `None` for one that is not ours.
+pub fn asked(ts1: i64) -> Option<MonoTime> {
+    (ts1.rem_euclid(1_000) == MARK_NS).then(|| MonoTime::from_ns(ts1))
+}
+
+/// MAVLink bytes to what an autopilot says.
+#[derive(Clone, Debug, Default)]
+pub struct AutopilotDecoder {
+    frames: MavlinkFrames,
+    heard: Vec<MavlinkFrame>,
+    follows: Option<u8>,
+    clock: RemoteClock,
+    quaternion: Option<MonoTime>,
+    forces: Option<MonoTime>,
+    fix_usec: u64,
+    /// UTC less time since start, microseconds.
+    utc_less_boot: Option<i64>,
+}
+
+impl AutopilotDecoder {
+    /// Of this system; of the first autopilot that is heard where `None`.
+    pub fn new(system_id: Option<u8>) -> Self {
+        Self { follows: system_id, ..Self::default() }
+    }
+
+    /// Takes bytes that were heard at `t`.
+    pub fn push(&mut self, bytes: &[u8], t: MonoTime, out: &mut Vec<HeardAutopilot>) {
+        let mut heard = std::mem::take(&mut self.heard);
+        self.frames.push(bytes, &mut heard);
+        for frame in heard.drain(..) {
+            let used = self.frame(&frame, t, out);
+            let counts = self.frames.counts_mut();
+            match used {
+                Ok(true) => counts.used += 1,
+                Ok(false) => counts.ignored += 1,
+                Err(why) => counts.refuse(why),
+            }
+        }
+        self.heard = heard;
+    }
+
+    /// What became of the bytes.
+    pub fn counts(&self) -> &DecodeCounts {
+        self.frames.counts()
+    }
+
+    /// Its clock.
+    pub fn clock(&self) -> &RemoteClock {
+        &self.clock
+    }
+
+    /// The system that is followed.
+    pub fn system(&self) -> Option<u8> {
+        self.follows
+    }
+
+    /// Whether the frame is of use.
+    fn frame(
+        &mut self,
+        frame: &MavlinkFrame,
+        t: MonoTime,
+        out: &mut Vec<HeardAutopilot>,
+    ) -> Result<bool, Refusal> {
+        if self.follows.is_none() && is_autopilot(frame) {
+            self.follows = Some(frame.system);
+        }
+        if self.follows != Some(frame.system) || frame.component != AUTOPILOT {
+            return Ok(false);
+        }
+        let ms = |time_boot_ms: u32| Span::from_ns(i64::from(time_boot_ms) * 1_000_000);
+        match &frame.message {
+            MavMessage::HEARTBEAT(_) => Ok(true),
+            MavMessage::TIMESYNC(sync) => Ok(self.timesync(sync, t)),
+            MavMessage::SYSTEM_TIME(time) => {
+                self.at(ms(time.time_boot_ms), t)?;
+                let boot_usec = i64::from(time.time_boot_ms) * 1_000;
+                let known = time.time_unix_usec >= EARLIEST_UNIX_USEC;
+                let unix_usec = i64::try_from(time.time_unix_usec).map_err(|_| Refusal::OutOfRange)?;
+                self.utc_less_boot = known.then_some(unix_usec - boot_usec);
+                Ok(known)
+            }
+            MavMessage::ATTITUDE_QUATERNION(q) => {
+                let t = self.at(ms(q.time_boot_ms), t)?;
+                let [w, x, y, z] = [q.q1, q.q2, q.q3, q.q4].map(f64::from);
+                let q4 = Quaternion::new(w, x, y, z);
+                if !(0.9..1.1).contains(&q4.norm()) {
+                    return Err(Refusal::OutOfRange);
+                }
+                self.quaternion = Some(t);
+                let (heading, pitch, roll) =
+                    euler_321(&UnitQuaternion::from_quaternion(q4).to_rotation_matrix());
+                self.attitude(t, heading, Tilt { pitch, roll }, [q.rollspeed, q.pitchspeed, q.yawspeed], out)
+            }
+            MavMessage::ATTITUDE(a) => {
+                let t = self.at(ms(a.time_boot_ms), t)?;
+                if self.quaternion.is_some_and(|last| t - last < LATELY) {
+                    return Ok(false);
+                }
+                let tilt = Tilt { pitch: a.pitch.into(), roll: a.roll.into() };
+                self.attitude(t, a.yaw.into(), tilt, [a.rollspeed, a.pitchspeed, a.yawspeed], out)
+            }
+            MavMessage::SCALED_IMU(imu) => {
+                let t = self.at(ms(imu.time_boot_ms), t)?;
+                let rate = Vector3::new(imu.xgyro, imu.ygyro, imu.zgyro).map(|x| f64::from(x) * 1e-3);
+                let force = Vector3::new(imu.xacc, imu.yacc, imu.zacc).map(|x| f64::from(x) * 1e-3 * GRAVITY);
+                Ok(self.inertial(t, rate, Some(force), out))
+            }
+            MavMessage::HIGHRES_IMU(imu) if imu.id == 0 => {
+                let t = self.at(self.since_boot(imu.time_usec)?, t)?;
+                let rate = Vector3::new(imu.xgyro, imu.ygyro, imu.zgyro).map(f64::from);
+                let force = Vector3::new(imu.xacc, imu.yacc, imu.zacc).map(f64::from);
+                Ok(self.inertial(t, rate, Some(force), out))
+            }
+            MavMessage::GPS_RAW_INT(fix) => self.fix(fix, t, out),
+            MavMessage::GLOBAL_POSITION_INT(place) => self.position(place, t, out),
+            _ => Ok(false),
+        }
+    }
+
+    /// Host time of a time since its start that was heard at `t`.
+    fn at(&mut self, boot: Span, t: MonoTime) -> Result<MonoTime, Refusal> {
+        let believed = self.clock.heard(boot, t);
+        self.clock.host(boot).filter(|_| believed).ok_or(Refusal::OutOfRange)
+    }
+
+    /// Time since its start of a stamp that may be UTC.
+    fn since_boot(&self, time_usec: u64) -> Result<Span, Refusal> {
+        let usec = i64::try_from(time_usec).map_err(|_| Refusal::OutOfRange)?;
+        let boot_usec = match time_usec < UNIX_USEC {
+            true => usec,
+            false => usec - self.utc_less_boot.ok_or(Refusal::NoTime)?,
+        };
+        Ok(Span::from_ns(boot_usec.saturating_mul(1_000)))
+    }
+
+    /// An answer to a question of ours.
+    fn timesync(&mut self, sync: &TIMESYNC_DATA, t: MonoTime) -> bool {
+        let sent = asked(sync.ts1).filter(|_| sync.tc1 != 0);
+        if let Some(sent) = sent {
+            self.clock.exchanged(sent, Span::from_ns(sync.tc1), t);
+        }
+        sent.is_some()
+    }
+
+    fn attitude(
+        &mut self,
+        t: MonoTime,
+        heading: f64,
+        tilt: Tilt,
+        rates: [f32; 3],
+        out: &mut Vec<HeardAutopilot>,
+    ) -> Result<bool, Refusal> {
+        if ![heading, tilt.pitch, tilt.roll].iter().all(|angle| angle.is_finite() && angle.abs() < 7.0) {
+            return Err(Refusal::OutOfRange);
+        }
+        let sample = AttitudeSample { heading: Some(heading), heading_is_true: true, tilt: Some(tilt) };
+        out.push(HeardAutopilot { t, said: AutopilotSaid::Attitude(sample) });
+        if self.forces.is_none_or(|last| t - last >= LATELY) {
+            self.inertial(t, Vector3::from(rates).map(f64::from), None, out);
+        }
+        Ok(true)
+    }
+
+    fn inertial(
+        &mut self,
+        t: MonoTime,
+        rate: Vector3<f64>,
+        force: Option<Vector3<f64>>,
+        out: &mut Vec<HeardAutopilot>,
+    ) -> bool {
+        if force.is_some() {
+            self.forces = Some(t);
+        }
+        let sample = InertialSample { rate_rps: Some(rate), force_mps2: force };
+        out.push(HeardAutopilot { t, said: AutopilotSaid::Inertial(sample) });
+        true
+    }
+
+    fn fix(
+        &mut self,
+        fix: &GPS_RAW_INT_DATA,
+        t: MonoTime,
+        out: &mut Vec<HeardAutopilot>,
+    ) -> Result<bool, Refusal> {
+        // The same fix again: it is sent at a rate of its own.
+        if fix.time_usec == self.fix_usec {
+            return Ok(false);
+        }
+        let boot = self.since_boot(fix.time_usec)?;
+        let (lat_deg, lon_deg) = (f64::from(fix.lat) * 1e-7, f64::from(fix.lon) * 1e-7);
+        if lat_deg.abs() > 90.0 || lon_deg.abs() > 180.0 {
+            return Err(Refusal::OutOfRange);
+        }
+        self.fix_usec = fix.time_usec;
+        // A fix is as old as it is: only its own clock tells when it came, never its arrival here.
+        let t = self.clock.host(boot).unwrap_or(t);
+        let kind = fix_kind(fix.fix_type);
+        let metres = |mm: u32| (mm > 0 && mm < u32::MAX).then(|| f64::from(mm) * 1e-3);
+        let (speed, course) = (known(fix.vel).map(|v| v * 1e-2), known(fix.cog).map(|c| c * 1e-2));
+        let velocity = speed.zip(course).map(|(v, course_deg)| {
+            let (s, c) = course_deg.to_radians().sin_cos();
+            Vector3::new(v * c, v * s, 0.0)
+        });
+        let there = kind.has_position();
+        let alt_m = f64::from(fix.alt) * 1e-3;
+        let ellipsoid_m = f64::from(fix.alt_ellipsoid) * 1e-3;
+        let epoch = GnssEpoch {
+            utc: self.utc_less_boot.and_then(|ahead| {
+                Some(UtcTime::from_unix_ns((boot.ns() / 1_000).checked_add(ahead)?.checked_mul(1_000)?))
+            }),
+            fix: kind,
+            lat_deg: there.then_some(lat_deg),
+            lon_deg: there.then_some(lon_deg),
+            alt_msl_m: kind.has_height().then_some(alt_m),
+            geoid_m: (kind.has_height() && fix.alt_ellipsoid != 0).then_some(ellipsoid_m - alt_m),
+            speed_mps: speed.filter(|_| there),
+            course_deg: course.filter(|_| there),
+            vel_ned_mps: velocity.filter(|_| there),
+            hpe_m: metres(fix.h_acc),
+            vpe_m: metres(fix.v_acc),
+            sats: (fix.satellites_visible != u8::MAX).then(|| fix.satellites_visible.into()),
+            hdop: known(fix.eph).map(|dop| dop * 1e-2),
+            ..GnssEpoch::default()
+        };
+        out.push(HeardAutopilot { t, said: AutopilotSaid::Gnss(epoch) });
+        Ok(true)
+    }
+
+    fn position(
+        &mut self,
+        place: &GLOBAL_POSITION_INT_DATA,
+        t: MonoTime,
+        out: &mut Vec<HeardAutopilot>,
+    ) -> Result<bool, Refusal> {
+        let boot = Span::from_ns(i64::from(place.time_boot_ms) * 1_000_000);
+        let t = self.at(boot, t)?;
+        let (lat_deg, lon_deg) = (f64::from(place.lat) * 1e-7, f64::from(place.lon) * 1e-7);
+        // Without a position yet it says 0, 0.
+        if (place.lat, place.lon) == (0, 0) {
+            return Ok(false);
+        }
+        if lat_deg.abs() > 90.0 || lon_deg.abs() > 180.0 {
+            return Err(Refusal::OutOfRange);
+        }
+        let vel_ned_mps = Vector3::new(place.vx, place.vy, place.vz).map(|v| f64::from(v) * 1e-2);
+        let alt_msl_m = f64::from(place.alt) * 1e-3;
+        let said = AutopilotPosition { boot, lat_deg, lon_deg, alt_msl_m, vel_ned_mps };
+        out.push(HeardAutopilot { t, said: AutopilotSaid::Position(said) });
+        Ok(true)
+    }
+}
+
+/// A figure that is not its "unknown".
+fn known(figure: u16) -> Option<f64> {
+    (figure != u16::MAX).then(|| f64::from(figure))
+}
+
+fn fix_kind(kind: GpsFixType) -> FixKind {
+    match kind {
+        GpsFixType::GPS_FIX_TYPE_NO_GPS | GpsFixType::GPS_FIX_TYPE_NO_FIX => FixKind::None,
+        GpsFixType::GPS_FIX_TYPE_2D_FIX => FixKind::TwoD,
+        GpsFixType::GPS_FIX_TYPE_RTK_FLOAT => FixKind::RtkFloat,
+        GpsFixType::GPS_FIX_TYPE_RTK_FIXED => FixKind::RtkFixed,
+        _ => FixKind::ThreeD,
+    }
+}

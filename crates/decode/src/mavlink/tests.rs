@@ -1,0 +1,230 @@
+//! An autopilot's messages as ArduPilot and PX4 send them, and bytes that are none.
+
+use ::mavlink::dialects::development::*;
+use ::mavlink::{MAVLinkV2MessageRaw, MavHeader};
+use nalgebra::Vector3;
+use proptest::prelude::*;
+
+use super::*;
+use windhover_base::msg::FixKind;
+use windhover_base::time::{MonoTime, Span};
+
+fn at(s: f64) -> MonoTime {
+    MonoTime::from_ns(1_700_000_000_000_000_000) + Span::from_s(s)
+}
+
+fn frame(system_id: u32, component_id: u8, message: &MavMessage) -> Vec<u8> {
+    let mut raw = MAVLinkV2MessageRaw::new();
+    raw.serialize_message(MavHeader { system_id, component_id, sequence: 3 }, message);
+    raw.raw_bytes().to_vec()
+}
+
+fn heartbeat() -> MavMessage {
+    MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+        mavtype: MavType::MAV_TYPE_HELICOPTER,
+        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+        mavlink_version: 3,
+        ..HEARTBEAT_DATA::DEFAULT
+    })
+}
+
+fn attitude(time_boot_ms: u32, yaw: f32) -> MavMessage {
+    MavMessage::ATTITUDE(ATTITUDE_DATA {
+        time_boot_ms,
+        roll: 0.1,
+        pitch: -0.2,
+        yaw,
+        ..ATTITUDE_DATA::DEFAULT
+    })
+}
+
+/// A decoder that follows system 1, started 100 s before `at(0)`.
+fn following() -> AutopilotDecoder {
+    let mut decoder = AutopilotDecoder::new(None);
+    decoder.push(&frame(1, 1, &heartbeat()), at(0.0), &mut Vec::new());
+    assert_eq!(decoder.system(), Some(1));
+    decoder
+}
+
+fn heard(decoder: &mut AutopilotDecoder, message: &MavMessage, t: MonoTime) -> Vec<HeardAutopilot> {
+    let mut out = Vec::new();
+    decoder.push(&frame(1, 1, message), t, &mut out);
+    out
+}
+
+#[test]
+fn only_the_autopilot_is_heard() {
+    let mut decoder = following();
+    let mut out = Vec::new();
+    // A ground station, another helicopter, a camera of the same one.
+    for (system, component) in [(255, 190), (2, 1), (1, 100)] {
+        decoder.push(&frame(system, component, &attitude(100_000, 0.5)), at(0.0), &mut out);
+    }
+    assert_eq!(out, []);
+    decoder.push(&frame(1, 1, &attitude(100_000, 0.5)), at(0.002), &mut out);
+    let AutopilotSaid::Attitude(sample) = out[0].said else { panic!("{out:?}") };
+    assert!(sample.heading_is_true && (sample.heading.expect("told") - 0.5).abs() < 1e-6);
+    let tilt = sample.tilt.expect("told");
+    assert!((tilt.pitch + 0.2).abs() < 1e-6 && (tilt.roll - 0.1).abs() < 1e-6);
+    // A system that is asked for is waited for.
+    let mut second = AutopilotDecoder::new(Some(2));
+    second.push(&frame(1, 1, &attitude(100_000, 0.5)), at(0.0), &mut Vec::new());
+    assert_eq!(second.counts().used, 0);
+}
+
+#[test]
+fn quaternions_are_preferred_and_forces_are_in_si_units() {
+    let mut decoder = following();
+    let q = nalgebra::UnitQuaternion::from_euler_angles(0.1, -0.2, 2.0);
+    let quaternion = MavMessage::ATTITUDE_QUATERNION(ATTITUDE_QUATERNION_DATA {
+        time_boot_ms: 100_000,
+        q1: q.w as f32,
+        q2: q.i as f32,
+        q3: q.j as f32,
+        q4: q.k as f32,
+        rollspeed: 0.3,
+        ..ATTITUDE_QUATERNION_DATA::DEFAULT
+    });
+    let out = heard(&mut decoder, &quaternion, at(0.0));
+    let [HeardAutopilot { said: AutopilotSaid::Attitude(sample), .. }, rates] = out[..] else {
+        panic!("{out:?}")
+    };
+    assert!((sample.heading.expect("told") - 2.0).abs() < 1e-6, "{sample:?}");
+    let AutopilotSaid::Inertial(rates) = rates.said else { panic!("{out:?}") };
+    assert!(rates.force_mps2.is_none() && (rates.rate_rps.expect("told").x - 0.3).abs() < 1e-6);
+    assert_eq!(heard(&mut decoder, &attitude(100_100, 0.0), at(0.1)), []);
+    let imu = MavMessage::SCALED_IMU(SCALED_IMU_DATA {
+        time_boot_ms: 100_150,
+        zacc: -1_000,
+        xgyro: 500,
+        ..SCALED_IMU_DATA::DEFAULT
+    });
+    let out = heard(&mut decoder, &imu, at(0.15));
+    let AutopilotSaid::Inertial(sample) = out[0].said else { panic!("{out:?}") };
+    let (rate, force) = sample.rate_rps.zip(sample.force_mps2).expect("both");
+    assert!((rate - Vector3::new(0.5, 0.0, 0.0)).norm() < 1e-9);
+    assert!((force - Vector3::new(0.0, 0.0, -9.806_65)).norm() < 1e-9);
+    // From here on the IMU's own rates are used, not the attitude's.
+    assert_eq!(heard(&mut decoder, &quaternion, at(0.2)).len(), 1);
+}
+
+#[test]
+fn fixes_and_its_own_position() {
+    let mut decoder = following();
+    heard(&mut decoder, &attitude(100_000, 0.0), at(0.0));
+    let time = SYSTEM_TIME_DATA { time_unix_usec: 1_800_000_000_000_000, time_boot_ms: 100_100 };
+    heard(&mut decoder, &MavMessage::SYSTEM_TIME(time), at(0.1));
+    let fix = MavMessage::GPS_RAW_INT(GPS_RAW_INT_DATA {
+        time_usec: 100_200_000,
+        fix_type: GpsFixType::GPS_FIX_TYPE_RTK_FIXED,
+        lat: 301_234_567,
+        lon: -857_654_321,
+        alt: 33_250,
+        alt_ellipsoid: 6_250,
+        eph: 90,
+        vel: 250,
+        cog: 9_000,
+        satellites_visible: 14,
+        h_acc: 20,
+        v_acc: 30,
+        ..GPS_RAW_INT_DATA::DEFAULT
+    });
+    let out = heard(&mut decoder, &fix, at(0.25));
+    let AutopilotSaid::Gnss(epoch) = out[0].said else { panic!("{out:?}") };
+    assert!((out[0].t - at(0.2)).abs() < Span::from_ms(1.0), "when its own clock says: {:?}", out[0].t);
+    assert_eq!((epoch.fix, epoch.sats), (FixKind::RtkFixed, Some(14)));
+    assert_eq!(epoch.utc.map(|utc| utc.unix_ns()), Some(1_800_000_000_100_000_000));
+    assert!((epoch.geoid_m.expect("told") + 27.0).abs() < 1e-9);
+    assert!((epoch.vel_ned_mps.expect("told") - Vector3::new(0.0, 2.5, 0.0)).norm() < 1e-9);
+    assert!((epoch.hpe_m.expect("told") - 0.02).abs() < 1e-9 && !epoch.vel_has_down);
+    assert_eq!(heard(&mut decoder, &fix, at(0.35)), [], "the same fix again");
+    let nowhere = MavMessage::GLOBAL_POSITION_INT(GLOBAL_POSITION_INT_DATA {
+        time_boot_ms: 100_400,
+        ..Default::default()
+    });
+    assert_eq!(heard(&mut decoder, &nowhere, at(0.4)), []);
+    let place = MavMessage::GLOBAL_POSITION_INT(GLOBAL_POSITION_INT_DATA {
+        time_boot_ms: 100_500,
+        lat: 301_234_567,
+        lon: -857_654_321,
+        alt: 45_000,
+        vx: 120,
+        ..GLOBAL_POSITION_INT_DATA::DEFAULT
+    });
+    let out = heard(&mut decoder, &place, at(0.5));
+    let AutopilotSaid::Position(position) = out[0].said else { panic!("{out:?}") };
+    assert_eq!((position.boot, position.alt_msl_m), (Span::from_s(100.5), 45.0));
+}
+
+#[test]
+fn questions_for_the_time_put_its_clock_on_ours() {
+    let mut decoder = following();
+    let asked = question(at(1.0));
+    let answer =
+        |ts1| MavMessage::TIMESYNC(TIMESYNC_DATA { tc1: 101_005_000_000, ts1, ..TIMESYNC_DATA::DEFAULT });
+    // Somebody else's is none of ours.
+    heard(&mut decoder, &answer(asked - 1), at(1.010));
+    assert!(!decoder.clock().is_exchanged());
+    heard(&mut decoder, &answer(asked), at(1.010));
+    assert!(decoder.clock().is_exchanged());
+    // A message that took 200 ms is stamped as well as any.
+    let out = heard(&mut decoder, &attitude(102_000, 0.0), at(2.2));
+    assert!((out[0].t - at(2.0)).abs() < Span::from_ms(0.01), "{:?}", out[0].t - at(2.0));
+}
+
+#[test]
+fn an_autopilot_that_starts_anew_is_followed() {
+    let mut decoder = following();
+    assert_eq!(heard(&mut decoder, &attitude(100_000, 0.0), at(0.0)).len(), 2);
+    let mut after = 0;
+    for k in 0..10_u32 {
+        let t = at(5.0 + 0.1 * f64::from(k));
+        after += heard(&mut decoder, &attitude(100 * k, 0.0), t).len();
+    }
+    assert_eq!((after, decoder.clock().restarts()), (16, 1));
+}
+
+#[test]
+fn values_that_cannot_be_are_refused_and_noise_is_passed_over() {
+    let mut decoder = following();
+    for odd in [f32::NAN, f32::INFINITY, 1e9] {
+        assert_eq!(heard(&mut decoder, &attitude(100_000, odd), at(0.0)), []);
+    }
+    let zero = MavMessage::ATTITUDE_QUATERNION(ATTITUDE_QUATERNION_DATA {
+        time_boot_ms: 100_000,
+        ..Default::default()
+    });
+    assert_eq!(heard(&mut decoder, &zero, at(0.0)), []);
+    assert_eq!(decoder.counts().refused(crate::Refusal::OutOfRange), 4);
+    // A frame amid noise, in parts, one bit of another changed.
+    let good = frame(1, 1, &attitude(100_100, 0.5));
+    let mut bad = good.clone();
+    bad[12] ^= 1;
+    let bytes = [b"ArduPilot\xfd\xfe\x00".as_slice(), &bad, &good, &[0; 300]].concat();
+    let mut out = Vec::new();
+    for byte in bytes {
+        decoder.push(&[byte], at(0.1), &mut out);
+    }
+    assert_eq!(out.len(), 2, "{out:?}");
+    assert!(decoder.counts().refused(crate::Refusal::BadChecksum) >= 1);
+}
+
+proptest! {
+    #[test]
+    fn any_bytes_in_any_parts_make_no_panic(parts in prop::collection::vec(prop::collection::vec(any::<u8>(), 0..300), 0..8)) {
+        let mut decoder = AutopilotDecoder::new(Some(1));
+        let mut out = Vec::new();
+        for (k, part) in parts.iter().enumerate() {
+            decoder.push(part, at(k as f64), &mut out);
+        }
+    }
+
+    #[test]
+    fn any_payload_of_a_known_message_makes_no_panic(id in 0_u32..512, payload in prop::collection::vec(any::<u8>(), 255)) {
+        use ::mavlink::{MavlinkVersion, Message as _};
+        if let Ok(message) = MavMessage::parse(MavlinkVersion::V2, id, &payload) {
+            let mut decoder = AutopilotDecoder::new(Some(1));
+            decoder.push(&frame(1, 1, &message), at(0.0), &mut Vec::new());
+        }
+    }
+}

@@ -1,0 +1,153 @@
+//! A flight whose helicopter is flown while it lasts: sensors measure what has happened by then, and what they deliver
+//! comes in the order in which it is heard.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use super::camera::Exposures;
+use super::compass::Compass;
+use super::compass_wire::{WireContext, write_reading};
+use super::flight::FlightError;
+use super::garmin::write_epoch;
+use super::gnss::GnssReceiver;
+use super::line::Line;
+use super::random::{Purpose, Stream};
+use super::render::Renderer;
+use super::world::World;
+use windhover_base::msg::{Event, EventBody, FrameEncoding, FramePayload, GrayImage, Source};
+use windhover_base::time::{MonoTime, Span};
+
+/// A frame's exposure is jittered: it is taken this long after its nominal time has been flown, s.
+const EXPOSED_BY_S: f64 = 0.01;
+
+/// How much later than the instruments' own delays what they deliver is heard, ms: uniform from 0, drawn for each.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub struct Lateness {
+    /// Of frames.
+    pub frames_ms: f64,
+    /// Of reads of the compass's line.
+    pub compass_ms: f64,
+}
+
+/// The sensors of a flight that is being flown.
+pub struct ClosedFlight {
+    world: Arc<World>,
+    renderer: Option<Renderer>,
+    gnss: GnssReceiver,
+    gnss_line: Line,
+    compass: Compass,
+    compass_line: Line,
+    exposures: Exposures,
+    lateness: Lateness,
+    late: Stream,
+    /// What is on its way, by when it is heard.
+    coming: VecDeque<(MonoTime, EventBody)>,
+    compass_heard: MonoTime,
+    flown: MonoTime,
+    seq: u64,
+}
+
+impl ClosedFlight {
+    /// Sensors of a flown world ([`World::flown`]), drawing with this many threads; without frames where
+    /// that is none. Dropouts and outages of the scenario
+    /// are left out.
+    pub fn new(world: Arc<World>, lateness: Lateness, threads: usize) -> Self {
+        let rig = &world.scenario().rig;
+        let stream = |purpose| Stream::of(world.seed(), purpose);
+        Self {
+            renderer: (threads > 0).then(|| Renderer::new(Arc::clone(&world)).with_threads(threads)),
+            gnss: GnssReceiver::new(&world),
+            gnss_line: Line::new(rig.gps.baud, stream(Purpose::GnssLine)),
+            compass: Compass::new(&world),
+            compass_line: Line::new(rig.compass.baud, stream(Purpose::CompassLine)),
+            exposures: Exposures::new(world.seed()),
+            lateness,
+            late: stream(Purpose::Lateness),
+            coming: VecDeque::new(),
+            compass_heard: world.time(0.0),
+            flown: world.time(0.0),
+            seq: 0,
+            world,
+        }
+    }
+
+    /// The world flown through.
+    pub fn world(&self) -> &Arc<World> {
+        &self.world
+    }
+
+    /// How far it has been flown.
+    pub fn now(&self) -> MonoTime {
+        self.flown
+    }
+
+    /// The helicopter was moved on by a step: appends what is heard by its end.
+    pub fn step(&mut self, out: &mut Vec<Event>) -> Result<(), FlightError> {
+        self.flown += World::STEP;
+        self.measure();
+        while let Some((t, _)) = self.coming.front()
+            && *t <= self.flown
+        {
+            let Some((t_recv, body)) = self.coming.pop_front() else { break };
+            out.push(Event { t_recv, seq: self.seq, body });
+            self.seq += 1;
+        }
+        Ok(())
+    }
+
+    /// What was true by now goes on its way.
+    fn measure(&mut self) {
+        let world = Arc::clone(&self.world);
+        let (scenario, now_s) = (world.scenario(), world.seconds(self.flown));
+        let mut line = Vec::with_capacity(256);
+        while self.gnss.due_s(&world) <= now_s {
+            let Some(sample) = self.gnss.next(&world) else { break };
+            line.clear();
+            write_epoch(scenario, &sample.epoch, &mut line);
+            self.gnss_line.send(&line, sample.t_first_byte);
+        }
+        while self.compass.due_s(&world) <= now_s {
+            let Some(sample) = self.compass.next(&world) else { break };
+            let context = WireContext {
+                format: scenario.rig.compass.format,
+                declination_deg: scenario.declination_deg,
+                utc: world.utc(world.seconds(sample.t_true)),
+            };
+            line.clear();
+            write_reading(&sample.sample, &context, &mut line);
+            self.compass_line.send(&line, sample.t_first_byte);
+        }
+        while let Some((t, data)) = self.gnss_line.pop() {
+            self.put(t, EventBody::Bytes { source: Source::Gps, data });
+        }
+        while let Some((t, data)) = self.compass_line.pop() {
+            // A line keeps its order, however late it is looked at.
+            let late = Span::from_ms(self.late.uniform(0.0, self.lateness.compass_ms.max(1e-9)));
+            self.compass_heard = self.compass_heard.max(t + late);
+            self.put(self.compass_heard, EventBody::Bytes { source: Source::Compass, data });
+        }
+        while self.exposures.due_s(&world) + EXPOSED_BY_S <= now_s {
+            let Some(truth) = self.exposures.next(&world) else { break };
+            let mut image = GrayImage::default();
+            let Some(renderer) = &self.renderer else { continue };
+            renderer.render(truth.t_true, truth.frame, &mut image);
+            let (width, height) = (image.width as u32, image.height as u32);
+            let frame = FramePayload {
+                index: truth.frame,
+                t_exposure: truth.t_stamp,
+                encoding: FrameEncoding::Grey,
+                width,
+                height,
+                stride: width,
+                data: image.data.into(),
+            };
+            let late = Span::from_ms(self.late.uniform(0.0, self.lateness.frames_ms.max(1e-9)));
+            self.put(truth.t_recv + late, EventBody::Frame(frame));
+        }
+    }
+
+    fn put(&mut self, t: MonoTime, body: EventBody) {
+        let place = self.coming.iter().rposition(|(at, _)| *at <= t).map_or(0, |i| i + 1);
+        self.coming.insert(place, (t, body));
+    }
+}

@@ -1,0 +1,13 @@
+//! What targets share.
+
+use std::path::Path;
+
+/// Writes a file of these parts in memory's file system where there is one, and hands it over.
+pub fn with_file(end: &str, parts: &[&[u8]], work: impl FnOnce(&Path)) {
+    let memory = Path::new("/dev/shm");
+    let folder = if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() };
+    let path = folder.join(format!("windhover-fuzz-{}.{end}", std::process::id()));
+    std::fs::write(&path, parts.concat()).expect("a scratch file");
+    work(&path);
+    std::fs::remove_file(&path).expect("it is ours");
+}

@@ -1,0 +1,205 @@
+//! A closed-loop flight in lock-step: world, sensors, pipeline, MAVLink, follower, world.
+
+use std::sync::Arc;
+
+use nalgebra::Vector3;
+
+use super::autopilot::{SimulatedAutopilot, follow_target};
+use crate::config::Config;
+use crate::io::mavlink::Teller;
+use crate::io::mavlink::companion::Companion;
+use crate::pipeline::{Pipeline, PipelineSettings};
+use windhover_base::msg::{Event, EventBody, Source};
+use windhover_base::time::{MonoTime, Span};
+use windhover_decode::MavlinkFrames;
+use windhover_simulate::{
+    ClosedFlight, FlightError, FollowTarget, Follower, FollowerTuning, Lateness, OwnshipTruth, Scenario,
+    VehicleTruth, World,
+};
+
+/// What the autopilot says is heard so much later.
+const LINK: Span = Span::from_ns(4_000_000);
+
+/// What a flight is flown with.
+#[derive(Clone, Debug, Default)]
+pub struct LoopSettings {
+    /// How much later than usual frames and compass are heard.
+    pub lateness: Lateness,
+    /// What the autopilot's receiver errs by, north, east, down, metres.
+    pub receiver_m: Vector3<f64>,
+    /// The follower is told the truth instead.
+    pub truth: bool,
+    /// From this time on no frame comes, seconds.
+    pub camera_dies_s: Option<f64>,
+    /// Threads that draw.
+    pub threads: usize,
+}
+
+/// How things stand after a step.
+#[derive(Clone, Copy, Debug)]
+pub struct Moment {
+    /// Seconds into the flight.
+    pub t_s: f64,
+    /// The helicopter.
+    pub own: OwnshipTruth,
+    /// The vehicle.
+    pub vehicle: VehicleTruth,
+    /// What the follower was told in this step, if anything, north, east, down of the world's origin.
+    pub told: Option<FollowTarget>,
+}
+
+/// A flight whose helicopter follows what is told of the vehicle.
+pub struct ClosedLoop {
+    flight: ClosedFlight,
+    pipeline: Pipeline,
+    teller: Teller,
+    companion: Companion,
+    autopilot: SimulatedAutopilot,
+    follower: Follower,
+    settings: LoopSettings,
+    heard: bool,
+    system_id: u8,
+    next_tell: MonoTime,
+    next_second: MonoTime,
+    seq: u64,
+    /// The autopilot's bytes on their way.
+    coming: Vec<(MonoTime, Vec<u8>)>,
+}
+
+impl ClosedLoop {
+    /// A flight of this scenario with the configuration that `configure` makes of the scenario's own.
+    pub fn new(
+        scenario: Scenario,
+        seed: u64,
+        configure: impl FnOnce(&mut Config),
+        settings: LoopSettings,
+    ) -> Self {
+        let mut config = Config::of_rig(scenario.rig.clone(), scenario.ground());
+        configure(&mut config);
+        let tuning = FollowerTuning { height_m: scenario.helicopter.height_m, ..FollowerTuning::default() };
+        let world = Arc::new(World::flown(scenario, seed));
+        let begin = world.time(0.0);
+        Self {
+            // Who is told the truth needs no pictures.
+            flight: ClosedFlight::new(
+                world,
+                settings.lateness,
+                if settings.truth { 0 } else { settings.threads.max(1) },
+            ),
+            pipeline: Pipeline::new(PipelineSettings::from(&config)),
+            teller: Teller::new(&config.mavlink, &config.target, &config.ground, &config.camera, None),
+            companion: Companion::new(None, true),
+            autopilot: SimulatedAutopilot::new(settings.receiver_m),
+            follower: Follower::new(tuning),
+            settings,
+            heard: config.autopilot.is_some(),
+            system_id: config.mavlink.system_id,
+            next_tell: begin,
+            next_second: begin,
+            seq: 0,
+            coming: Vec::new(),
+        }
+    }
+
+    /// The world flown through.
+    pub fn world(&self) -> &Arc<World> {
+        self.flight.world()
+    }
+
+    /// Goes on by [`World::STEP`].
+    pub fn step(&mut self) -> Result<Moment, FlightError> {
+        let world = Arc::clone(self.flight.world());
+        let now = self.flight.now();
+        let (position, velocity) = self.autopilot.position(&world, now);
+        let wanted = self.follower.command(now, &position, &velocity);
+        world.fly(&wanted);
+        let mut events = Vec::new();
+        self.flight.step(&mut events)?;
+        let t = self.flight.now();
+        self.hear_autopilot(&world, t, &mut events);
+        let told = match self.settings.truth {
+            true => self.tell_truth(&world, t),
+            false => self.tell(&world, t, &mut events),
+        };
+        if let Some(told) = &told {
+            self.follower.hear(told, t);
+        }
+        let t_s = world.seconds(t);
+        Ok(Moment { t_s, own: world.ownship(t), vehicle: world.vehicle(0, t), told })
+    }
+
+    /// What the autopilot says joins what is heard, where it is heard.
+    fn hear_autopilot(&mut self, world: &World, t: MonoTime, events: &mut Vec<Event>) {
+        let mut bytes = Vec::new();
+        self.autopilot.says(world, t, &mut bytes);
+        if t >= self.next_second {
+            self.next_second += Span::from_s(1.0);
+            let mut asked = Vec::new();
+            self.companion.every_second(t, &mut asked);
+            let mut frames = Vec::new();
+            asked.iter().for_each(|frame| MavlinkFrames::default().push(frame, &mut frames));
+            frames.iter().for_each(|frame| self.autopilot.hears(world, frame, t + LINK, &mut bytes));
+        }
+        if self.heard && !bytes.is_empty() {
+            self.coming.push((t + LINK + LINK, bytes));
+        }
+        for (at, data) in self.coming.extract_if(.., |(at, _)| *at <= t).collect::<Vec<_>>() {
+            let mut frames = Vec::new();
+            MavlinkFrames::default().push(&data, &mut frames);
+            for frame in &frames {
+                self.companion.heard(frame, at, &mut Vec::new());
+            }
+            events.push(Event {
+                t_recv: at,
+                seq: 0,
+                body: EventBody::Bytes { source: Source::Autopilot, data },
+            });
+        }
+        events.sort_by_key(|event| event.t_recv);
+    }
+
+    /// Through the pipeline, and out as MAVLink.
+    fn tell(&mut self, world: &World, t: MonoTime, events: &mut Vec<Event>) -> Option<FollowTarget> {
+        let dead = self.settings.camera_dies_s.is_some_and(|from| world.seconds(t) >= from);
+        events.retain(|event| !(dead && matches!(event.body, EventBody::Frame(_))));
+        if let Some(tick) = self.pipeline.tick_due(t) {
+            events.push(Event { t_recv: tick.max(t), seq: 0, body: EventBody::Tick });
+        }
+        let mut outputs = Vec::new();
+        for event in events.iter_mut() {
+            event.seq = self.seq;
+            self.seq += 1;
+            self.pipeline.handle(event, &mut outputs);
+        }
+        outputs.iter().for_each(|output| self.teller.output(&output.output));
+        if t < self.next_tell {
+            return None;
+        }
+        self.next_tell += self.teller.every();
+        let mut frames = Vec::new();
+        self.teller.tell(t, &mut frames);
+        let scenario = world.scenario();
+        let origin_msl_m = scenario.origin.height_m - scenario.geoid_m;
+        frames.iter().find_map(|frame| follow_target(frame, self.system_id, world.frame(), origin_msl_m))
+    }
+
+    /// The truth, as often and as exactly; where its receiver takes it to be.
+    fn tell_truth(&mut self, world: &World, t: MonoTime) -> Option<FollowTarget> {
+        if t < self.next_tell {
+            return None;
+        }
+        self.next_tell += self.teller.every();
+        let velocity = |t: MonoTime| {
+            let vehicle = world.vehicle(0, t);
+            let (s, c) = vehicle.heading_rad.sin_cos();
+            Vector3::new(c, s, 0.0) * vehicle.speed_mps
+        };
+        let (half, vehicle) = (Span::from_ms(20.0), world.vehicle(0, t));
+        Some(FollowTarget {
+            stamp: t - world.time(0.0),
+            position_m: vehicle.origin() + self.settings.receiver_m,
+            velocity_mps: velocity(t),
+            acceleration_mps2: (velocity(t + half) - velocity(t - half)) / (2.0 * half.s()),
+        })
+    }
+}

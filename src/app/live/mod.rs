@@ -1,0 +1,14 @@
+//! The loop closed: a simulated helicopter that follows what the real pipeline tells it over MAVLink.
+//!
+//! [`LiveFlight`] goes in real time, with a daemon of its own process. [`ClosedLoop`] goes in lock-step on simulated time, so the same scenario and seed give the same flight.
+
+mod autopilot;
+mod closed_loop;
+mod devices;
+mod real_time;
+mod score;
+
+pub use autopilot::{SimulatedAutopilot, follow_target};
+pub use closed_loop::{ClosedLoop, LoopSettings, Moment};
+pub use real_time::{LiveError, LiveFlight, LiveFolder};
+pub use score::Score;

@@ -1,0 +1,77 @@
+//! How a closed-loop flight went: what a follower's pilot asks of it.
+
+use nalgebra::{Vector2, Vector3};
+
+use super::closed_loop::Moment;
+
+/// Figures of a flight, from some time on.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub struct Score {
+    /// Horizontal distance of the helicopter from the vehicle, rms, metres.
+    pub follow_rms_m: f64,
+    /// The same, largest.
+    pub follow_max_m: f64,
+    /// Tilt, rms and largest, degrees.
+    pub tilt_rms_deg: f64,
+    /// The same, largest.
+    pub tilt_max_deg: f64,
+    /// Height over the vehicle, mean, metres.
+    pub height_m: f64,
+    /// Velocity told less the true one, rms of its length, m/s.
+    pub velocity_rms_mps: f64,
+    /// Correlation of that with the helicopter's own acceleration through its tilt, the larger of north and east by size.
+    pub correlation: f64,
+    /// Highest speed of the helicopter, m/s.
+    pub speed_max_mps: f64,
+    /// How often something was told.
+    pub told: usize,
+}
+
+impl Score {
+    /// Of the moments from `from_s` on.
+    pub fn of(moments: &[Moment], from_s: f64) -> Self {
+        let moments: Vec<&Moment> = moments.iter().filter(|moment| moment.t_s >= from_s).collect();
+        let mean = |of: &dyn Fn(&Moment) -> f64| {
+            moments.iter().map(|moment| of(moment)).sum::<f64>() / moments.len().max(1) as f64
+        };
+        let most = |of: &dyn Fn(&Moment) -> f64| moments.iter().map(|moment| of(moment)).fold(0.0, f64::max);
+        let away = |m: &Moment| (m.own.position_ned_m - m.vehicle.origin()).xy().norm();
+        let tilt = |m: &Moment| (m.own.ned_from_body * Vector3::z()).z.clamp(-1.0, 1.0).acos().to_degrees();
+        let (errors, tilts): (Vec<Vector2<f64>>, Vec<Vector2<f64>>) = moments
+            .iter()
+            .filter_map(|m| {
+                let (s, c) = m.vehicle.heading_rad.sin_cos();
+                let error = m.told?.velocity_mps.xy() - Vector2::new(c, s) * m.vehicle.speed_mps;
+                Some((error, -(m.own.ned_from_body * Vector3::z()).xy()))
+            })
+            .unzip();
+        let squares: f64 = errors.iter().map(Vector2::norm_squared).sum();
+        let told = errors.len();
+        Self {
+            follow_rms_m: mean(&|m| away(m).powi(2)).sqrt(),
+            follow_max_m: most(&away),
+            tilt_rms_deg: mean(&|m| tilt(m).powi(2)).sqrt(),
+            tilt_max_deg: most(&tilt),
+            height_m: mean(&|m| m.vehicle.origin().z - m.own.position_ned_m.z),
+            velocity_rms_mps: (squares / told.max(1) as f64).sqrt(),
+            correlation: [0, 1]
+                .map(|axis| correlation(errors.iter().map(|e| e[axis]), tilts.iter().map(|t| t[axis])))
+                .into_iter()
+                .fold(0.0, |a: f64, b| if b.abs() > a.abs() { b } else { a }),
+            speed_max_mps: most(&|m| m.own.velocity_ned_mps.norm()),
+            told,
+        }
+    }
+}
+
+fn correlation(a: impl Iterator<Item = f64> + Clone, b: impl Iterator<Item = f64> + Clone) -> f64 {
+    let n = a.clone().count().max(1) as f64;
+    let (mean_a, mean_b) = (a.clone().sum::<f64>() / n, b.clone().sum::<f64>() / n);
+    let (mut ab, mut aa, mut bb) = (0.0, 0.0, 0.0);
+    for (x, y) in a.zip(b) {
+        ab += (x - mean_a) * (y - mean_b);
+        aa += (x - mean_a).powi(2);
+        bb += (y - mean_b).powi(2);
+    }
+    if aa > 0.0 && bb > 0.0 { ab / (aa * bb).sqrt() } else { 0.0 }
+}

@@ -1,0 +1,236 @@
+//! The link to the helicopter's autopilot as a task: a serial line or a UDP port, both ways.
+
+use std::collections::VecDeque;
+use std::convert::Infallible;
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use tokio::net::UdpSocket;
+use tokio::sync::Notify;
+
+use super::clock::HostClock;
+use super::device::{Backoff, Fault, NoteKind, Report, Reports, wait_for};
+use super::mavlink::companion::Companion;
+use super::mavlink::packet::{self, SigningKey};
+use super::serial::{Line, SerialSettings};
+use windhover_decode::{MavlinkFrame, MavlinkFrames};
+
+/// Frames that wait for a line that takes none; the oldest goes first.
+const WAITING: usize = 64;
+/// Bytes one read can return.
+const READ_BYTES: usize = 4096;
+
+/// How the autopilot is reached.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub enum Reached {
+    /// Over a serial line.
+    Serial {
+        /// Its device.
+        device: String,
+        /// Its speed.
+        baud: u32,
+    },
+    /// At this UDP address of ours.
+    Udp(String),
+}
+
+/// What the task is set to.
+#[derive(Clone, Debug)]
+pub struct AutopilotSettings {
+    /// How it is reached.
+    pub reached: Reached,
+    /// Its system id; the first that is heard where `None`.
+    pub system_id: Option<u8>,
+    /// Whether it is asked for the messages that are used.
+    pub configure: bool,
+    /// Frames that are not signed with it are refused.
+    pub key: Option<SigningKey>,
+}
+
+/// Frames on their way to the autopilot. Copies are the same; nothing here waits.
+#[derive(Clone, Debug, Default)]
+pub struct ToAutopilot {
+    frames: Arc<Mutex<VecDeque<Vec<u8>>>>,
+    come: Arc<Notify>,
+}
+
+impl ToAutopilot {
+    /// Puts a frame in the row.
+    pub fn send(&self, frame: &[u8]) {
+        let mut frames = self.frames.lock().unwrap_or_else(PoisonError::into_inner);
+        if frames.len() == WAITING {
+            frames.pop_front();
+        }
+        frames.push_back(frame.to_vec());
+        drop(frames);
+        self.come.notify_one();
+    }
+
+    fn take(&self) -> VecDeque<Vec<u8>> {
+        std::mem::take(&mut *self.frames.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}
+
+/// Hears the autopilot for ever, and sends it what is to be sent; dropping the future closes the link.
+pub async fn run(
+    settings: &AutopilotSettings,
+    outgoing: &ToAutopilot,
+    clock: HostClock,
+    reports: Reports<'_>,
+) -> Infallible {
+    let mut backoff = Backoff::new();
+    loop {
+        let fault = match Port::open(&settings.reached).await {
+            Ok(port) => {
+                reports(Report::Up(port.words()));
+                let companion = Companion::new(settings.system_id, settings.configure);
+                let frames = MavlinkFrames::default();
+                let mut link = AutopilotLink { port, companion, frames, settings, clock, reports };
+                let fault = match link.serve(outgoing, &mut backoff).await {
+                    Ok(never) => match never {},
+                    Err(fault) => fault,
+                };
+                link.port.close().await;
+                fault
+            }
+            Err(fault) => fault,
+        };
+        reports(Report::Down(fault));
+        backoff.wait(reports).await;
+    }
+}
+
+/// An open way to the autopilot.
+enum Port {
+    Serial(Line, String),
+    Udp { socket: UdpSocket, address: String, peer: Option<SocketAddr>, from: Option<SocketAddr> },
+}
+
+impl Port {
+    async fn open(reached: &Reached) -> Result<Self, Fault> {
+        match reached {
+            Reached::Serial { device, baud } => {
+                let settings = SerialSettings {
+                    device: device.clone(),
+                    baud: *baud,
+                    text: false,
+                    configure_garmin: false,
+                };
+                let line = Line::open(&settings).await?;
+                Ok(Self::Serial(line, format!("{device} at {baud} baud")))
+            }
+            Reached::Udp(address) => {
+                let socket = UdpSocket::bind(address).await.map_err(|e| Fault::from_io(address, &e))?;
+                Ok(Self::Udp { socket, address: address.clone(), peer: None, from: None })
+            }
+        }
+    }
+
+    fn words(&self) -> String {
+        match self {
+            Self::Serial(_, words) => words.clone(),
+            Self::Udp { address, .. } => format!("udp://{address}"),
+        }
+    }
+
+    async fn read(&mut self, buffer: &mut [u8]) -> Result<usize, Fault> {
+        match self {
+            Self::Serial(line, _) => line.read(buffer).await,
+            Self::Udp { socket, address, from, .. } => {
+                let (count, sender) =
+                    socket.recv_from(buffer).await.map_err(|e| Fault::from_io(address, &e))?;
+                *from = Some(sender);
+                Ok(count)
+            }
+        }
+    }
+
+    /// The autopilot is where the last bytes came from.
+    fn answer_there(&mut self) {
+        if let Self::Udp { peer, from, .. } = self {
+            *peer = *from;
+        }
+    }
+
+    async fn write(&mut self, frame: &[u8]) -> Result<(), Fault> {
+        match self {
+            Self::Serial(line, _) => line.write(frame).await,
+            // A datagram that does not go is lost, as any may be.
+            Self::Udp { socket, peer, .. } => {
+                if let Some(peer) = peer {
+                    let _ = socket.send_to(frame, *peer).await;
+                }
+                Ok(())
+            }
+        }
+    }
+
+    async fn close(self) {
+        if let Self::Serial(line, _) = self {
+            line.close().await;
+        }
+    }
+}
+
+struct AutopilotLink<'a> {
+    port: Port,
+    companion: Companion,
+    frames: MavlinkFrames,
+    settings: &'a AutopilotSettings,
+    clock: HostClock,
+    reports: Reports<'a>,
+}
+
+impl AutopilotLink<'_> {
+    async fn serve(&mut self, outgoing: &ToAutopilot, backoff: &mut Backoff) -> Result<Infallible, Fault> {
+        let mut second = tokio::time::interval(Duration::from_secs(1));
+        second.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
+        let mut buffer = vec![0; READ_BYTES];
+        loop {
+            let mut answers = Vec::new();
+            tokio::select! {
+                count = wait_for(self.port.read(&mut buffer), self.reports) => {
+                    let count = count?;
+                    backoff.reset();
+                    self.take(&buffer[..count], &mut answers);
+                }
+                _ = second.tick() => self.companion.every_second(self.clock.now(), &mut answers),
+                () = outgoing.come.notified() => answers.extend(outgoing.take()),
+            }
+            for frame in answers {
+                self.port.write(&frame).await?;
+            }
+            for note in self.companion.notes() {
+                (self.reports)(Report::Note(NoteKind::Autopilot, 1, note));
+            }
+        }
+    }
+
+    /// Bytes go on as they came; with a key, the frames alone that are signed with it.
+    fn take(&mut self, bytes: &[u8], answers: &mut Vec<Vec<u8>>) {
+        let t = self.clock.now();
+        let mut heard = Vec::new();
+        self.frames.push(bytes, &mut heard);
+        if let Some(key) = &self.settings.key {
+            let before = heard.len();
+            heard.retain(|frame| packet::verify(&frame.bytes, key).is_ok());
+            if heard.len() < before {
+                let words = "frames that are not signed with mavlink.signing_key are refused".to_owned();
+                (self.reports)(Report::Note(NoteKind::Autopilot, (before - heard.len()) as u32, words));
+            }
+        }
+        let mut its = false;
+        for frame in &heard {
+            its |= self.companion.heard(frame, t, answers);
+        }
+        if its {
+            self.port.answer_there();
+        }
+        let whole = |heard: &[MavlinkFrame]| heard.iter().flat_map(|frame| frame.bytes.clone()).collect();
+        let believed: Vec<u8> = if self.settings.key.is_some() { whole(&heard) } else { bytes.to_vec() };
+        if !believed.is_empty() {
+            (self.reports)(Report::Bytes(t, believed));
+        }
+    }
+}

@@ -1,0 +1,204 @@
+//! What is said to the helicopter's own autopilot beside the vehicles: that we are there, what time it is, and which
+//! messages are wanted of it.
+
+use mavlink::MessageData as _;
+use mavlink::dialects::development::*;
+
+use windhover_base::time::{MonoTime, RemoteClock, Span};
+use windhover_decode::{MavlinkFrame, is_autopilot, timesync_asked, timesync_question};
+
+use super::messages;
+use super::packet::{self, Sender};
+
+/// MAV_COMP_ID_ONBOARD_COMPUTER.
+const COMPANION: u8 = 191;
+/// MAV_COMP_ID_AUTOPILOT1.
+const AUTOPILOT: u8 = 1;
+/// Messages that are used, and how often each is, a second. ArduPilot has SCALED_IMU, PX4 HIGHRES_IMU.
+const WANTED: [(u32, f32); 6] = [
+    (ATTITUDE_QUATERNION_DATA::ID, 25.0),
+    (SCALED_IMU_DATA::ID, 50.0),
+    (HIGHRES_IMU_DATA::ID, 50.0),
+    (GPS_RAW_INT_DATA::ID, 10.0),
+    (GLOBAL_POSITION_INT_DATA::ID, 10.0),
+    (SYSTEM_TIME_DATA::ID, 1.0),
+];
+
+/// Our side of the link to the autopilot.
+#[derive(Clone, Debug, Default)]
+pub struct Companion {
+    wanted: Option<u8>,
+    configure: bool,
+    system: Option<u8>,
+    /// Another autopilot that was heard and told of.
+    another: Option<u8>,
+    clock: RemoteClock,
+    restarts: u32,
+    configured: bool,
+    sequence: u8,
+    notes: Vec<String>,
+}
+
+impl Companion {
+    /// Of this system; of the first autopilot that is heard where `None`.
+    pub fn new(wanted: Option<u8>, configure: bool) -> Self {
+        Self { wanted, configure, ..Self::default() }
+    }
+
+    /// Takes a frame that was heard at `t`; whether it is the autopilot's. Appends what it is answered.
+    pub fn heard(&mut self, frame: &MavlinkFrame, t: MonoTime, out: &mut Vec<Vec<u8>>) -> bool {
+        if is_autopilot(frame) && self.wanted.is_none_or(|wanted| wanted == frame.system) {
+            let system = *self.system.get_or_insert_with(|| {
+                self.notes.push(format!("system {} is followed", frame.system));
+                frame.system
+            });
+            if system != frame.system && self.another != Some(frame.system) {
+                self.another = Some(frame.system);
+                let words = format!("system {} is an autopilot too, and is not heard", frame.system);
+                self.notes.push(words);
+            }
+        }
+        if self.system != Some(frame.system) || frame.component != AUTOPILOT {
+            return false;
+        }
+        match &frame.message {
+            MavMessage::TIMESYNC(sync) if sync.tc1 == 0 => self.tell_time(sync.ts1, t, out),
+            MavMessage::TIMESYNC(sync) => {
+                if let Some(sent) = timesync_asked(sync.ts1) {
+                    self.clock.exchanged(sent, Span::from_ns(sync.tc1), t);
+                }
+            }
+            MavMessage::SYSTEM_TIME(time) => self.beat(time.time_boot_ms, t),
+            MavMessage::ATTITUDE(attitude) => self.beat(attitude.time_boot_ms, t),
+            MavMessage::GLOBAL_POSITION_INT(place) => self.beat(place.time_boot_ms, t),
+            _ => {}
+        }
+        true
+    }
+
+    fn beat(&mut self, time_boot_ms: u32, t: MonoTime) {
+        self.clock.heard(Span::from_ns(i64::from(time_boot_ms) * 1_000_000), t);
+        if self.clock.restarts() != self.restarts {
+            self.restarts = self.clock.restarts();
+            self.configured = false;
+            self.notes.push("it was started anew, or its clock stepped".into());
+        }
+    }
+
+    /// Its own time is what we say when it asks for ours: then stamps are on one clock, and what it takes for the
+    /// difference is none.
+    fn tell_time(&mut self, ts1: i64, t: MonoTime, out: &mut Vec<Vec<u8>>) {
+        let Some(remote) = self.clock.remote(t).filter(|_| self.clock.is_exchanged()) else { return };
+        let answer = TIMESYNC_DATA { tc1: remote.ns(), ts1, ..TIMESYNC_DATA::DEFAULT };
+        self.put(&MavMessage::TIMESYNC(answer), out);
+    }
+
+    /// What is said once a second: nothing before it was heard.
+    pub fn every_second(&mut self, now: MonoTime, out: &mut Vec<Vec<u8>>) {
+        let Some(system) = self.system else { return };
+        self.put(&messages::heartbeat_of(MavType::MAV_TYPE_ONBOARD_CONTROLLER), out);
+        let question = TIMESYNC_DATA {
+            tc1: 0,
+            ts1: timesync_question(now),
+            target_system: system,
+            target_component: AUTOPILOT,
+        };
+        self.put(&MavMessage::TIMESYNC(question), out);
+        if self.configure && !self.configured {
+            self.configured = true;
+            for (id, hz) in WANTED {
+                self.put(&interval(system, id, hz), out);
+            }
+        }
+    }
+
+    /// What an operator should know.
+    pub fn notes(&mut self) -> Vec<String> {
+        std::mem::take(&mut self.notes)
+    }
+
+    fn put(&mut self, message: &MavMessage, out: &mut Vec<Vec<u8>>) {
+        let Some(system) = self.system else { return };
+        let sender = Sender { system, component: COMPANION };
+        out.push(packet::encode(self.sequence, sender, message, None));
+        self.sequence = self.sequence.wrapping_add(1);
+    }
+}
+
+/// The command that asks for a message so often.
+fn interval(system: u8, id: u32, hz: f32) -> MavMessage {
+    MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
+        param1: id as f32,
+        param2: 1e6 / hz,
+        target_system: system,
+        target_component: AUTOPILOT,
+        ..COMMAND_LONG_DATA::DEFAULT
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use windhover_decode::MavlinkFrames;
+
+    fn at(s: f64) -> MonoTime {
+        MonoTime::from_ns(1_700_000_000_000_000_000) + Span::from_s(s)
+    }
+
+    fn frames(bytes: &[Vec<u8>]) -> Vec<MavlinkFrame> {
+        let mut out = Vec::new();
+        bytes.iter().for_each(|frame| MavlinkFrames::default().push(frame, &mut out));
+        out
+    }
+
+    fn of(system: u8, message: &MavMessage) -> MavlinkFrame {
+        let bytes = packet::encode(0, Sender { system, component: AUTOPILOT }, message, None);
+        frames(&[bytes]).remove(0)
+    }
+
+    fn heartbeat() -> MavMessage {
+        MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+            autopilot: MavAutopilot::MAV_AUTOPILOT_PX4,
+            mavtype: MavType::MAV_TYPE_HELICOPTER,
+            ..HEARTBEAT_DATA::DEFAULT
+        })
+    }
+
+    #[test]
+    fn nothing_is_said_before_it_is_heard_and_then_its_time_is_asked_for() {
+        let mut companion = Companion::new(None, true);
+        let mut said = Vec::new();
+        companion.every_second(at(0.0), &mut said);
+        assert!(said.is_empty());
+        assert!(companion.heard(&of(3, &heartbeat()), at(0.5), &mut said));
+        companion.every_second(at(1.0), &mut said);
+        let said = frames(&said);
+        assert_eq!(said.len(), 2 + WANTED.len());
+        assert!(said.iter().all(|frame| (frame.system, frame.component) == (3, COMPANION)));
+        let MavMessage::TIMESYNC(question) = &said[1].message else { panic!("{said:?}") };
+        // Its own question is answered in its own time, once that is known.
+        let mut out = Vec::new();
+        let its = MavMessage::TIMESYNC(TIMESYNC_DATA { ts1: 7, ..TIMESYNC_DATA::DEFAULT });
+        companion.heard(&of(3, &its), at(1.001), &mut out);
+        assert!(out.is_empty());
+        let answer = TIMESYNC_DATA { tc1: 50_000_000_000, ts1: question.ts1, ..TIMESYNC_DATA::DEFAULT };
+        companion.heard(&of(3, &MavMessage::TIMESYNC(answer)), at(1.004), &mut out);
+        companion.heard(&of(3, &its), at(2.002), &mut out);
+        let MavMessage::TIMESYNC(told) = &frames(&out)[0].message else { panic!("{out:?}") };
+        assert_eq!(told.ts1, 7);
+        assert!((told.tc1 - 51_000_000_000).abs() < 1_000_000, "{}", told.tc1);
+    }
+
+    #[test]
+    fn another_autopilot_is_told_and_not_heard() {
+        let mut companion = Companion::new(None, false);
+        assert!(companion.heard(&of(1, &heartbeat()), at(0.0), &mut Vec::new()));
+        assert!(!companion.heard(&of(2, &heartbeat()), at(0.1), &mut Vec::new()));
+        assert!(!companion.heard(&of(2, &heartbeat()), at(1.1), &mut Vec::new()));
+        assert_eq!(companion.notes().len(), 2);
+        let mut second = Companion::new(Some(2), false);
+        assert!(!second.heard(&of(1, &heartbeat()), at(0.0), &mut Vec::new()));
+        assert!(second.heard(&of(2, &heartbeat()), at(0.1), &mut Vec::new()));
+    }
+}

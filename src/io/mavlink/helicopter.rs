@@ -1,0 +1,122 @@
+//! What is known of the helicopter: its own state lately, and what its autopilot takes for its position and time.
+
+use std::collections::VecDeque;
+
+use nalgebra::{UnitQuaternion, Vector3};
+
+use windhover_base::geo::LocalFrame;
+use windhover_base::msg::{AutopilotPosition, Ownship, Stamped};
+use windhover_base::time::{MonoTime, Span};
+
+/// Own states are kept for this long.
+const KEPT: Span = Span::from_ns(3_000_000_000);
+/// Between two own states farther apart nothing is known.
+const GAP: Span = Span::from_ns(500_000_000);
+/// The difference between the autopilot's position and ours is averaged over so long, s: longer than what noise and
+/// tilt make of it, shorter than receivers take to wander.
+const AVERAGED_S: f64 = 2.0;
+/// The autopilot's position is known while it was heard so lately.
+const FRESH: Span = Span::from_ns(2_000_000_000);
+
+/// The helicopter at one time.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct OwnAt {
+    /// North, east, down of the datum, metres.
+    pub position_ned_m: Vector3<f64>,
+    /// Height above the ellipsoid, metres.
+    pub height_m: f64,
+    /// Attitude.
+    pub ned_from_body: UnitQuaternion<f64>,
+    /// One-sigma of its height, metres.
+    pub sigma_down_m: f64,
+}
+
+/// The autopilot's position less ours, and its clock less ours.
+#[derive(Clone, Copy, PartialEq, Debug)]
+struct Difference {
+    at: MonoTime,
+    /// North and east, metres; and altitude above mean sea level less height above the ellipsoid.
+    place_m: Vector3<f64>,
+    clock: Span,
+}
+
+/// The helicopter.
+#[derive(Clone, Debug, Default)]
+pub struct Helicopter {
+    own: VecDeque<Ownship>,
+    heard: Option<Stamped<AutopilotPosition>>,
+    difference: Option<Difference>,
+}
+
+impl Helicopter {
+    /// Takes its own state.
+    pub fn own(&mut self, own: &Ownship, frame: Option<&LocalFrame>) {
+        let place = self.own.iter().rposition(|at| at.t_valid <= own.t_valid).map_or(0, |i| i + 1);
+        self.own.insert(place, *own);
+        let latest = self.own.back().map_or(own.t_valid, |last| last.t_valid);
+        self.own.retain(|at| latest - at.t_valid <= KEPT);
+        if let Some(frame) = frame {
+            self.compare(frame);
+        }
+    }
+
+    /// Takes where its autopilot takes it to be.
+    pub fn heard(&mut self, position: &Stamped<AutopilotPosition>) {
+        self.heard = Some(*position);
+    }
+
+    /// The helicopter at `t`, between the states that are known; as it was last, a little after them.
+    pub fn at(&self, t: MonoTime) -> Option<OwnAt> {
+        let after = self.own.iter().find(|own| own.t_valid >= t);
+        let before = self.own.iter().rev().find(|own| own.t_valid <= t);
+        let (a, b) = match (before, after) {
+            (Some(a), Some(b)) if b.t_valid - a.t_valid <= GAP => (a, b),
+            (Some(a), None) if t - a.t_valid <= GAP => (a, a),
+            _ => return None,
+        };
+        let between = (b.t_valid - a.t_valid).s();
+        let share = if between > 0.0 { (t - a.t_valid).s() / between } else { 0.0 };
+        let on = if between > 0.0 { Vector3::zeros() } else { a.velocity_ned_mps * (t - a.t_valid).s() };
+        Some(OwnAt {
+            position_ned_m: a.position_ned_m.lerp(&b.position_ned_m, share) + on,
+            height_m: a.height_m + share * (b.height_m - a.height_m) - on.z,
+            ned_from_body: a.ned_from_body.slerp(&b.ned_from_body, share),
+            sigma_down_m: a.position_sigma_m().z,
+        })
+    }
+
+    /// Follows the difference between the autopilot's position and ours, once both are known for the same time.
+    fn compare(&mut self, frame: &LocalFrame) {
+        let Some(heard) = self.heard else { return };
+        let known = self.own.back().is_some_and(|last| last.t_valid >= heard.t_valid);
+        let Some(own) = self.at(heard.t_valid).filter(|_| known) else { return };
+        self.heard = None;
+        let place = windhover_base::geo::Geodetic {
+            lat_deg: heard.value.lat_deg,
+            lon_deg: heard.value.lon_deg,
+            height_m: own.height_m,
+        };
+        let apart = frame.ned(place) - own.position_ned_m;
+        let place_m = Vector3::new(apart.x, apart.y, heard.value.alt_msl_m - own.height_m);
+        let clock = heard.value.boot - (heard.t_valid - MonoTime::default());
+        let place_m = match self.difference {
+            Some(last) if heard.t_valid > last.at && heard.t_valid - last.at <= FRESH => {
+                let share = 1.0 - (-(heard.t_valid - last.at).s() / AVERAGED_S).exp();
+                last.place_m + (place_m - last.place_m) * share
+            }
+            _ => place_m,
+        };
+        self.difference = Some(Difference { at: heard.t_valid, place_m, clock });
+    }
+
+    /// The autopilot's position less ours (north, east; altitude above mean sea level less our height above the
+    /// ellipsoid), metres: the last that is known, and whether it was heard just now.
+    pub fn difference(&self, now: MonoTime) -> Option<(Vector3<f64>, bool)> {
+        self.difference.map(|d| (d.place_m, now - d.at <= FRESH))
+    }
+
+    /// `t` on the autopilot's clock, since its start.
+    pub fn on_its_clock(&self, t: MonoTime) -> Option<Span> {
+        self.difference.map(|d| (t - MonoTime::default()) + d.clock)
+    }
+}

@@ -1,0 +1,180 @@
+//! Closed-loop flights: the helicopter follows what is told of the vehicle over MAVLink, and what it is told depends on
+//! how it flies.
+
+use nalgebra::Vector3;
+
+use windhover::app::live::{ClosedLoop, LoopSettings, Moment, Score};
+use windhover::config::Config;
+use windhover_base::settings::{AutopilotConfig, AutopilotUse};
+use windhover_simulate::{HiddenMarker, Lateness, Route, Scenario, SpeedPlan, Wind};
+
+/// 12 m above a vehicle on a circle, in some wind; drawn at `scale` of the camera's resolution.
+fn circle(duration_s: f64, scale: f64) -> Scenario {
+    let mut scenario = Scenario::named("follow").expect("known").with_resolution(scale);
+    scenario.duration_s = duration_s;
+    scenario.helicopter.height_m = 12.0;
+    scenario.vehicles[0].route = Route::Circle { north_m: 0.0, east_m: 0.0, radius_m: 12.5 };
+    scenario.vehicles[0].speed = SpeedPlan::Cruise { mean_mps: 1.5, wander_mps: 0.0 };
+    scenario.wind = Wind { mean_mps: 5.0, toward_deg: Some(30.0), gust_mps: 0.8 };
+    scenario.gps.bias_sigma_m = 0.0;
+    scenario.gps.dropout = 0.0;
+    scenario.camera.dropped = 0.0;
+    scenario
+}
+
+fn late() -> LoopSettings {
+    LoopSettings {
+        lateness: Lateness { frames_ms: 50.0, compass_ms: 50.0 },
+        threads: 2,
+        ..LoopSettings::default()
+    }
+}
+
+fn listening(config: &mut Config) {
+    let listen = Some("udp://0.0.0.0:14550".to_owned());
+    let uses = vec![AutopilotUse::Attitude, AutopilotUse::Imu];
+    config.autopilot = Some(AutopilotConfig { listen, uses, ..AutopilotConfig::default() });
+}
+
+fn fly(
+    scenario: Scenario,
+    seed: u64,
+    configure: impl FnOnce(&mut Config),
+    settings: LoopSettings,
+) -> Vec<Moment> {
+    let steps = (scenario.duration_s / 0.005) as usize;
+    let mut flight = ClosedLoop::new(scenario, seed, configure, settings);
+    (0..steps).map(|_| flight.step().expect("flown")).collect()
+}
+
+fn scored(name: &str, moments: &[Moment], from_s: f64) -> Score {
+    let score = Score::of(moments, from_s);
+    println!("{name}: {score:?}");
+    score
+}
+
+#[test]
+fn a_vehicle_on_a_circle_is_followed_on_the_estimate_as_on_the_truth() {
+    let (duration_s, from_s) = (16.0, 7.0);
+    let truth = LoopSettings { truth: true, ..late() };
+    let truth = scored("truth", &fly(circle(duration_s, 0.5), 1, |_| {}, truth), from_s);
+    let told = scored("told", &fly(circle(duration_s, 0.5), 1, listening, late()), from_s);
+    assert!(told.told > 80, "{told:?}");
+    assert!(told.follow_rms_m < 1.5 * truth.follow_rms_m.max(0.2), "{told:?} {truth:?}");
+    assert!(told.velocity_rms_mps < 0.15, "{told:?}");
+}
+
+#[test]
+fn a_covered_tag_ends_what_is_told_and_the_helicopter_stops() {
+    let mut scenario = circle(13.0, 0.5);
+    scenario.camera.hidden = (0..2)
+        .map(|marker| HiddenMarker { target: 0, marker, from_s: 6.0, to_s: 11.0, share: 1.0 })
+        .collect();
+    let moments = fly(scenario, 2, |_| {}, LoopSettings { threads: 2, ..LoopSettings::default() });
+    let told = |from: f64, to: f64| {
+        moments.iter().filter(|m| (from..to).contains(&m.t_s) && m.told.is_some()).count()
+    };
+    assert!(told(5.0, 6.0) >= 9, "{}", told(5.0, 6.0));
+    assert_eq!(told(7.2, 11.0), 0, "silent from coast_s after the last sight on");
+    assert!(told(12.0, 13.0) >= 8, "{} within a second of the tag", told(12.0, 13.0));
+    let covered: Vec<Moment> = moments.into_iter().filter(|m| m.t_s < 11.0).collect();
+    let score = scored("covered", &covered, 6.0);
+    assert!(score.speed_max_mps < 1.2 * 1.5, "{score:?}");
+}
+
+#[test]
+fn a_dead_camera_ends_what_is_told() {
+    let settings = LoopSettings { camera_dies_s: Some(5.0), threads: 2, ..LoopSettings::default() };
+    let moments = fly(circle(9.0, 0.5), 3, |_| {}, settings);
+    let told = |from: f64, to: f64| {
+        moments.iter().filter(|m| (from..to).contains(&m.t_s) && m.told.is_some()).count()
+    };
+    assert!(told(4.0, 5.0) >= 9, "{}", told(4.0, 5.0));
+    assert_eq!(told(6.1, 9.0), 0);
+}
+
+/// Tags covered for 8 s and for 40 s.
+#[test]
+#[ignore = "a minute"]
+fn proof_a_covered_tag_never_makes_the_helicopter_run() {
+    for covered_s in [8.0, 40.0] {
+        let mut scenario = circle(18.0 + covered_s, 0.65);
+        let until_s = 10.0 + covered_s;
+        scenario.camera.hidden = (0..2)
+            .map(|marker| HiddenMarker { target: 0, marker, from_s: 10.0, to_s: until_s, share: 1.0 })
+            .collect();
+        let moments = fly(scenario, 5, |_| {}, late());
+        let covered: Vec<Moment> = moments.iter().copied().filter(|m| m.t_s < until_s).collect();
+        let score = scored(&format!("covered {covered_s} s"), &covered, 10.0);
+        assert!(score.speed_max_mps < 1.2 * 1.5, "{score:?}");
+        // Its path is a circle of 12.5 m about the origin.
+        let off = |m: &Moment| (m.own.position_ned_m.xy().norm() - 12.5).abs();
+        let farthest = covered.iter().filter(|m| m.t_s >= 10.0).map(off).fold(0.0, f64::max);
+        assert!(farthest < 3.0, "{farthest} m from the vehicle's path");
+        let told = moments.iter().filter(|m| m.t_s > until_s && m.told.is_some()).map(|m| m.t_s - until_s);
+        let after = told.fold(f64::INFINITY, f64::min);
+        println!("told again after {after} s, {farthest} m from the path");
+        assert!(covered_s > 10.0 || after < 1.0, "told again after {after} s");
+    }
+}
+
+/// The flights of the bars: `cargo test --release --test flights closed_loop -- --ignored --nocapture`.
+#[test]
+#[ignore = "minutes"]
+fn proof_the_bars_of_following() {
+    let plans = [
+        (
+            "circle",
+            Route::Circle { north_m: 0.0, east_m: 0.0, radius_m: 12.5 },
+            SpeedPlan::Cruise { mean_mps: 1.5, wander_mps: 0.0 },
+        ),
+        ("eight", Route::Eight { a_m: 15.0, b_m: 8.0 }, SpeedPlan::Cruise { mean_mps: 1.5, wander_mps: 0.0 }),
+        (
+            "stop and go",
+            Route::Eight { a_m: 15.0, b_m: 8.0 },
+            SpeedPlan::StopAndGo { speed_mps: 1.5, go_s: 10.0, stop_s: 10.0, reverse_mps: 0.0 },
+        ),
+        (
+            "4 m/s",
+            Route::Eight { a_m: 30.0, b_m: 12.0 },
+            SpeedPlan::Cruise { mean_mps: 4.0, wander_mps: 0.0 },
+        ),
+    ];
+    for (name, route, speed) in plans {
+        let scenario = || {
+            let mut scenario = circle(50.0, 0.65);
+            (scenario.vehicles[0].route, scenario.vehicles[0].speed) = (route, speed);
+            scenario
+        };
+        let truth = LoopSettings { truth: true, ..late() };
+        let truth = scored(&format!("{name}, truth"), &fly(scenario(), 3, |_| {}, truth), 10.0);
+        for (how, heard) in [("alone", false), ("autopilot heard", true)] {
+            let configure = |config: &mut Config| {
+                if heard {
+                    listening(config)
+                }
+            };
+            let told = scored(&format!("{name}, {how}"), &fly(scenario(), 3, configure, late()), 10.0);
+            assert!(
+                told.follow_rms_m <= 1.5 * truth.follow_rms_m.max(0.2),
+                "{name}, {how}: {told:?} {truth:?}"
+            );
+            assert!(told.tilt_rms_deg <= 1.5 * truth.tilt_rms_deg, "{name}, {how}: {told:?} {truth:?}");
+            assert!(told.velocity_rms_mps <= 0.15, "{name}, {how}: {told:?}");
+        }
+    }
+}
+
+/// The autopilot's receiver 2 m from ours, and the ground configured 5 m too low.
+#[test]
+#[ignore = "minutes"]
+fn proof_two_receivers_and_a_wrong_elevation_cost_nothing_where_the_autopilot_is_heard() {
+    let settings = || LoopSettings { receiver_m: Vector3::new(1.4, -1.4, 0.0), ..late() };
+    let wrong = |config: &mut Config| {
+        listening(config);
+        config.ground.elevation_msl_m = config.ground.elevation_msl_m.map(|m| m - 5.0);
+    };
+    let score = scored("wrong", &fly(circle(40.0, 0.65), 4, wrong, settings()), 15.0);
+    assert!(score.follow_rms_m < 0.4, "{score:?}");
+    assert!((score.height_m - 12.0).abs() < 0.2, "{score:?}");
+}
