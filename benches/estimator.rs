@@ -364,7 +364,7 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
             Sample::Frame { truth, seq } => {
                 frames += 1;
                 let frame = Stamped {
-                    t_valid: exposures.exposed(truth.t_stamp) + offset,
+                    t_valid: exposures.exposed(truth.t_stamp, truth.t_recv) + offset,
                     t_recv: truth.t_recv,
                     seq: *seq,
                     value: suite.observations().clone(),

@@ -60,7 +60,13 @@ pub async fn autopilot(config: Arc<Config>, outgoing: ToAutopilot, context: Task
         (None, None) => return,
     };
     let (system_id, configure) = (autopilot.system_id, autopilot.configure);
-    let settings = AutopilotSettings { reached, system_id, configure, key };
+    let settings = AutopilotSettings {
+        reached,
+        system_id,
+        configure,
+        key,
+        signing_link_id: config.mavlink.signing_link_id,
+    };
     let (clock, stop) = (context.clock, context.stop.clone());
     let device = DeviceReports { part: Part::Autopilot, source: Source::Autopilot, context, heart };
     let reports = |report| device.take(report);

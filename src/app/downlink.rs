@@ -176,7 +176,8 @@ async fn send_mavlink(downlink: Downlink, status: SharedStatus, clock: HostClock
         let told = downlink.lines().mavlink.as_mut().map(|mavlink| {
             mavlink.found(found);
             mavlink.send(clock.now());
-            let words: Vec<String> = mavlink.stations().iter().map(Station::words).collect();
+            let mut words: Vec<String> = mavlink.stations().iter().map(Station::words).collect();
+            words.extend(mavlink.counts().words());
             (mavlink.news(), words.join("; "))
         });
         if let Some((news, words)) = told {

@@ -46,6 +46,8 @@ pub struct AutopilotSettings {
     pub configure: bool,
     /// Frames that are not signed with it are refused.
     pub key: Option<SigningKey>,
+    /// Link id of our signatures.
+    pub signing_link_id: u8,
 }
 
 /// Frames on their way to the autopilot. Copies are the same; nothing here waits.
@@ -84,7 +86,8 @@ pub async fn run(
         let fault = match Port::open(&settings.reached).await {
             Ok(port) => {
                 reports(Report::Up(port.words()));
-                let companion = Companion::new(settings.system_id, settings.configure);
+                let signed_with = settings.key.clone().map(|key| (key, settings.signing_link_id));
+                let companion = Companion::new(settings.system_id, settings.configure).signing(signed_with);
                 let frames = MavlinkFrames::default();
                 let mut link = AutopilotLink { port, companion, frames, settings, clock, reports };
                 let fault = match link.serve(outgoing, &mut backoff).await {

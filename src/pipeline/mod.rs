@@ -419,7 +419,7 @@ impl Pipeline {
         let t = event.t_recv;
         self.pace.frame(t, payload.index);
         let offset = Span::from_ms(self.settings.rig.camera.exposure_offset_ms);
-        let t_valid = self.exposures.exposed(payload.t_exposure) + offset;
+        let t_valid = self.exposures.exposed(payload.t_exposure, t) + offset;
         if self.last_exposure.is_some_and(|last| payload.t_exposure <= last) {
             let words = format!("frame {} is stamped no later than the one before", payload.index);
             out.push(notice(t, NoticeKind::ClockJump, Some(Source::Camera), words));

@@ -99,6 +99,7 @@ fn tracked(c: &mut Criterion) {
         search: false,
         size_range_px: Some((30.0, 110.0)),
         occupied: vec![(Vector2::new(640.0, 440.0), 220.0)],
+        ..FramePrediction::default()
     };
     for features in [0, 8] {
         let settings = DetectorConfig { ground_features: features, ..DetectorConfig::default() };

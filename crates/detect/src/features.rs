@@ -24,6 +24,9 @@ const MOST_SIGMA_A_LEVEL: f32 = 0.02;
 /// Parts of the frame, across and down; each is to have a feature before any has two.
 const PARTS: (usize, usize) = (4, 3);
 
+/// Most features followed, those that move among them, as a multiple of those wanted.
+const MOST_MOVING: usize = 2;
+
 const UPRIGHT: [f32; 4] = [1.0, 0.0, 0.0, 1.0];
 
 /// What interpolation leaves, pixels.
@@ -40,6 +43,8 @@ struct Track {
     /// Contrast over that at birth, in the last frame.
     gain: f32,
     sigma: f32,
+    /// Whether it is of something that moves. It is followed on to keep others off.
+    moves: bool,
 }
 
 /// Keeps a number of features alive; keeps its buffers.
@@ -66,6 +71,15 @@ pub(super) struct FeatureTracker {
 /// A place that features keep off: centre and radius, pixels.
 pub(super) type Circle = (Vector2<f64>, f64);
 
+/// What features keep off: circles, and what moves.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Obstacles<'a> {
+    pub occupied: &'a [Circle],
+    /// Features that were found to be of something that moves, and how far others keep off them, pixels.
+    pub moving: &'a [u64],
+    pub moving_radius_px: f64,
+}
+
 impl FeatureTracker {
     /// Keeps `wanted` features alive.
     pub fn new(wanted: usize) -> Self {
@@ -85,22 +99,26 @@ impl FeatureTracker {
         }
     }
 
-    /// Follows the features into a frame and finds new ones off the `occupied` circles. A frame of another
-    /// size than the last starts anew.
-    pub fn process(&mut self, image: ImageView<'_>, occupied: &[Circle], out: &mut Vec<FeatureTrack>) {
+    /// Follows the features into a frame and finds new ones off the obstacles, in the place of those that move.
+    /// A frame of another size than the last starts anew.
+    pub fn process(&mut self, image: ImageView<'_>, off: Obstacles<'_>, out: &mut Vec<FeatureTrack>) {
         if self.wanted == 0 {
             return;
         }
         std::mem::swap(&mut self.pyramid, &mut self.before);
         self.pyramid.build(image, Base::Half, Rim::LeftOut, 32, self.simd);
         if self.size == (image.width, image.height) {
-            self.follow(image, occupied);
+            self.follow(image, off.occupied);
         } else {
             self.tracks.clear();
         }
         self.size = (image.width, image.height);
-        if self.tracks.len() < self.wanted {
-            self.find(image, occupied);
+        let most = MOST_MOVING * self.wanted;
+        for track in &mut self.tracks {
+            track.moves |= off.moving.contains(&track.id);
+        }
+        if self.still() < self.wanted && self.tracks.len() < most {
+            self.find(image, off);
         }
         out.extend(self.tracks.iter().map(|t| FeatureTrack {
             id: t.id,
@@ -132,8 +150,13 @@ impl FeatureTracker {
         });
     }
 
+    /// How many features are not known to move.
+    fn still(&self) -> usize {
+        self.tracks.iter().filter(|track| !track.moves).count()
+    }
+
     /// The best corner of each part of the frame that has no feature yet.
-    fn find(&mut self, image: ImageView<'_>, occupied: &[Circle]) {
+    fn find(&mut self, image: ImageView<'_>, off: Obstacles<'_>) {
         let level = self.pyramid.level(image, 2.min(self.pyramid.len() - 1));
         let (w, h) = (level.image.width / PARTS.0, level.image.height / PARTS.1);
         self.corners.clear();
@@ -143,19 +166,19 @@ impl FeatureTracker {
                 (first..first + length).contains(&(level.of_frame(c).max(0.0) as usize))
             };
             let here = |t: &Track| within(t.warp.at[0], u, w) && within(t.warp.at[1], v, h);
-            if !self.tracks.iter().any(here) {
-                let wanted = |at| Template::fits(image, at) && free(at, occupied);
+            if !self.tracks.iter().any(|t| !t.moves && here(t)) {
+                let wanted = |at| Template::fits(image, at) && clear(at, &self.tracks, off);
                 self.corners.extend(self.search.best(level, (u, v, w, h), self.simd, wanted));
             }
         }
         self.corners.sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
         for &(_, at) in &self.corners {
-            if self.tracks.len() >= self.wanted {
+            if self.still() >= self.wanted || self.tracks.len() >= MOST_MOVING * self.wanted {
                 break;
             }
             let Some((template, warp)) = Template::new(image, at, self.simd) else { continue };
             let sigma = template.sigma_a_level();
-            if sigma < MOST_SIGMA_A_LEVEL && free(warp.at, occupied) {
+            if sigma < MOST_SIGMA_A_LEVEL && clear(warp.at, &self.tracks, off) {
                 self.tracks.push(Track {
                     id: self.next_id,
                     warp,
@@ -163,6 +186,7 @@ impl FeatureTracker {
                     template,
                     gain: 1.0,
                     sigma,
+                    moves: false,
                 });
                 self.next_id += 1;
             }
@@ -178,6 +202,13 @@ fn middle(turns: &[[f32; 4]]) -> [f32; 4] {
         let rank = |x: f32| below(x).abs_diff(turns.len() / 2);
         turns.iter().map(|t| t[k]).min_by_key(|x| rank(*x)).unwrap_or(UPRIGHT[k])
     })
+}
+
+/// Whether a place is off all obstacles.
+fn clear(at: [f32; 2], tracks: &[Track], off: Obstacles<'_>) -> bool {
+    let apart = |track: &Track| f64::from((at[0] - track.warp.at[0]).hypot(at[1] - track.warp.at[1]));
+    let beside = |track: &Track| track.moves && apart(track) < off.moving_radius_px;
+    free(at, off.occupied) && !tracks.iter().any(beside)
 }
 
 fn free(at: [f32; 2], occupied: &[Circle]) -> bool {
@@ -232,7 +263,7 @@ mod tests {
         for n in 0..24 {
             let light = 1.0 - 0.01 * f64::from(n);
             let mut out = Vec::new();
-            tracker.process(frame(&view(n), light).view(), &[], &mut out);
+            tracker.process(frame(&view(n), light).view(), Obstacles::default(), &mut out);
             assert_eq!(out.len(), 8, "frame {n}");
             for track in &out {
                 let ground = view(n).inverse() * nalgebra::Point2::from(track.px);
@@ -255,9 +286,9 @@ mod tests {
     fn a_cut_ends_every_feature() {
         let mut tracker = FeatureTracker::new(8);
         let (mut before, mut after) = (Vec::new(), Vec::new());
-        tracker.process(frame(&view(0), 1.0).view(), &[], &mut before);
+        tracker.process(frame(&view(0), 1.0).view(), Obstacles::default(), &mut before);
         let elsewhere = nalgebra::Translation2::new(5000.0, 3000.0) * view(0);
-        tracker.process(frame(&elsewhere, 1.0).view(), &[], &mut after);
+        tracker.process(frame(&elsewhere, 1.0).view(), Obstacles::default(), &mut after);
         assert_eq!((before.len(), after.len()), (8, 8));
         assert!(after.iter().all(|a| before.iter().all(|b| b.id != a.id)), "all are new");
     }
@@ -268,8 +299,32 @@ mod tests {
         let circle = (Vector2::new(200.0, 160.0), 100.0);
         for n in 0..4 {
             let mut out = Vec::new();
-            tracker.process(frame(&view(n), 1.0).view(), &[circle], &mut out);
+            let off = Obstacles { occupied: &[circle], ..Obstacles::default() };
+            tracker.process(frame(&view(n), 1.0).view(), off, &mut out);
             assert!(!out.is_empty() && out.iter().all(|t| (t.px - circle.0).norm() > circle.1), "frame {n}");
+        }
+    }
+
+    #[test]
+    fn others_are_found_in_the_place_of_what_moves_and_keep_off_it() {
+        let mut tracker = FeatureTracker::new(8);
+        let mut out = Vec::new();
+        tracker.process(frame(&view(0), 1.0).view(), Obstacles::default(), &mut out);
+        // Two in the middle, which stay in view.
+        out.sort_by_key(|track| (track.px - Vector2::new(200.0, 160.0)).norm() as u32);
+        let moving = [out[0].id, out[1].id];
+        for n in 1..6 {
+            let off = Obstacles { moving: &moving, moving_radius_px: 60.0, ..Obstacles::default() };
+            out.clear();
+            tracker.process(frame(&view(n), 1.0).view(), off, &mut out);
+            let (movers, still): (Vec<&FeatureTrack>, Vec<&FeatureTrack>) =
+                out.iter().partition(|track| moving.contains(&track.id));
+            assert_eq!(movers.len(), 2, "they are followed on");
+            assert!(still.len() >= 7, "{} others in frame {n}", still.len());
+            // The first eight had the numbers below eight.
+            for new in still.iter().filter(|track| n == 1 && track.id >= 8) {
+                assert!(movers.iter().all(|mover| (new.px - mover.px).norm() >= 60.0), "{new:?}");
+            }
         }
     }
 }

@@ -6,16 +6,23 @@
 use super::detector::{Detector, Limits};
 use super::disc_pairs::DiscPairs;
 use super::family::TagLayout;
-use super::features::{Circle, FeatureTracker};
+use super::features::{Circle, FeatureTracker, Obstacles};
 use super::roi::Roi;
 use windhover_base::geo::CameraModel;
 use windhover_base::msg::{
     FrameObservations, FramePrediction, ImageView, MarkerDetection, MarkerId, MarkerPrediction, RgbImage,
 };
-use windhover_base::settings::{DetectorConfig, MarkerKind, TargetConfig};
+use windhover_base::settings::{DetectorConfig, MarkerConfig, MarkerKind, TargetConfig};
 
 /// Frames over which the strips cover the whole image once.
 const STRIPS: usize = 8;
+
+/// How far a vehicle reaches about a tag that is of none of ours, in sizes of that tag: two and a half metres of one of half
+/// a metre.
+const STRANGERS_REACH: f64 = 5.0;
+
+/// What a vehicle may cover beyond its markers and axles, m.
+const MARGIN_M: f64 = 0.5;
 
 /// Sigmas of a predicted centre that its region of interest covers.
 const ROI_SIGMAS: f64 = 4.0;
@@ -29,6 +36,8 @@ pub struct FrameDetector {
     scratch: Vec<MarkerDetection>,
     discs: Option<DiscPairs>,
     features: FeatureTracker,
+    /// What the vehicle of each marker covers about it, in sizes of that marker.
+    reach: Vec<(MarkerId, f64)>,
     occupied: Vec<Circle>,
 }
 
@@ -52,6 +61,7 @@ impl FrameDetector {
             scratch: Vec::new(),
             discs: DiscPairs::new(targets, lens),
             features: FeatureTracker::new(detector.ground_features),
+            reach: targets.iter().enumerate().flat_map(|(i, target)| reach(i, target)).collect(),
             occupied: Vec::new(),
         }
     }
@@ -75,8 +85,22 @@ impl FrameDetector {
         }
         self.occupied.clear();
         self.occupied.extend(prediction.iter().flat_map(|p| &p.occupied));
-        self.occupied.extend(out.markers.iter().map(|m| (m.center_px, m.size_px)));
-        self.features.process(image, &self.occupied, &mut out.features);
+        // A vehicle where it is foretold is covered by its own circle.
+        let foretold = prediction.map_or(&[][..], |p| &p.occupied);
+        let ours =
+            |m: &MarkerDetection| foretold.iter().any(|(at, radius)| (m.center_px - at).norm() < *radius);
+        let reach = &self.reach;
+        let covered = |m: &MarkerDetection| {
+            let sizes = if ours(m) { 1.0 } else { reach_of(reach, m.marker) };
+            (m.center_px, sizes * m.size_px)
+        };
+        self.occupied.extend(out.markers.iter().map(covered));
+        let off = Obstacles {
+            occupied: &self.occupied,
+            moving: prediction.map_or(&[], |p| &p.moving),
+            moving_radius_px: prediction.map_or(0.0, |p| p.moving_radius_px),
+        };
+        self.features.process(image, off, &mut out.features);
     }
 
     fn find_tags(
@@ -112,6 +136,26 @@ impl FrameDetector {
             }
         }
     }
+}
+
+/// How far a vehicle reaches about each of its markers, in sizes of that marker.
+fn reach(index: usize, target: &TargetConfig) -> impl Iterator<Item = (MarkerId, f64)> {
+    let size = |m: &MarkerConfig| m.size_m.or(m.diameter_m).unwrap_or(0.0);
+    let at = |m: &MarkerConfig| m.position_m[0].hypot(m.position_m[1]);
+    let markers = target.marker.iter();
+    let reach_m =
+        markers.map(|m| at(m) + size(m)).fold(target.wheelbase_m.unwrap_or(0.0), f64::max) + MARGIN_M;
+    target.marker.iter().enumerate().filter(move |(_, m)| size(m) > 0.0).map(move |(k, m)| {
+        let id = match m.family.zip(m.id) {
+            Some((family, id)) => MarkerId::Tag { family, id },
+            None => MarkerId::Disc { target: index, marker: k },
+        };
+        (id, reach_m / size(m))
+    })
+}
+
+fn reach_of(known: &[(MarkerId, f64)], marker: MarkerId) -> f64 {
+    known.iter().find(|(id, _)| *id == marker).map_or(STRANGERS_REACH, |(_, reach)| *reach)
 }
 
 fn near(a: &MarkerDetection, b: &MarkerDetection) -> bool {

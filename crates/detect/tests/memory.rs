@@ -134,6 +134,7 @@ fn foretold(n: usize) -> FramePrediction {
         search: false,
         size_range_px: Some((20.0, 100.0)),
         occupied: vec![(Vector2::new(345.0, 245.0), 70.0)],
+        ..FramePrediction::default()
     }
 }
 

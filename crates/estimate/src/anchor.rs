@@ -98,6 +98,9 @@ impl State {
             if let Some(first) = target.life.first_mut() {
                 shift(&mut first.place);
             }
+            if let Some(twin) = &mut target.twin {
+                shift(&mut twin.place);
+            }
         }
         for feature in self.features.iter_mut().filter(|f| f.id.is_some()) {
             shift(&mut feature.mean);

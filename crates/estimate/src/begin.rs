@@ -41,6 +41,8 @@ impl Core {
         *target = Target {
             mean,
             life,
+            twin: target.twin,
+            spin: target.spin,
             last_seen: t,
             tied_since: t,
             standstill: Standstill::MOVES,
@@ -103,7 +105,8 @@ impl Core {
                 && target == index
             {
                 if gated {
-                    self.fuse_marker(index, marker, detection);
+                    let inside = self.fuse_marker(index, marker, detection, true);
+                    self.judge_tag(index, marker, inside);
                 } else {
                     self.fuse_first_marker(index, marker, detection);
                 }
@@ -157,7 +160,7 @@ pub(crate) fn ground_point(
 }
 
 /// First guess of a target from one frame: (state, whether the heading is known).
-fn guess(
+pub(crate) fn guess(
     own: &Own,
     models: &Models,
     index: usize,

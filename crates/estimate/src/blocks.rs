@@ -1,7 +1,8 @@
 //! Which part of the joint state lies in which columns of the error state.
 //!
 //! Order: the helicopter and its sensors' slow errors ([`own`], as many as there are sensors), each target
-//! ([`TargetBlock`]), each ground feature (two columns). A new state of the helicopter is a constant of [`own`].
+//! ([`TargetBlock`]), each ground feature (two columns), each fitted tag ([`TagFitBlock`]). A new state of the helicopter is a
+//! constant of [`own`].
 
 use std::ops::Range;
 
@@ -120,6 +121,20 @@ pub(crate) const TARGET: usize = 5;
 /// Length of a feature's part: north, east.
 pub(crate) const FEATURE: usize = 2;
 
+/// Length of a tag's part: logarithm of its size, place forward and right, turn, each beside its configuration.
+pub(crate) const TAG_FIT: usize = 4;
+
+/// One tag's part.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) struct TagFitBlock(Block<TAG_FIT>);
+
+impl TagFitBlock {
+    /// All of it.
+    pub(crate) const fn all(self) -> Block<TAG_FIT> {
+        self.0
+    }
+}
+
 /// One target's part: north, east, heading, speed, yaw rate of the rear axle.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(crate) struct TargetBlock(Block<TARGET>);
@@ -173,12 +188,14 @@ pub(crate) struct Layout {
     pub(crate) own: usize,
     pub(crate) targets: usize,
     pub(crate) features: usize,
+    /// Tags whose size, place and turn are states.
+    pub(crate) tags: usize,
 }
 
 impl Layout {
     /// Length of the error state.
     pub(crate) const fn len(self) -> usize {
-        self.feature(self.features).0
+        self.tag(self.tags).0.0
     }
 
     /// The states of the helicopter's part that move by themselves.
@@ -196,6 +213,11 @@ impl Layout {
         Block(self.own + TARGET * self.targets + FEATURE * i)
     }
 
+    /// The fit of tag `i`.
+    pub(crate) const fn tag(self, i: usize) -> TagFitBlock {
+        TagFitBlock(Block(self.feature(self.features).0 + TAG_FIT * i))
+    }
+
     /// Every pair of columns that is a place on the ground: of targets, then of features.
     pub(crate) fn places(self) -> impl Iterator<Item = Block<2>> {
         let targets = (0..self.targets).map(move |i| self.target(i).place());
@@ -209,7 +231,7 @@ mod tests {
 
     #[test]
     fn the_parts_of_a_state_lie_one_behind_the_other() {
-        let layout = Layout { own: own::LEN, targets: 2, features: 3 };
+        let layout = Layout { own: own::LEN, targets: 2, features: 3, tags: 2 };
         assert_eq!(own::MOTION.range(), own::RATE.column(0)..own::TILT_ERROR.end());
         assert_eq!(layout.slow(), own::GUST.column(0)..own::LEN);
         assert_eq!(own::SLOW.end(), own::WITH_SECOND);
@@ -217,9 +239,10 @@ mod tests {
         assert_eq!(layout.target(0).all().column(0), own::LEN);
         assert_eq!(layout.target(1).all().column(0), layout.target(0).yaw_rate().end());
         assert_eq!(layout.feature(0).column(0), layout.target(1).all().end());
-        assert_eq!(layout.feature(2).end(), layout.len());
+        assert_eq!(layout.feature(2).end(), layout.tag(0).all().column(0));
+        assert_eq!(layout.tag(1).all().end(), layout.len());
         let places: Vec<_> = layout.places().map(Block::range).collect();
         assert_eq!(places.len(), 5);
-        assert_eq!(places[4].end, layout.len());
+        assert_eq!(places[4].end, layout.tag(0).all().column(0));
     }
 }

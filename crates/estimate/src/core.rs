@@ -1,6 +1,6 @@
 //! The filter proper: one state, one measurement after another in order of validity.
 
-use windhover_base::msg::{Disposition, FixKind, FusionResult, FusionSource};
+use windhover_base::msg::{Disposition, FixKind, FusionResult, FusionSource, MarkerDetection};
 use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::{MonoTime, Span};
 
@@ -8,6 +8,7 @@ use super::Site;
 use super::blocks::{Layout, own};
 use super::fit::WATCHED;
 use super::fitted::{LEARN_RATIO, Learning, Learnt};
+use super::ground::GroundWork;
 use super::kind::TiltWatch;
 use super::measurement::Measurement;
 use super::models::Models;
@@ -33,6 +34,11 @@ pub(crate) struct Core {
     pub(crate) state: State,
     pub(crate) work: Workspace,
     pub(crate) z: Measurement,
+    pub(crate) ground: GroundWork,
+    /// Room for a direction of the error state.
+    pub(crate) along: Vec<f64>,
+    /// Room for the markers of a frame that are fused.
+    pub(crate) chosen: Vec<MarkerDetection>,
     /// What became of measurements; filled only while `reporting`.
     pub(crate) results: Vec<FusionResult>,
     pub(crate) reporting: bool,
@@ -74,12 +80,16 @@ impl Core {
             (Some(_), None) => own::WITH_IMU,
             (None, None) => own::LEN,
         };
-        let layout = Layout { own, targets: rig.target.len(), features: e.features };
+        let layout =
+            Layout { own, targets: rig.target.len(), features: e.features, tags: models.fitted_tags() };
         let copies = (lag_frames * 3 / 2 + 6).min(MAX_COPIES);
         let state = State::new(layout, copies, start.clone(), senses, tilt);
         Self {
             work: Workspace::new(layout.len()),
             z: Measurement::default(),
+            along: vec![0.0; layout.len()],
+            chosen: Vec::with_capacity(64),
+            ground: GroundWork::new(layout.features, layout.len()),
             models,
             learning: Learning {
                 on: e.learn,

@@ -193,15 +193,21 @@ impl Estimator {
             self.refused(FusionSource::Marker, t, Disposition::NoOwnship, out);
             None
         };
-        // The state after this frame; where it was not taken, the newest one.
-        let state = match taken {
-            Some(index) => self.history.before(index + 1),
-            None => &self.core.state,
+        // The state after this frame; where it was not taken, what all else shows of that time, and nothing beyond the
+        // newest measurement.
+        let (state, t) = match taken {
+            Some(index) => (self.history.before(index + 1), t),
+            None => {
+                let t = t.min(self.core.state.t);
+                self.ahead.copy_present(self.history.at(t));
+                self.ahead.propagate(t, &self.core.models);
+                (&self.ahead, self.ahead.t)
+            }
         };
         for target in 0..state.targets.len() {
             out.push(EstimatorOutput::Estimate(state.estimate(&self.core.models, target, number, t)));
         }
-        if taken.is_some() {
+        if state.alive {
             out.push(EstimatorOutput::Ownship(state.ownship(&self.core.models, Some(number), t)));
         }
         self.emit_smoothed(out);
@@ -264,7 +270,7 @@ impl Estimator {
         format!(
             "heading bias {:.2}±{:.2} deg, tilt felt {:?} (slope {:.2}) gain {:.2}±{:.2} error {:.2},{:.2}±{:.2} deg \
              bias {:.2},{:.2}±{:.2} deg, trim {:.1},{:.1}±{:.1} deg, wind {:.2},{:.2}±{:.2} m/s2, drag {:.2}±{:.2}, delay {:.0}±{:.0} ms, \
-             sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} gust {:.2} thrust {:.2} targets {} pixels {:.2?} {:.2}",
+             sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} gust {:.2} thrust {:.2} targets {} pixels {:.2?} {:.2} tags {}",
             own.heading_bias.to_degrees(),
             cov.sigma(own::HEADING_BIAS, 0).to_degrees(),
             self.core.state.tilt[0].felt,
@@ -295,7 +301,8 @@ impl Estimator {
             l.thrust_var.sqrt(),
             targets.join(" "),
             l.marker_factor,
-            l.feature_factor
+            l.feature_factor,
+            self.core.state.tags_in_words()
         )
     }
 
@@ -384,7 +391,7 @@ impl Estimator {
             return;
         }
         self.looked = Some(t);
-        let misfits = self.core.misfits();
+        let misfits = self.core.misfits().chain(self.core.vehicle_misfits());
         out.extend(
             misfits
                 .map(|(source, cause, figure)| EstimatorOutput::Misfit(Misfit { t, source, figure, cause })),

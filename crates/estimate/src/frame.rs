@@ -1,29 +1,30 @@
 //! A frame: which of its markers and ground features are fused, and what becomes of tracks and features by it.
 
-use windhover_base::msg::{Disposition, FeatureTrack, FrameObservations, FusionSource, MarkerDetection};
+use windhover_base::msg::{Disposition, FrameObservations, FusionSource, MarkerDetection};
 
 use super::aid::disc::Disc;
-use super::aid::feature::FeaturePixel;
 use super::aid::tag::Tag;
-use super::begin::ground_point;
 use super::core::Core;
-use super::models::{Marker, Models};
-use super::state::{GUESSED_VAR, State};
+use super::models::Marker;
 use super::track::{OnSight, Verdict};
 
 impl Core {
     /// Fuses a frame's ground features, then its markers.
     pub(crate) fn fuse_frame(&mut self, frame: &FrameObservations) {
         self.fuse_features(&frame.features);
+        let mut chosen = std::mem::take(&mut self.chosen);
+        self.choose_markers(&frame.markers, &mut chosen);
         for target in 0..self.state.targets.len() {
-            self.fuse_target(target, &frame.markers);
+            self.fuse_target(target, &chosen);
         }
+        self.chosen = chosen;
         for detection in &frame.markers {
             if self.models.find(detection.marker).is_none() {
                 self.refuse(FusionSource::Marker, Disposition::Unknown);
             }
         }
         self.state.learn_targets(&self.learning);
+        self.judge_turns();
         self.state.copy_targets(frame.frame, self.keep_copies);
     }
 
@@ -36,21 +37,32 @@ impl Core {
             return;
         }
         match life.on_sight(&now) {
+            OnSight::Start | OnSight::StartAgain(_) if !self.height_agrees(index, markers) => {
+                self.refuse(FusionSource::Marker, Disposition::GateRejected);
+            }
             OnSight::Start => self.start_target(index, markers, None),
             OnSight::StartAgain(first) => self.start_target(index, markers, Some(first)),
             OnSight::PlaceAnew if self.place_anew(index, markers) => {}
-            OnSight::PlaceAnew | OnSight::Fuse => self.fuse_seen(index, markers),
+            OnSight::Return if self.is_elsewhere(index, markers) && self.place_anew(index, markers) => {}
+            OnSight::PlaceAnew | OnSight::Return | OnSight::Fuse => self.fuse_seen(index, markers),
         }
     }
 
     /// Fuses the markers of a target that is held.
     fn fuse_seen(&mut self, index: usize, markers: &[MarkerDetection]) {
-        let mut accepted = false;
+        let (before, since_s) =
+            (self.state.across(index), (self.state.t - self.state.targets[index].last_seen).s());
+        let (mut accepted, mut beside) = (false, false);
         for detection in markers {
             if let Some((target, marker)) = self.models.find(detection.marker)
                 && target == index
             {
-                accepted |= self.fuse_marker(index, marker, detection);
+                let inside = self.fuse_marker(index, marker, detection, accepted);
+                accepted |= inside;
+                if beside {
+                    self.judge_tag(index, marker, inside);
+                }
+                beside = true;
             }
         }
         let t = self.state.t;
@@ -58,6 +70,7 @@ impl Core {
         if accepted {
             target.life = target.life.accepted();
             target.last_seen = t;
+            self.learn_slip(index, &before, since_s);
         } else {
             target.life = target.life.refused();
             match target.life.verdict(self.restart_after, self.models.targets[index].moves()) {
@@ -69,11 +82,45 @@ impl Core {
         self.state.settle(index);
     }
 
+    /// Whether all markers of a target lie outside the gate.
+    fn is_elsewhere(&mut self, index: usize, markers: &[MarkerDetection]) -> bool {
+        markers.iter().all(|seen| match self.models.find(seen.marker) {
+            Some((target, marker)) if target == index => self.marker_ratio(index, marker, seen) > 1.0,
+            _ => true,
+        })
+    }
+
+    /// The marker's normalised innovation squared over the gate; above one as well where it cannot be predicted.
+    fn marker_ratio(&mut self, target: usize, marker: usize, seen: &MarkerDetection) -> f64 {
+        let marker = self.models.targets[target].markers[marker].clone();
+        let expected = match as_tag(target, &marker, seen) {
+            Some(tag) => self.linearise(&tag),
+            None => self.linearise(&as_disc(target, &marker, seen)),
+        };
+        match expected {
+            Err(_) => return f64::INFINITY,
+            Ok(()) if self.at_truth => return 0.0,
+            Ok(()) => {}
+        }
+        self.work
+            .square(&self.state, &self.z)
+            .map_or(f64::INFINITY, |square| square / self.models.gates[self.z.m])
+    }
+
     /// Fuses one marker through the gate: a tag's four corners at once, or its or a disc's centre. Whether it was inside.
-    pub(crate) fn fuse_marker(&mut self, target: usize, marker: usize, seen: &MarkerDetection) -> bool {
+    /// `beside` says whether another marker of the target was, in the same frame.
+    pub(crate) fn fuse_marker(
+        &mut self,
+        target: usize,
+        marker: usize,
+        seen: &MarkerDetection,
+        beside: bool,
+    ) -> bool {
         let marker = self.models.targets[target].markers[marker].clone();
         match as_tag(target, &marker, seen) {
-            Some(tag) => tag.fuse(self),
+            Some(tag) => {
+                tag.fuse(self, beside && tag.fit.is_some_and(|slot| !self.state.tags[slot].is_open()))
+            }
             None => as_disc(target, &marker, seen).fuse(self),
         }
     }
@@ -86,84 +133,14 @@ impl Core {
             None => self.fuse_aid_as_it_is(&as_disc(target, &marker, seen)),
         }
     }
-
-    /// Ground features: those in use are fused or dropped, and free places taken.
-    fn fuse_features(&mut self, tracks: &[FeatureTrack]) {
-        for slot in 0..self.state.features.len() {
-            let Some(id) = self.state.features[slot].id else { continue };
-            match tracks.iter().find(|track| track.id == id) {
-                Some(track) => self.fuse_feature(slot, track),
-                None => self.drop_feature(slot),
-            }
-        }
-        for slot in 0..self.state.features.len() {
-            if self.state.features[slot].id.is_none()
-                && let Some(track) = next_feature(&self.state, &self.models, tracks)
-            {
-                self.start_feature(slot, &track);
-            }
-        }
-    }
-
-    fn start_feature(&mut self, slot: usize, track: &FeatureTrack) {
-        let own = &self.state.own;
-        let Some(found) = ground_point(own, &self.models, track.px, 0.0) else { return };
-        let feature = &mut self.state.features[slot];
-        feature.id = Some(track.id);
-        feature.mean = [found.x, found.y];
-        feature.rejected = 0;
-        self.state.renew(self.state.layout().feature(slot), &[GUESSED_VAR; 2]);
-        match self.linearise(&pixel_of(slot, track)) {
-            Ok(()) => _ = self.fuse(FusionSource::Feature, None),
-            Err(_) => self.drop_feature(slot),
-        }
-    }
-
-    pub(crate) fn drop_feature(&mut self, slot: usize) {
-        self.state.features[slot].id = None;
-        self.state.renew(self.state.layout().feature(slot), &[0.0; 2]);
-    }
-
-    /// Fuses a feature in use; what is outside the gate twice in a row, or cannot be seen, is dropped.
-    pub(crate) fn fuse_feature(&mut self, slot: usize, track: &FeatureTrack) {
-        let Some(outcome) = pixel_of(slot, track).fuse(self) else {
-            return self.drop_feature(slot);
-        };
-        let rejected = &mut self.state.features[slot].rejected;
-        *rejected = if outcome.ratio > 1.0 { *rejected + 1 } else { 0 };
-        if *rejected >= 2 {
-            self.drop_feature(slot);
-        }
-    }
 }
 
 fn as_tag<'a>(target: usize, marker: &'a Marker, seen: &'a MarkerDetection) -> Option<Tag<'a>> {
     let (points, corners_px) = marker.corners.as_ref().zip(seen.corners_px.as_ref())?;
-    Some(Tag { target, points, corners_px, cov_px2: &seen.corner_cov_px2 })
+    let (center, fit) = (&marker.center, marker.fit);
+    Some(Tag { target, center, points, fit, corners_px, cov_px2: &seen.corner_cov_px2 })
 }
 
 fn as_disc<'a>(target: usize, marker: &'a Marker, seen: &'a MarkerDetection) -> Disc<'a> {
     Disc { target, point: &marker.center, center_px: &seen.center_px, cov_px2: &seen.center_cov_px2 }
-}
-
-fn pixel_of(slot: usize, track: &FeatureTrack) -> FeaturePixel {
-    FeaturePixel { slot, px: track.px, sigma_px: track.sigma_px }
-}
-
-/// The track not yet used that lies farthest from those in use: spread is what separates turning from
-/// moving.
-fn next_feature(state: &State, models: &Models, tracks: &[FeatureTrack]) -> Option<FeatureTrack> {
-    let used = |id: u64| state.features.iter().any(|f| f.id == Some(id));
-    let lone = |track: &FeatureTrack| {
-        let others = tracks.iter().filter(|other| used(other.id));
-        others.map(|o| (o.px - track.px).norm()).fold(f64::INFINITY, f64::min)
-    };
-    let fit = |track: &&FeatureTrack| {
-        !used(track.id)
-            && track.sigma_px.is_finite()
-            && track.sigma_px > 0.0
-            && track.px.iter().all(|x| x.is_finite())
-            && models.camera.normalised(track.px).is_some()
-    };
-    tracks.iter().filter(fit).max_by(|a, b| lone(a).total_cmp(&lone(b)).then(b.id.cmp(&a.id))).copied()
 }

@@ -301,10 +301,10 @@ fn tag_corners_discs_and_features() {
             {
                 let seen = detection(&core, target, marker);
                 check_measurement(what, seed, &core, omitted, &|core| {
-                    core.fuse_marker(target, marker, &seen);
+                    core.fuse_marker(target, marker, &seen, false);
                 });
             }
-            let pixel = FeaturePixel { slot: 3, px: Vector2::new(640.0, 512.0), sigma_px: 1.0 };
+            let pixel = FeaturePixel { slot: 3, px: Vector2::new(640.0, 512.0), sigma_px: 1.0, slack_m: 0.0 };
             check_measurement("feature", seed, &core, omitted, &|core| {
                 pixel.fuse(core);
             });
@@ -330,15 +330,16 @@ fn rows_exposed_one_after_the_other() {
                 left_out(own::POSITION.range(), 5.0),
                 left_out(own::ATTITUDE.range(), 60.0),
                 left_out(seen, 20.0),
+                left_out(layout.tag(0).all().column(0)..layout.len(), 5.0),
             ]
         };
         let mut seen = detection(&core, target, 0);
         (seen.center_px, seen.corners_px) = (low, Some([low; 4]));
         let omitted = of_pose(layout.target(target).pose().range());
         check_measurement("tag", seed, &core, &omitted, &|core| {
-            core.fuse_marker(target, 0, &seen);
+            core.fuse_marker(target, 0, &seen, false);
         });
-        let pixel = FeaturePixel { slot, px: low, sigma_px: 1.0 };
+        let pixel = FeaturePixel { slot, px: low, sigma_px: 1.0, slack_m: 0.0 };
         check_measurement("feature", seed, &core, &of_pose(layout.feature(slot).range()), &|core| {
             pixel.fuse(core);
         });
@@ -371,10 +372,46 @@ fn nothing_seen_shows_absolute_heading() {
         for target in 0..state.targets.len() {
             let seen = detection(&core, target, 0);
             let (h, _) = measured(&mut core.clone(), &|core| {
-                core.fuse_marker(target, 0, &seen);
+                core.fuse_marker(target, 0, &seen, false);
             });
             let pixels = (h * &turn).amax();
             assert!(pixels < 1e-8, "seed {seed}, target {target}: {pixels} px per radian");
+        }
+    }
+}
+
+/// Along the two directions in which nobody can tell who is wrong (all that is seen larger, all tags turned on their
+/// vehicle) no pixel changes, of tags nor of ground features.
+#[test]
+fn nothing_seen_shows_scale_or_how_tags_are_turned() {
+    for seed in 0..STATES {
+        let mut core = random_core(seed, Ground::Flat { down_m: 0.0 });
+        core.state.tags.iter_mut().for_each(|tag| tag.mean = [0.0; 4]);
+        let mut along = vec![0.0; core.state.layout().len()];
+        for target in 0..core.state.targets.len() {
+            let seen = detection(&core, target, 0);
+            let pixels = |along: &[f64], fuse: &dyn Fn(&mut Core)| {
+                let (h, _) = measured(&mut core.clone(), fuse);
+                (h * nalgebra::DVector::from_column_slice(along)).amax()
+            };
+            let tag = |core: &mut Core| _ = core.fuse_marker(target, 0, &seen, false);
+            let ground = |core: &mut Core| {
+                FeaturePixel { slot: 3, px: Vector2::new(640.0, 512.0), sigma_px: 1.0, slack_m: 0.0 }
+                    .fuse(core);
+            };
+            assert!(core.scale_direction(target, &mut along).is_some());
+            assert!(
+                pixels(&along, &tag) < 1e-6,
+                "seed {seed}, scale of target {target}: {}",
+                pixels(&along, &tag)
+            );
+            assert!(pixels(&along, &ground) < 1e-6, "seed {seed}: {} of the ground", pixels(&along, &ground));
+            core.turn_direction(target, &mut along);
+            assert!(
+                pixels(&along, &tag) < 1e-6,
+                "seed {seed}, turn of target {target}: {}",
+                pixels(&along, &tag)
+            );
         }
     }
 }
@@ -406,7 +443,7 @@ fn delayed_copies_are_fused_like_states() {
         }));
         let z = {
             let mut twin = core.clone();
-            twin.fuse_marker(target, marker, &seen);
+            twin.fuse_marker(target, marker, &seen, false);
             twin.z.clone()
         };
         core.state.copies.truncate(1);
@@ -416,7 +453,7 @@ fn delayed_copies_are_fused_like_states() {
         let gain = &p * h.transpose() * s.try_inverse().expect("positive definite");
         let step = &gain * nalgebra::DVector::from_column_slice(&z.residual[..z.m]);
         let left = &p - &gain * &h * &p;
-        core.fuse_marker(target, marker, &seen);
+        core.fuse_marker(target, marker, &seen, false);
         let copy = &core.state.copies[0];
         for i in 0..copied {
             assert!((copy.mean[i] - step[n + i]).abs() < 1e-6, "seed {seed}: mean {i}");

@@ -6,7 +6,7 @@
 use super::blocks::TargetBlock;
 use super::delayed::DelayedCopy;
 use super::fitted::{Learning, MOST, STILL};
-use super::standstill::{REST_S, Standstill};
+use super::standstill::{REST_S, Standstill, Unrest};
 use super::state::State;
 
 impl State {
@@ -88,6 +88,12 @@ impl State {
                 *q = (*q * keep).max(start * STILL * STILL);
             }
         }
+    }
+
+    /// A target that stood has begun to move, as far as is measured: as [`Self::wake`] has it.
+    pub(crate) fn rouse(&mut self, learning: &Learning, i: usize) {
+        self.targets[i].unrest = Unrest::default();
+        self.wake(learning, i);
     }
 
     /// A target whose markers have all left the gate moves otherwise than it did. One that stood has begun to move:

@@ -20,6 +20,8 @@ pub(crate) struct Measurement {
     pub(crate) residual: [f64; MAX_MEASURED],
     /// Noise covariance.
     pub(crate) noise: Small,
+    /// Whether what the linear model leaves out makes too much of the noise to fit the noise from it.
+    pub(crate) unsettled: bool,
 }
 
 /// `N` columns that a measurement touches: where a block of the error state stands in its Jacobian.
@@ -43,6 +45,7 @@ impl Default for Measurement {
             h: [[0.0; MAX_COLUMNS]; MAX_MEASURED],
             residual: [0.0; MAX_MEASURED],
             noise: [[0.0; MAX_MEASURED]; MAX_MEASURED],
+            unsettled: false,
         }
     }
 }

@@ -31,6 +31,8 @@ pub(crate) struct Marker {
     pub(crate) size_m: f64,
     /// Where a tag's top points in the vehicle frame, rad.
     pub(crate) yaw: f64,
+    /// Which of the fitted tags it is (`tag_fit.rs`).
+    pub(crate) fit: Option<usize>,
 }
 
 /// A target as configured.
@@ -95,6 +97,9 @@ pub(crate) struct Models {
     pub(crate) gates: [f64; 9],
 }
 
+/// Tags of a target whose size, place and turn are states; those beyond are taken as configured.
+const MOST_FITTED: usize = 4;
+
 /// GPS height errs about twice as much as position: satellites are only above.
 const GPS_DOWN_FACTOR: f64 = 2.0;
 
@@ -108,6 +113,12 @@ impl Models {
         for (m, gate) in gates.iter_mut().enumerate().skip(1) {
             *gate = chi_square_quantile(estimator.gate_probability, m);
         }
+        let mut targets: Vec<TargetModels> =
+            target.iter().enumerate().map(|(i, t)| target_models(i, t)).collect();
+        let tags = targets
+            .iter_mut()
+            .flat_map(|t| t.markers.iter_mut().filter(|m| m.corners.is_some()).take(MOST_FITTED));
+        tags.enumerate().for_each(|(slot, tag)| tag.fit = Some(slot));
         Self {
             frame: site.frame,
             ground: site.ground.clone(),
@@ -142,11 +153,16 @@ impl Models {
             },
             slip_q: estimator.target_slip_walk.powi(2),
             target_walks: [estimator.target_speed_walk.powi(2), estimator.target_yaw_rate_walk.powi(2)],
-            targets: target.iter().enumerate().map(|(i, t)| target_models(i, t)).collect(),
+            targets,
             marker_var_px2: estimator.marker_noise_px.powi(2),
             feature_factor2: estimator.feature_sigma_factor.powi(2),
             gates,
         }
+    }
+
+    /// How many tags are fitted.
+    pub(crate) fn fitted_tags(&self) -> usize {
+        self.targets.iter().flat_map(|t| &t.markers).filter(|m| m.fit.is_some()).count()
     }
 
     /// Which marker of which target a detection is of.
@@ -183,12 +199,19 @@ fn marker_model(target: usize, marker: usize, config: &MarkerConfig) -> Marker {
     let tag = (config.kind == MarkerKind::Apriltag).then_some(()).and(config.family.zip(config.id));
     let Some((family, id)) = tag else {
         let size_m = config.diameter_m.unwrap_or(0.0);
-        return Marker { id: MarkerId::Disc { target, marker }, center, corners: None, size_m, yaw };
+        return Marker {
+            id: MarkerId::Disc { target, marker },
+            center,
+            corners: None,
+            size_m,
+            yaw,
+            fit: None,
+        };
     };
     let size_m = config.size_m.unwrap_or(0.0);
     let half = 0.5 * size_m;
     // Seen from above with its top toward `yaw`: up in the print is forward, right is right.
     let corner = |up: f64, right: f64| center + rot_z(yaw) * Vector3::new(up * half, right * half, 0.0);
     let corners = [corner(1.0, -1.0), corner(1.0, 1.0), corner(-1.0, 1.0), corner(-1.0, -1.0)];
-    Marker { id: MarkerId::Tag { family, id }, center, corners: Some(corners), size_m, yaw }
+    Marker { id: MarkerId::Tag { family, id }, center, corners: Some(corners), size_m, yaw, fit: None }
 }

@@ -16,6 +16,11 @@ use super::matrix::Grid;
 use super::models::Models;
 use super::state::State;
 
+/// What moves and is no target may be as large as this about a feature that rides on it, m: a person with a shadow.
+const MOVER_RADIUS_M: f64 = 0.8;
+/// Farther than this from where it should be a vehicle out of sight is not kept clear of features, m.
+const FARTHEST_GONE_M: f64 = 4.0;
+
 /// State and covariance at the reference point, `reference_m` ahead of the rear axle.
 pub(crate) fn target_state(
     models: &Models,
@@ -105,15 +110,20 @@ impl State {
         let height_sigma = self.cov.sigma(own::POSITION, 2);
         expected.size_range_px = size_range(models, height, height_sigma);
         expected.search = self.targets.iter().any(|t| t.life.status() != TrackStatus::Tracking);
-        let known = |t: &super::state::Target| t.life.status() != TrackStatus::Lost;
-        for (i, target) in self.targets.iter().enumerate().filter(|(_, t)| known(t)) {
+        expected.moving.extend(self.refused_tracks.iter());
+        expected.moving_radius_px = MOVER_RADIUS_M * models.camera.fx / height.max(0.5);
+        for (i, target) in self.targets.iter().enumerate().filter(|(_, t)| t.life.is_held()) {
             let model = &models.targets[i];
             let (middle, _) = target_point(&target.mean, models, &middle_of(model));
             let scale = models.camera.fx / (middle - camera).norm().max(0.5);
             if let Some(seen) = view(&self.own, models, &middle) {
-                expected.occupied.push((seen.px, model.radius_m * scale));
+                // With no tag read, features may ride on it wherever it has got to.
+                let doubt_px = 2.0 * self.pixel_sigma(i, models, &middle, &seen);
+                let radius_px = model.radius_m * scale + doubt_px.min(FARTHEST_GONE_M * scale);
+                expected.occupied.push((seen.px, radius_px));
             }
-            for marker in &model.markers {
+            let markers = if target.life.status() == TrackStatus::Lost { &[][..] } else { &model.markers };
+            for marker in markers {
                 let (world, _) = target_point(&target.mean, models, &marker.center);
                 let Some(seen) = view(&self.own, models, &world) else { continue };
                 let sigma_px = self.pixel_sigma(i, models, &world, &seen);

@@ -9,11 +9,17 @@ use super::blocks::{Block, FEATURE, Layout, TARGET, own};
 use super::delayed::DelayedCopy;
 use super::fit::{Fit, WATCHED};
 use super::fitted::Learnt;
+use super::ground::RefusedTracks;
+use super::height::HeightCheck;
 use super::kind::TiltWatch;
 use super::matrix::Grid;
 use super::own::{Own, Senses};
-use super::standstill::Standstill;
+use super::slip::Slip;
+use super::spin::Spin;
+use super::standstill::{Standstill, Unrest};
+use super::tag_fit::{Scale, ScaleTest, TagFit};
 use super::track::Life;
+use super::twins::Twin;
 
 /// Variance of the place of something just found, m². Its guess is made from where the helicopter is thought to be, so
 /// as a prior it must say nothing of where that is: with 30 m each new ground feature said a little, and a
@@ -36,6 +42,14 @@ pub(crate) struct Target {
     /// (zero where they have not been).
     pub(crate) memory_s: [f64; 2],
     pub(crate) fitted_memory_s: [f64; 2],
+    /// A copy of one of its markers on another vehicle.
+    pub(crate) twin: Option<Twin>,
+    /// Whether, and for how long, it has turned tighter than its model of motion allows.
+    pub(crate) spin: Spin,
+    pub(crate) turn_judged: MonoTime,
+    pub(crate) slip: Slip,
+    /// Whether it is about to move again, where it stands.
+    pub(crate) unrest: Unrest,
 }
 
 /// One ground feature.
@@ -43,6 +57,13 @@ pub(crate) struct Target {
 pub(crate) struct Feature {
     pub(crate) id: Option<u64>,
     pub(crate) mean: [f64; FEATURE],
+    /// When it was found.
+    pub(crate) since: MonoTime,
+    /// Whether it has stood long enough to be ground.
+    pub(crate) proven: bool,
+    /// Frames in which it was where it was expected.
+    pub(crate) stood: u32,
+    /// Frames in a row in which it was not.
     pub(crate) rejected: u32,
 }
 
@@ -70,6 +91,20 @@ pub(crate) struct State {
     pub(crate) own_columns: usize,
     pub(crate) targets: Vec<Target>,
     pub(crate) features: Vec<Feature>,
+    /// What tags are beside their configuration.
+    pub(crate) tags: Vec<TagFit>,
+    pub(crate) scale_test: ScaleTest,
+    /// The scale of all that is seen, once it is open.
+    pub(crate) scale: Option<Scale>,
+    /// Whether the receiver's velocity contradicts that vehicles in view stand.
+    pub(crate) unrest: Unrest,
+    /// Share of the tracked features that move, over the last seconds.
+    pub(crate) moving_share: f64,
+    pub(crate) movers_noted: MonoTime,
+    /// Share of the last markers that were outside the gate.
+    pub(crate) markers_outside: f64,
+    /// Tracks that are of no ground.
+    pub(crate) refused_tracks: RefusedTracks,
     pub(crate) cov: Grid,
     /// Targets as they were at recent frames.
     pub(crate) copies: Vec<DelayedCopy>,
@@ -83,6 +118,10 @@ pub(crate) struct State {
     /// How the sources of own motion fit, by [`WATCHED`].
     pub(crate) fits: [Fit; WATCHED.len()],
     pub(crate) rejections: Rejections,
+    /// What tags have shown of height before they were fused.
+    pub(crate) height: HeightCheck,
+    /// By how much lower than configured the ground lies, m: the receiver's heights are over that.
+    pub(crate) ground_lower_m: f64,
     /// When the scene was last anchored anew, and by how much it moved.
     pub(crate) anchored: Option<(MonoTime, Vector3<f64>)>,
 }
@@ -100,6 +139,7 @@ impl State {
             own_columns: layout.own,
             targets: vec![Target::default(); layout.targets],
             features: vec![Feature::default(); layout.features],
+            tags: vec![TagFit::default(); layout.tags],
             cov: Grid::zeros(n, n),
             copies: vec![DelayedCopy::of_targets(layout); copies],
             past_motion: DelayedCopy::of_states(own::MOTION.range().len(), n),
@@ -120,6 +160,7 @@ impl State {
         self.past_motion.copy_from(&other.past_motion);
         self.rejections = other.rejections;
         self.anchored = other.anchored;
+        self.height = other.height;
         self.tilt = other.tilt;
     }
 
@@ -128,11 +169,17 @@ impl State {
         self.t = other.t;
         self.alive = other.alive;
         self.own = other.own;
+        self.ground_lower_m = other.ground_lower_m;
         self.own_columns = other.own_columns;
         self.senses = other.senses;
         self.fits = other.fits;
         self.targets.clone_from(&other.targets);
         self.features.clone_from(&other.features);
+        self.tags.clone_from(&other.tags);
+        (self.scale_test, self.scale, self.unrest) = (other.scale_test, other.scale, other.unrest);
+        (self.moving_share, self.movers_noted) = (other.moving_share, other.movers_noted);
+        self.markers_outside = other.markers_outside;
+        self.refused_tracks = other.refused_tracks;
         self.cov.copy_from(&other.cov);
         self.learnt.copy_from(&other.learnt);
     }
@@ -141,6 +188,8 @@ impl State {
     pub(crate) fn clear(&mut self) {
         self.targets.fill(Target::default());
         self.features.fill(Feature::default());
+        self.tags.fill(TagFit::default());
+        self.scale = None;
         self.cov.fill(0.0);
         self.past_motion.in_use = false;
         self.copies.iter_mut().for_each(|copy| copy.in_use = false);
@@ -148,7 +197,12 @@ impl State {
 
     /// Which part lies where.
     pub(crate) fn layout(&self) -> Layout {
-        Layout { own: self.own_columns, targets: self.targets.len(), features: self.features.len() }
+        Layout {
+            own: self.own_columns,
+            targets: self.targets.len(),
+            features: self.features.len(),
+            tags: self.tags.len(),
+        }
     }
 
     /// Forgets some states and gives them variances of their own.
@@ -168,6 +222,9 @@ impl State {
         }
         for (i, feature) in self.features.iter_mut().enumerate() {
             add(&mut feature.mean, &dx[layout.feature(i).range()]);
+        }
+        for (i, tag) in self.tags.iter_mut().enumerate() {
+            add(&mut tag.mean, &dx[layout.tag(i).all().range()]);
         }
     }
 

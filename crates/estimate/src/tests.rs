@@ -246,7 +246,10 @@ fn a_vehicle_that_comes_back_elsewhere_is_placed_anew_and_never_lost() {
     scene.rover = [-1.2, -2.4, 1.0];
     let out = scene.hear(30);
     let statuses: Vec<_> = Scene::estimates(&out, 1).iter().map(|e| e.status).collect();
-    assert!(statuses.iter().all(|s| *s == TrackStatus::Tracking), "{statuses:?}");
+    // In the one frame it is read off anew in, nothing confirms it yet.
+    let coasting = statuses.iter().filter(|s| **s == TrackStatus::Coasting).count();
+    let tracking = statuses.iter().filter(|s| **s == TrackStatus::Tracking).count();
+    assert!(coasting <= 1 && coasting + tracking == statuses.len(), "{statuses:?}");
     scene.assert_right(&out, "being carried");
     assert_eq!(resets(&out), 0);
 }

@@ -6,15 +6,16 @@
 //! | unknown, lost | its markers are seen | started (1 frame) |
 //! | started | seen again: started afresh, speed from where it was first seen | started (one more), acquiring from the sixth |
 //! | acquiring | accepted, in the eighth frame or later, and settled | tracking |
-//! | started, acquiring | not seen for a second | the same, missing: reported as lost |
+//! | started, acquiring (never tracked) | not seen for a second | the same, missing: reported as lost |
 //! | started, acquiring, missing | seen | the same, not missing |
 //! | tracking, coasting | fused, and in doubt ([`Certainty::Doubtful`]) | acquiring |
 //! | tracking | not seen for longer than a blink | coasting |
-//! | coasting | fused, not in doubt | tracking |
+//! | coasting | accepted, not in doubt | tracking |
+//! | coasting | seen, all markers outside the gate | placed anew at once |
 //! | any held | not seen for `lost_after_s` (never of a target that cannot move) | lost |
 //! | acquiring, tracking, coasting | refused: all markers outside the gate | the same, counted |
 //! | acquiring | refused twice in a row | started anew (1 frame) |
-//! | tracking, coasting | refused too often in a row ([`Life::verdict`]) | placed anew: the same, unconfirmed |
+//! | tracking, coasting | refused too often in a row ([`Life::verdict`]) | placed anew: coasting, unconfirmed |
 //! | placed anew | refused twice in a row | started anew (1 frame) |
 //! | placed anew | accepted | confirmed |
 //!
@@ -30,6 +31,8 @@ use windhover_base::time::{MonoTime, Span};
 const FRAMES_TO_START: u32 = 6;
 /// Frames a new track must be seen in before it is believed.
 const FRAMES_TO_TRACK: u32 = FRAMES_TO_START + 2;
+/// Frames counted of a track that was believed and is in doubt: out of sight it is not forgotten as one never believed.
+const BELIEVED_BEFORE: u32 = FRAMES_TO_TRACK + 1;
 /// Frames in a row outside the gate after which a track that is not believed is given up.
 const DOUBTED_REFUSALS: u32 = 2;
 /// Heading sigma below which a track settles, and above which it is in doubt again, rad.
@@ -84,6 +87,8 @@ pub(crate) enum OnSight {
     StartAgain(Sighting),
     /// Reads its place off its markers, or fuses them where they show no heading.
     PlaceAnew,
+    /// It comes back: the same where all of its markers lie outside the gate, before any of them is fused.
+    Return,
     /// Fuses its markers.
     Fuse,
 }
@@ -180,6 +185,7 @@ impl Life {
             Self::Started { frames, first, missing } => {
                 Self::Started { frames, first, missing: missing || now.away.s() > MISSING_S }
             }
+            Self::Acquiring { frames: BELIEVED_BEFORE, .. } => self,
             Self::Acquiring { frames, evidence, missing } => {
                 Self::Acquiring { frames, evidence, missing: missing || now.away.s() > MISSING_S }
             }
@@ -195,10 +201,11 @@ impl Life {
             Self::Unknown | Self::Lost => OnSight::Start,
             _ if now.is_gone() => OnSight::Start,
             Self::Started { first, .. } => OnSight::StartAgain(first),
-            Self::Acquiring { missing: false, .. } => OnSight::Fuse,
+            Self::Acquiring { frames, missing: false, .. } if frames < BELIEVED_BEFORE => OnSight::Fuse,
             Self::Acquiring { .. } | Self::Tracking(_) | Self::Coasting(_) if back_in_doubt => {
                 OnSight::PlaceAnew
             }
+            Self::Coasting(_) if now.moves() => OnSight::Return,
             Self::Acquiring { .. } | Self::Tracking(_) | Self::Coasting(_) => OnSight::Fuse,
         }
     }
@@ -220,7 +227,7 @@ impl Life {
     pub(crate) fn accepted(self) -> Self {
         match self {
             Self::Acquiring { frames, missing, .. } => Self::Acquiring {
-                frames: (frames + 1).min(FRAMES_TO_TRACK),
+                frames: frames.max((frames + 1).min(FRAMES_TO_TRACK)),
                 evidence: Evidence::default(),
                 missing,
             },
@@ -233,9 +240,13 @@ impl Life {
         self.with_evidence(|evidence| Evidence { refused: evidence.refused + 1, ..evidence })
     }
 
-    /// Its place was read off its markers anew.
+    /// Its place was read off its markers anew. Until one of them is accepted it is not tracked.
     pub(crate) fn placed_anew(self) -> Self {
-        self.with_evidence(|_| Evidence { refused: 0, unconfirmed: true })
+        let placed = self.with_evidence(|_| Evidence { refused: 0, unconfirmed: true });
+        match placed {
+            Self::Tracking(evidence) => Self::Coasting(evidence),
+            _ => placed,
+        }
     }
 
     /// Frames in a row in which all of its markers were outside the gate.
@@ -246,7 +257,7 @@ impl Life {
     /// After a refusal: a believed track is moved after `restart_after` frames in a row, any other given up sooner.
     pub(crate) fn verdict(self, restart_after: u32, moves: bool) -> Verdict {
         let Evidence { refused, unconfirmed } = self.evidence();
-        let believed = matches!(self, Self::Tracking(_)) && !unconfirmed;
+        let believed = matches!(self, Self::Tracking(_));
         if refused < if believed { restart_after } else { DOUBTED_REFUSALS } {
             return Verdict::Keep;
         }
@@ -268,8 +279,9 @@ impl Life {
                 Self::Acquiring { frames, evidence, missing: false }
             }
             (Self::Tracking(evidence) | Self::Coasting(evidence), Certainty::Doubtful) => {
-                Self::Acquiring { frames: FRAMES_TO_TRACK, evidence, missing: false }
+                Self::Acquiring { frames: BELIEVED_BEFORE, evidence, missing: false }
             }
+            (Self::Coasting(evidence), _) if evidence.unconfirmed || evidence.refused > 0 => self,
             (Self::Tracking(evidence) | Self::Coasting(evidence), _) => Self::Tracking(evidence),
             (Self::Unknown | Self::Lost, _) => self,
         }

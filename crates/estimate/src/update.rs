@@ -141,6 +141,18 @@ impl Workspace {
         outcome
     }
 
+    /// The normalised innovation squared of `z`, which is not fused; `None` where it is no number.
+    pub(crate) fn square(&mut self, state: &State, z: &Measurement) -> Option<f64> {
+        self.project(state, z);
+        let mut s = self.innovation_covariance(z);
+        if !z.is_finite() || !cholesky(&mut s, z.m) {
+            return None;
+        }
+        let mut white = z.residual;
+        forward(&s, z.m, &mut white);
+        Some(white[..z.m].iter().map(|x| x * x).sum())
+    }
+
     /// `H P Hᵀ + R` of what [`Self::project`] left.
     fn innovation_covariance(&self, z: &Measurement) -> Small {
         let mut s = self.spread(z);
@@ -217,6 +229,7 @@ impl Workspace {
         }
         state.inject(&self.dx);
         state.keep_heading_unobserved(&self.dx);
+        state.keep_scale_unobserved(&self.dx);
     }
 
     /// Fixed-point smoothing: the copy `c` moves by `P_cx Hᵀ S⁻¹ r`.

@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use super::camera::Exposures;
+use super::camera::{Exposures, FrameTruth};
 use super::compass::Compass;
 use super::compass_wire::{WireContext, write_reading};
 use super::flight::FlightError;
@@ -44,12 +44,14 @@ pub struct ClosedFlight {
     coming: VecDeque<(MonoTime, EventBody)>,
     compass_heard: MonoTime,
     flown: MonoTime,
+    /// Frames that were exposed and are drawn elsewhere.
+    exposed: Vec<FrameTruth>,
     seq: u64,
 }
 
 impl ClosedFlight {
-    /// Sensors of a flown world ([`World::flown`]), drawing with this many threads; without frames where
-    /// that is none. Dropouts and outages of the scenario
+    /// Sensors of a flown world ([`World::flown`]), drawing with this many threads; where that is none, frames
+    /// are only [`Self::exposed`]. Dropouts and outages of the scenario
     /// are left out.
     pub fn new(world: Arc<World>, lateness: Lateness, threads: usize) -> Self {
         let rig = &world.scenario().rig;
@@ -66,6 +68,7 @@ impl ClosedFlight {
             coming: VecDeque::new(),
             compass_heard: world.time(0.0),
             flown: world.time(0.0),
+            exposed: Vec::new(),
             seq: 0,
             world,
         }
@@ -79,6 +82,11 @@ impl ClosedFlight {
     /// How far it has been flown.
     pub fn now(&self) -> MonoTime {
         self.flown
+    }
+
+    /// Frames exposed since this was last asked, where they are not drawn here.
+    pub fn exposed(&mut self) -> Vec<FrameTruth> {
+        std::mem::take(&mut self.exposed)
     }
 
     /// The helicopter was moved on by a step: appends what is heard by its end.
@@ -129,7 +137,10 @@ impl ClosedFlight {
         while self.exposures.due_s(&world) + EXPOSED_BY_S <= now_s {
             let Some(truth) = self.exposures.next(&world) else { break };
             let mut image = GrayImage::default();
-            let Some(renderer) = &self.renderer else { continue };
+            let Some(renderer) = &self.renderer else {
+                self.exposed.push(truth);
+                continue;
+            };
             renderer.render(truth.t_true, truth.frame, &mut image);
             let (width, height) = (image.width as u32, image.height as u32);
             let frame = FramePayload {

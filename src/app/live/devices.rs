@@ -5,6 +5,8 @@ use std::io::{ErrorKind, Read as _, Write as _};
 use std::os::fd::OwnedFd;
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::time::Duration;
 
 use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
@@ -12,8 +14,11 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 
 use crate::io::camera::grey_header;
-use windhover_base::msg::FramePayload;
+use crate::io::clock::HostClock;
+use windhover_base::msg::{FrameEncoding, FramePayload, GrayImage};
 use windhover_base::time::Span;
+use windhover_simulate::render::Renderer;
+use windhover_simulate::{FrameTruth, World};
 
 /// A daemon that takes no frame for so long is gone.
 const TAKES_BY: Duration = Duration::from_millis(500);
@@ -103,6 +108,54 @@ impl FrameSocket {
         {
             self.daemon = None;
         }
+    }
+}
+
+/// Frames are drawn and sent by a thread of their own: lines keep their pace however long a frame takes.
+#[derive(Debug)]
+pub struct Darkroom {
+    exposed: SyncSender<FrameTruth>,
+}
+
+/// Frames that wait to be drawn; one that finds as many before it is lost, as by a driver that is not asked in time.
+const WAITING: usize = 2;
+
+impl Darkroom {
+    /// Draws frames of a world for whoever is at a socket.
+    pub fn open(
+        world: Arc<World>,
+        mut socket: FrameSocket,
+        clock: HostClock,
+        threads: usize,
+    ) -> std::io::Result<Self> {
+        let (exposed, frames) = sync_channel::<FrameTruth>(WAITING);
+        let draw = move || {
+            let (renderer, mut image) = (Renderer::new(world).with_threads(threads), GrayImage::default());
+            for truth in frames {
+                renderer.render(truth.t_true, truth.frame, &mut image);
+                let (width, height) = (image.width as u32, image.height as u32);
+                let frame = FramePayload {
+                    index: truth.frame,
+                    t_exposure: truth.t_stamp,
+                    encoding: FrameEncoding::Grey,
+                    width,
+                    height,
+                    stride: width,
+                    data: image.data.clone().into(),
+                };
+                if let Ok(left) = u64::try_from((truth.t_recv - clock.now()).ns()) {
+                    std::thread::sleep(Duration::from_nanos(left));
+                }
+                socket.send(&frame);
+            }
+        };
+        std::thread::Builder::new().name("frames".into()).spawn(draw)?;
+        Ok(Self { exposed })
+    }
+
+    /// A frame was exposed.
+    pub fn draw(&self, frame: FrameTruth) {
+        let _ = self.exposed.try_send(frame);
     }
 }
 

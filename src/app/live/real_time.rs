@@ -9,7 +9,7 @@ use std::time::Duration;
 use nalgebra::Vector3;
 
 use super::autopilot::{SimulatedAutopilot, follow_target};
-use super::devices::{FrameSocket, PtyLine};
+use super::devices::{Darkroom, FrameSocket, PtyLine};
 use super::score::Score;
 use super::{Moment, closed_loop::LoopSettings};
 use crate::config::{AUTOPILOT, Config};
@@ -96,7 +96,7 @@ pub struct LiveFlight {
     compass: PtyLine,
     to_daemon: PtyLine,
     heard: MavlinkFrames,
-    camera: FrameSocket,
+    camera: Darkroom,
     system_id: u8,
     moments: Vec<Moment>,
 }
@@ -131,9 +131,11 @@ impl LiveFlight {
         let world = Arc::new(World::flown(scenario, seed));
         let (gps, compass, to_daemon) = (line("gps")?, line("compass")?, line("autopilot")?);
         let socket = folder.at("camera.sock");
-        let camera = FrameSocket::open(&socket, clock.less_monotonic()).map_err(io(&socket))?;
+        let frames = FrameSocket::open(&socket, clock.less_monotonic()).map_err(io(&socket))?;
+        let drawing = Arc::clone(&world);
+        let camera = Darkroom::open(drawing, frames, clock, settings.threads.max(1)).map_err(io(&socket))?;
         Ok(Self {
-            flight: ClosedFlight::new(Arc::clone(&world), settings.lateness, settings.threads.max(1)),
+            flight: ClosedFlight::new(Arc::clone(&world), settings.lateness, 0),
             autopilot: SimulatedAutopilot::new(settings.receiver_m),
             world,
             clock,
@@ -203,6 +205,7 @@ impl LiveFlight {
         let told = self.hear(now, &mut said);
         self.to_daemon.send(&said);
         events.iter().for_each(|event| self.deliver(event));
+        self.flight.exposed().into_iter().for_each(|frame| self.camera.draw(frame));
         let t_s = self.world.seconds(now);
         let (own, vehicle) = (self.world.ownship(now), self.world.vehicle(0, now));
         self.moments.push(Moment { t_s, own, vehicle, told });
@@ -213,7 +216,6 @@ impl LiveFlight {
         match &event.body {
             EventBody::Bytes { source: Source::Gps, data } => self.gps.send(data),
             EventBody::Bytes { source: Source::Compass, data } => self.compass.send(data),
-            EventBody::Frame(frame) => self.camera.send(frame),
             _ => {}
         }
     }

@@ -4,11 +4,11 @@
 use mavlink::MessageData as _;
 use mavlink::dialects::development::*;
 
-use windhover_base::time::{MonoTime, RemoteClock, Span};
+use windhover_base::time::{MonoTime, RemoteClock, Span, UtcTime};
 use windhover_decode::{MavlinkFrame, is_autopilot, timesync_asked, timesync_question};
 
 use super::messages;
-use super::packet::{self, Sender};
+use super::packet::{self, Sender, Signature, SigningKey};
 
 /// MAV_COMP_ID_ONBOARD_COMPUTER.
 const COMPANION: u8 = 191;
@@ -36,6 +36,8 @@ pub struct Companion {
     restarts: u32,
     configured: bool,
     sequence: u8,
+    signed_with: Option<(SigningKey, u8)>,
+    stamp: u64,
     notes: Vec<String>,
 }
 
@@ -43,6 +45,11 @@ impl Companion {
     /// Of this system; of the first autopilot that is heard where `None`.
     pub fn new(wanted: Option<u8>, configure: bool) -> Self {
         Self { wanted, configure, ..Self::default() }
+    }
+
+    /// Signs what it says with this key, under this link id.
+    pub fn signing(self, signed_with: Option<(SigningKey, u8)>) -> Self {
+        Self { signed_with, ..self }
     }
 
     /// Takes a frame that was heard at `t`; whether it is the autopilot's. Appends what it is answered.
@@ -90,24 +97,24 @@ impl Companion {
     fn tell_time(&mut self, ts1: i64, t: MonoTime, out: &mut Vec<Vec<u8>>) {
         let Some(remote) = self.clock.remote(t).filter(|_| self.clock.is_exchanged()) else { return };
         let answer = TIMESYNC_DATA { tc1: remote.ns(), ts1, ..TIMESYNC_DATA::DEFAULT };
-        self.put(&MavMessage::TIMESYNC(answer), out);
+        self.put(&MavMessage::TIMESYNC(answer), t, out);
     }
 
     /// What is said once a second: nothing before it was heard.
     pub fn every_second(&mut self, now: MonoTime, out: &mut Vec<Vec<u8>>) {
         let Some(system) = self.system else { return };
-        self.put(&messages::heartbeat_of(MavType::MAV_TYPE_ONBOARD_CONTROLLER), out);
+        self.put(&messages::heartbeat_of(MavType::MAV_TYPE_ONBOARD_CONTROLLER), now, out);
         let question = TIMESYNC_DATA {
             tc1: 0,
             ts1: timesync_question(now),
             target_system: system,
             target_component: AUTOPILOT,
         };
-        self.put(&MavMessage::TIMESYNC(question), out);
+        self.put(&MavMessage::TIMESYNC(question), now, out);
         if self.configure && !self.configured {
             self.configured = true;
             for (id, hz) in WANTED {
-                self.put(&interval(system, id, hz), out);
+                self.put(&interval(system, id, hz), now, out);
             }
         }
     }
@@ -117,10 +124,15 @@ impl Companion {
         std::mem::take(&mut self.notes)
     }
 
-    fn put(&mut self, message: &MavMessage, out: &mut Vec<Vec<u8>>) {
+    fn put(&mut self, message: &MavMessage, now: MonoTime, out: &mut Vec<Vec<u8>>) {
         let Some(system) = self.system else { return };
         let sender = Sender { system, component: COMPANION };
-        out.push(packet::encode(self.sequence, sender, message, None));
+        // Host time is near UTC where the computer's clock was set; stamps never go back.
+        self.stamp = packet::time_stamp(UtcTime::from_unix_ns(now.ns())).max(self.stamp + 1);
+        let time_stamp = self.stamp;
+        let signature =
+            self.signed_with.as_ref().map(|(key, link_id)| Signature { key, link_id: *link_id, time_stamp });
+        out.push(packet::encode(self.sequence, sender, message, signature));
         self.sequence = self.sequence.wrapping_add(1);
     }
 }
@@ -188,6 +200,18 @@ mod tests {
         let MavMessage::TIMESYNC(told) = &frames(&out)[0].message else { panic!("{out:?}") };
         assert_eq!(told.ts1, 7);
         assert!((told.tc1 - 51_000_000_000).abs() < 1_000_000, "{}", told.tc1);
+    }
+
+    #[test]
+    fn with_a_key_all_that_is_said_is_signed() {
+        let key = SigningKey([5; 32]);
+        let mut companion = Companion::new(None, true).signing(Some((key.clone(), 2)));
+        let mut said = Vec::new();
+        companion.heard(&of(3, &heartbeat()), at(0.5), &mut said);
+        companion.every_second(at(1.0), &mut said);
+        let stamps: Vec<u64> =
+            said.iter().map(|frame| packet::verify(frame, &key).expect("signed").2).collect();
+        assert!(stamps.len() > 2 && stamps.is_sorted_by(|a, b| a < b), "{stamps:?}");
     }
 
     #[test]

@@ -62,6 +62,15 @@ pub struct MavlinkCounts {
     pub foreign: u64,
 }
 
+impl MavlinkCounts {
+    /// In a few words, where something came that is not believed.
+    pub fn words(&self) -> Option<String> {
+        let Self { heard, refused, foreign } = self;
+        (refused + foreign > 0)
+            .then(|| format!("{heard} heard, {refused} refused, {foreign} under ids of ours"))
+    }
+}
+
 /// Sends the vehicles. Nothing here blocks.
 pub struct MavlinkSender {
     teller: Teller,

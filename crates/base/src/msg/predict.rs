@@ -29,6 +29,10 @@ pub struct FramePrediction {
     pub size_range_px: Option<(f64, f64)>,
     /// Circles (centre, radius, pixels) that vehicles cover: no ground features there.
     pub occupied: Vec<(Vector2<f64>, f64)>,
+    /// Tracks of ground features that are of no ground: something that moves.
+    pub moving: Vec<u64>,
+    /// Around each of them no other feature is looked for, pixels.
+    pub moving_radius_px: f64,
 }
 
 impl FramePrediction {
@@ -36,6 +40,7 @@ impl FramePrediction {
     pub fn clear(&mut self) {
         self.markers.clear();
         self.occupied.clear();
+        self.moving.clear();
         self.search = true;
         self.size_range_px = None;
     }

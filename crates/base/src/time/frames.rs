@@ -7,6 +7,9 @@ use super::{MonoTime, Span, SteadyClock};
 const REAL_MS2: f64 = 0.25;
 /// Variance of stamps about their beat up to which all of it is taken as real, ms².
 const GOOD_MS2: f64 = 0.5;
+/// Variance about the line from which there is no beat: no host stamps frames that badly, ms². The camera takes them
+/// when it will (a variable frame rate, an emulated one), and its stamps are all there is.
+const NO_BEAT_MS2: f64 = 400.0;
 /// Stamps farther from the beat than this many sigmas do not count in it.
 const WILD: f64 = 3.0;
 /// Fewest stamps that show a beat.
@@ -25,8 +28,8 @@ pub struct FrameClock {
 }
 
 impl FrameClock {
-    /// When the next frame was exposed, by its stamp.
-    pub fn exposed(&mut self, stamp: MonoTime) -> MonoTime {
+    /// When the next frame was exposed, by its stamp and when it was received: never later than that.
+    pub fn exposed(&mut self, stamp: MonoTime, received: MonoTime) -> MonoTime {
         self.beat.smooth(stamp);
         let line = Line::through(self.beat.counted());
         let deviation = line.zip(self.beat.deviation_of(stamp));
@@ -36,7 +39,7 @@ impl FrameClock {
             return stamp;
         }
         // Where a beat is followed, time does not run backwards.
-        let exposed = stamp - Span::from_ms(error_ms);
+        let exposed = (stamp - Span::from_ms(error_ms)).min(received.max(stamp));
         let exposed = self.last.map_or(exposed, |last| exposed.max(last));
         self.last = Some(exposed);
         exposed
@@ -79,8 +82,11 @@ impl Line {
         ms - self.at_mean_ms - self.slope * (t_s - self.t_mean_s)
     }
 
-    /// What of a stamp's deviation is expected to be its error; nothing where stamps are good.
+    /// What of a stamp's deviation is expected to be its error; nothing where stamps are good or follow no beat.
     fn stamp_error_ms(&self, point: Point) -> f64 {
+        if self.variance_ms2 > NO_BEAT_MS2 {
+            return 0.0;
+        }
         let excess = (self.variance_ms2 - GOOD_MS2).max(0.0);
         self.off_ms(point) * excess / (REAL_MS2 + excess)
     }
@@ -105,7 +111,7 @@ mod tests {
             let exposed = start + Span::from_s(f64::from(frame) * 0.1) + Span::from_ms(0.5 * normal());
             let stamp = exposed + Span::from_ms(jitter_ms * normal());
             if frame % 50 != 7 {
-                errors.push((clock.exposed(stamp) - exposed).ms());
+                errors.push((clock.exposed(stamp, stamp + Span::from_ms(50.0)) - exposed).ms());
             }
         }
         errors
@@ -141,10 +147,33 @@ mod tests {
         for frame in 0..200_i64 {
             let late = if frame % 3 == 0 { 12.0 } else { 0.0 };
             let stamp = MonoTime::from_ns(1 << 60) + Span::from_ms(frame as f64 * 20.0 + late);
-            let exposed = clock.exposed(stamp);
+            let exposed = clock.exposed(stamp, stamp + Span::from_ms(5.0));
             // Once the beat is known.
             assert!(frame < 40 || exposed >= last, "frame {frame}");
             last = exposed;
+        }
+    }
+
+    #[test]
+    fn no_frame_is_later_than_it_was_received() {
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        let mut clock = FrameClock::default();
+        for frame in 0..400_i64 {
+            let jitter_ms = 6.0 * Distribution::<f64>::sample(&StandardNormal, &mut rng);
+            let stamp = MonoTime::from_ns(1 << 60) + Span::from_ms(frame as f64 * 33.3 + jitter_ms);
+            let received = stamp + Span::from_ms(0.2);
+            assert!(clock.exposed(stamp, received) <= received, "frame {frame}");
+        }
+    }
+
+    #[test]
+    fn frames_without_a_beat_keep_their_stamps() {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let (mut clock, mut stamp) = (FrameClock::default(), MonoTime::from_ns(1 << 60));
+        for frame in 0..400 {
+            let apart_ms = 150.0 + 80.0 * Distribution::<f64>::sample(&StandardNormal, &mut rng);
+            stamp = stamp + Span::from_ms(apart_ms.max(20.0));
+            assert_eq!(clock.exposed(stamp, stamp), stamp, "frame {frame}");
         }
     }
 }

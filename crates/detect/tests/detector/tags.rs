@@ -291,6 +291,7 @@ proptest! {
             search,
             size_range_px: Some((0.5 * size_px, size_px)),
             occupied: vec![(center_px, size_px)],
+            ..FramePrediction::default()
         };
         let mut detector = with_discs(is_red);
         let mut seen = FrameObservations::default();

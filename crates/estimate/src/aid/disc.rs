@@ -25,8 +25,8 @@ impl Aid for Disc<'_> {
     const SOURCE: FusionSource = FusionSource::Marker;
 
     fn linearise(&self, state: &State, models: &Models, z: &mut Measurement) -> Result<(), Disposition> {
-        let seen = Sighting { point: self.point, px: self.center_px, cov_px2: self.cov_px2 };
-        linearise_points(self.target, std::iter::once(seen), state, models, z)
+        let seen = Sighting { point: *self.point, d_fit: None, px: self.center_px, cov_px2: self.cov_px2 };
+        linearise_points(self.target, None, std::iter::once(seen), state, models, z)
     }
 }
 

@@ -5,7 +5,7 @@ use nalgebra::{Matrix2, Vector2, Vector3};
 use windhover_base::msg::{Disposition, FusionSource};
 
 use super::Aid;
-use super::pixel::{self, CameraColumns, Moment};
+use super::pixel::{self, CameraColumns, Curvature, Moment};
 use crate::core::Core;
 use crate::fitted::blend_factor;
 use crate::measurement::Measurement;
@@ -20,6 +20,8 @@ pub(crate) struct FeaturePixel {
     pub(crate) px: Vector2<f64>,
     /// As the detector has it.
     pub(crate) sigma_px: f64,
+    /// By how much it may seem to have moved on the ground, one sigma, m.
+    pub(crate) slack_m: f64,
 }
 
 /// Sightings the fitted noise remembers: some seconds of eight features.
@@ -34,11 +36,13 @@ impl Aid for FeaturePixel {
         let view = pixel::view(&state.own, models, &world).ok_or(Disposition::Invalid)?;
         let [slope_n, slope_e] = models.ground.slope(north, east);
         let known = self.sigma_px.powi(2) * models.feature_factor2;
-        let curvature = pixel::curvature_px2(&state.cov, models);
-        let noise = Matrix2::identity() * (known * state.learnt.feature_factor + curvature);
+        let noise = Matrix2::identity() * (known * state.learnt.feature_factor);
+        let bent = Curvature::of(&state.cov, &state.own, models).noise_px2(&(world - state.own.position));
+        let slack = view.d_point.fixed_columns::<2>(0) * self.slack_m;
+        let noise = noise + slack * slack.transpose();
         z.begin(2);
         let moment = Moment::of(&state.own, models, &view, &Vector3::zeros(), &self.px);
-        CameraColumns::touch(z).set_point(z, 0, &self.px, &state.own, &view, &moment, &noise);
+        CameraColumns::touch(z).set_point(z, 0, &self.px, &state.own, &view, &moment, &noise, &bent);
         let north = view.d_point * Vector3::new(1.0, 0.0, slope_n);
         let east = view.d_point * Vector3::new(0.0, 1.0, slope_e);
         z.block(state.layout().feature(self.slot), &Matrix2::from_columns(&[north, east]));
@@ -50,8 +54,7 @@ impl FeaturePixel {
     /// Fuses it through the gate; `None`, without a report, where it cannot be in view.
     pub(crate) fn fuse(&self, core: &mut Core) -> Option<Outcome> {
         core.linearise(self).ok()?;
-        let curvature = pixel::curvature_px2(&core.state.cov, &core.models);
-        let settled = curvature < pixel::LITTLE_CURVATURE * core.z.noise[0][0];
+        let settled = !core.z.unsettled;
         let outcome = core.fuse_gated(Self::SOURCE);
         if settled && core.teaches(&outcome) {
             blend_factor(&mut core.state.learnt.feature_factor, outcome.misfit, SAMPLES, pixel::FACTORS);

@@ -1,4 +1,5 @@
-//! GPS position: `z = p + R l + b − vₐ τ + ½ a τ²`, with the velocity vₐ of the antenna at l and the delay τ.
+//! GPS position: `z = p + R l + b − vₐ τ + ½ a τ²`, with the velocity vₐ of the antenna at l and the delay τ. Where tags have
+//! shown the ground to lie lower than configured (`height.rs`), heights are less by that.
 //!
 //! Left out of the Jacobian, since it is small beside a fix's metre of noise (`jacobians.rs` holds the bounds): what
 //! τ and ½ τ² make of attitude and trim (0.25 m/rad), rate (0.12 m per rad/s), forces (0.01 m per m/s²) and drag
@@ -46,7 +47,8 @@ impl Aid for GpsPosition {
         z.block(own::GPS_BIAS, &Matrix3::identity());
         z.block(own::GPS_DELAY, &(-velocity + acceleration * tau));
         for i in 0..z.m {
-            z.residual[i] = self.ned_m[i] - expected[i];
+            let lower_m = if i == 2 { state.ground_lower_m } else { 0.0 };
+            z.residual[i] = self.ned_m[i] - lower_m - expected[i];
             z.noise[i][i] = noise_var * if i == 2 { HEIGHT_FACTOR } else { 1.0 };
         }
         Ok(())

@@ -56,15 +56,19 @@ impl Aid for GpsVelocity {
 }
 
 impl GpsVelocity {
-    /// Fuses it; after too many outside the gate velocity is what the receiver says.
+    /// Fuses it; after too many outside the gate velocity is what the receiver says, and what features ride on moves.
     pub(crate) fn fuse(&self, core: &mut Core) {
         let Some(outcome) = core.fuse_aid(self) else { return };
+        core.judge_scale(&outcome);
+        core.note_velocity_unrest(&outcome);
         if core.teaches(&outcome) {
             blend_factor(&mut core.state.learnt.gps_velocity_factor, outcome.misfit, SAMPLES, FACTORS);
         }
         let state = &mut core.state;
         state.rejections.gps_velocity = counted(state.rejections.gps_velocity, outcome.ratio);
         if state.rejections.gps_velocity >= core.restart_after {
+            core.distrust_ground();
+            let state = &mut core.state;
             state.rejections.gps_velocity = 0;
             state.renew(own::VELOCITY, &[4.0; 3]);
             state.own.velocity = self.ned_mps;

@@ -1,25 +1,29 @@
 //! A tag on a vehicle: its four corners at once, each through lens, mount, lever arms and the ground under the vehicle.
 
-use nalgebra::{Matrix2, Matrix2x5, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix2x5, Matrix3x4, Vector2, Vector3};
 
+use windhover_base::geo::rot_z;
 use windhover_base::msg::{Disposition, FusionSource};
 
 use super::Aid;
-use super::pixel::{self, CameraColumns, Moment};
-use crate::blocks::own;
+use super::pixel::{self, CameraColumns, Curvature, Moment};
+use crate::blocks::{TagFitBlock, own};
 use crate::core::Core;
 use crate::fitted::blend_factor;
 use crate::measurement::Measurement;
 use crate::models::Models;
 use crate::shape;
 use crate::state::State;
+use crate::tag_fit;
 use crate::update::REFUSE_RATIO;
 
 /// A point of a vehicle as it was seen.
 #[derive(Clone, Copy)]
 pub(super) struct Sighting<'a> {
     /// In the vehicle frame, m.
-    pub(super) point: &'a Vector3<f64>,
+    pub(super) point: Vector3<f64>,
+    /// Its derivative by the fit of its tag.
+    pub(super) d_fit: Option<Matrix3x4<f64>>,
     pub(super) px: &'a Vector2<f64>,
     pub(super) cov_px2: &'a Matrix2<f64>,
 }
@@ -28,8 +32,11 @@ pub(super) struct Sighting<'a> {
 #[derive(Clone, Copy)]
 pub(crate) struct Tag<'a> {
     pub(crate) target: usize,
-    /// In the vehicle frame, m.
+    /// Centre and corners in the vehicle frame as configured, m.
+    pub(crate) center: &'a Vector3<f64>,
     pub(crate) points: &'a [Vector3<f64>; 4],
+    /// Which of the fitted tags it is.
+    pub(crate) fit: Option<usize>,
     pub(crate) corners_px: &'a [Vector2<f64>; 4],
     pub(crate) cov_px2: &'a [Matrix2<f64>; 4],
 }
@@ -38,42 +45,53 @@ impl Aid for Tag<'_> {
     const SOURCE: FusionSource = FusionSource::Marker;
 
     fn linearise(&self, state: &State, models: &Models, z: &mut Measurement) -> Result<(), Disposition> {
-        let corners = self.points.iter().zip(self.corners_px).zip(self.cov_px2);
-        let seen = corners.map(|((point, px), cov_px2)| Sighting { point, px, cov_px2 });
-        linearise_points(self.target, seen, state, models, z)
+        let fitted = |slot: usize| {
+            tag_fit::corners(&state.tags[slot].mean, self.center, self.points).map(|(p, d)| (p, Some(d)))
+        };
+        let points = self.fit.map_or_else(|| self.points.map(|point| (point, None)), fitted);
+        let corners = points.into_iter().zip(self.corners_px).zip(self.cov_px2);
+        let seen = corners.map(|(((point, d_fit), px), cov_px2)| Sighting { point, d_fit, px, cov_px2 });
+        let fit = self.fit.map(|slot| tag_fit::block(state, slot));
+        linearise_points(self.target, fit, seen, state, models, z)
     }
 }
 
 /// Writes points of a vehicle into `z`.
 pub(super) fn linearise_points<'a>(
     target: usize,
+    fit: Option<TagFitBlock>,
     seen: impl ExactSizeIterator<Item = Sighting<'a>>,
     state: &State,
     models: &Models,
     z: &mut Measurement,
 ) -> Result<(), Disposition> {
     let mean = &state.targets[target].mean;
-    let curvature = pixel::curvature_px2(&state.cov, models);
+    let curvature = Curvature::of(&state.cov, &state.own, models);
     let factor = state.learnt.marker_factor[target];
     z.begin(2 * seen.len());
     let camera = CameraColumns::touch(z);
     let vehicle = z.touch(state.layout().target(target).all());
+    let fit = fit.map(|block| z.touch(block.all()));
+    let turned = rot_z(mean[2]);
     let [_, _, heading, speed, yaw_rate] = *mean;
     let (s, c) = heading.sin_cos();
-    for (i, Sighting { point, px, cov_px2 }) in seen.enumerate() {
-        let (world, derivatives) = pixel::target_point(mean, models, point);
+    for (i, Sighting { point, d_fit, px, cov_px2 }) in seen.enumerate() {
+        let (world, derivatives) = pixel::target_point(mean, models, &point);
         let view = pixel::view(&state.own, models, &world).ok_or(Disposition::Invalid)?;
         let known = cov_px2 + Matrix2::identity() * models.marker_var_px2;
-        let noise = known * factor + Matrix2::identity() * curvature;
+        let bent = curvature.noise_px2(&(world - state.own.position));
         // The point's velocity and its derivatives by speed, yaw rate and heading.
         let [north, east, turn] = derivatives;
         let ahead = north * c + east * s;
         let moment = Moment::of(&state.own, models, &view, &(ahead * speed + turn * yaw_rate), px);
-        camera.set_point(z, i, px, &state.own, &view, &moment, &noise);
+        camera.set_point(z, i, px, &state.own, &view, &moment, &(known * factor), &bent);
         let later = moment.after_s;
         let sideways = (east * c - north * s) * (speed * later);
         let by = [north, east, turn + sideways, ahead * later, turn * later];
         z.set(2 * i, vehicle, &Matrix2x5::from_columns(&by.map(|d| view.d_point * d)));
+        if let Some((columns, d_fit)) = fit.zip(d_fit) {
+            z.set(2 * i, columns, &(view.d_point * turned * d_fit));
+        }
     }
     Ok(())
 }
@@ -82,22 +100,30 @@ pub(super) fn linearise_points<'a>(
 const SAMPLES: f64 = 100.0;
 
 impl Tag<'_> {
-    /// Fuses it through the gate, with its noise raised to what its shape shows; whether it was inside.
-    pub(crate) fn fuse(&self, core: &mut Core) -> bool {
+    /// Fuses it through the gate, with its noise raised to what its shape shows; whether it was inside. One that is
+    /// outside while another tag of its vehicle is inside contradicts that one (`contradicts`), and is not fused: at any weight it would bend
+    /// tilt and height until the two agree.
+    pub(crate) fn fuse(&self, core: &mut Core, contradicts: bool) -> bool {
         if !core.expect_aid(self) {
             return false;
         }
         let worse = core.worse_than_assumed(self.target);
+        if contradicts && core.is_outside(worse) {
+            core.refuse(FusionSource::Marker, Disposition::GateRejected);
+            core.state.note_marker(true);
+            return false;
+        }
         fuse_expected(core, self.target, worse)
     }
 }
 
 /// Fuses the marker that stands in `z` through the gate, its noise raised by a factor; whether it was inside.
 pub(super) fn fuse_expected(core: &mut Core, target: usize, worse: f64) -> bool {
-    let curvature = pixel::curvature_px2(&core.state.cov, &core.models);
-    let settled = curvature < pixel::LITTLE_CURVATURE * core.z.noise[0][0];
+    let settled = !core.z.unsettled;
     core.z.scale_noise(worse);
     let outcome = core.fuse_gated(FusionSource::Marker);
+    core.note_marker_unrest(target, &outcome);
+    core.state.note_marker(outcome.ratio > 1.0);
     if settled && core.teaches(&outcome) {
         let factor = &mut core.state.learnt.marker_factor[target];
         blend_factor(factor, outcome.misfit * worse, SAMPLES, pixel::FACTORS);
@@ -106,6 +132,15 @@ pub(super) fn fuse_expected(core: &mut Core, target: usize, worse: f64) -> bool 
 }
 
 impl Core {
+    /// Whether what stands in `self.z` lies outside the gate, with its noise raised by a factor.
+    fn is_outside(&mut self, worse: f64) -> bool {
+        let noise = self.z.noise;
+        self.z.scale_noise(worse);
+        let square = self.work.square(&self.state, &self.z);
+        self.z.noise = noise;
+        !self.at_truth && square.is_none_or(|square| square > self.models.gates[self.z.m])
+    }
+
     /// By what factor the variance of the tag's pixels in `self.z` is larger than assumed, by what its shape shows:
     /// 1 unless that is beyond the gate, or so far beyond that it is no tag of ours.
     fn worse_than_assumed(&self, target: usize) -> f64 {

@@ -155,6 +155,9 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
         feature.id = Some(id as u64);
         feature.mean = [below.x + within(2.0), below.y + within(2.0)];
     }
+    for tag in &mut state.tags {
+        tag.mean = [within(0.05), within(0.05), within(0.05), within(0.1)];
+    }
     core
 }
 
@@ -202,6 +205,9 @@ pub(crate) fn difference(to: &State, from: &State) -> Vec<f64> {
     }
     for i in 0..layout.features {
         put(layout.feature(i).range(), &less(&to.features[i].mean, &from.features[i].mean));
+    }
+    for i in 0..layout.tags {
+        put(layout.tag(i).all().range(), &less(&to.tags[i].mean, &from.tags[i].mean));
     }
     dx
 }

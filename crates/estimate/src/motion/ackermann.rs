@@ -23,6 +23,10 @@ impl VehicleMotion for Ackermann {
         true
     }
 
+    fn tightest_turn(&self) -> Option<f64> {
+        self.max_curvature
+    }
+
     /// Half the tightest turn as one sigma, changing over a second; a thousandth of a radian a second at rest.
     fn most_yaw_rate_q(&self, speed2: f64) -> Option<f64> {
         self.max_curvature.map(|curvature| 2.0 * (0.5 * curvature).powi(2) * speed2 + 1e-6)

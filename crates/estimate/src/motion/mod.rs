@@ -47,6 +47,11 @@ pub(crate) trait VehicleMotion {
     /// The largest intensity of the yaw rate's walk at a squared speed; `None` where speed does not bound it.
     fn most_yaw_rate_q(&self, speed2: f64) -> Option<f64>;
 
+    /// The tightest turn it can drive, 1/m; `None` where it may turn on the spot.
+    fn tightest_turn(&self) -> Option<f64> {
+        None
+    }
+
     /// Carries the mean on; by itself, as a vehicle that rolls where it points.
     fn advance(&self, mean: &mut [f64; TARGET], dt: f64) {
         rolling::advance(mean, dt);

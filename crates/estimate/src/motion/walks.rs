@@ -39,8 +39,10 @@ impl State {
     pub(crate) fn intensities(&self, i: usize, models: &Models) -> Intensities {
         let [speed_q, yaw_rate_q] = self.present_walks(i, models);
         let speed2 = self.targets[i].mean[3].powi(2) + self.cov.var(self.layout().target(i).speed());
-        let most = models.targets[i].motion.model().most_yaw_rate_q(speed2);
+        let bounded = !self.targets[i].spin.is_free();
+        let most = models.targets[i].motion.model().most_yaw_rate_q(speed2).filter(|_| bounded);
         let yaw_rate_q = most.map_or(yaw_rate_q, |most| yaw_rate_q.min(most));
-        Intensities { speed_q, yaw_rate_q, slip_q: models.slip_q }
+        let slip_q = models.slip_q * self.targets[i].slip.factor();
+        Intensities { speed_q, yaw_rate_q, slip_q }
     }
 }

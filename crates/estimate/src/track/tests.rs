@@ -74,7 +74,8 @@ fn a_tracked_one_coasts_out_of_sight_and_is_lost_after_its_time() {
     let coasting = tracking.unseen(&away(0.2));
     assert_eq!(coasting, Life::Coasting(refused(1)));
     assert_eq!(coasting.unseen(&away(29.0)), coasting);
-    assert_eq!(coasting.settled(Certainty::Between), tracking);
+    assert_eq!(coasting.settled(Certainty::Between), coasting, "nothing was accepted yet");
+    assert_eq!(coasting.accepted().settled(Certainty::Between), Life::Tracking(NONE));
     assert_eq!(coasting.unseen(&away(31.0)), Life::Lost);
     assert_eq!(tracking.on_sight(&away(31.0)), OnSight::Start, "no frame came in between");
     assert_eq!(Life::Lost.on_sight(&away(31.0)), OnSight::Start);
@@ -97,10 +98,18 @@ fn one_that_comes_back_with_a_doubtful_heading_is_placed_anew() {
     let back = Circumstances { heading_doubtful: true, ..away(3.0) };
     for life in [Life::Tracking(NONE), Life::Coasting(NONE)] {
         assert_eq!(life.on_sight(&back), OnSight::PlaceAnew);
-        assert_eq!(life.on_sight(&Circumstances { heading_doubtful: false, ..back }), OnSight::Fuse);
-        assert_eq!(life.on_sight(&Circumstances { away: Span::from_s(0.1), ..back }), OnSight::Fuse);
     }
-    assert_eq!(Life::Coasting(refused(1)).placed_anew(), Life::Coasting(PLACED));
+    let sure = Circumstances { heading_doubtful: false, ..back };
+    assert_eq!(Life::Tracking(NONE).on_sight(&sure), OnSight::Fuse, "no frame came in between");
+    assert_eq!(Life::Coasting(NONE).on_sight(&sure), OnSight::Return);
+    assert_eq!(
+        Life::Tracking(NONE).on_sight(&Circumstances { away: Span::from_s(0.1), ..back }),
+        OnSight::Fuse
+    );
+    let placed = Life::Coasting(refused(1)).placed_anew();
+    assert_eq!(placed, Life::Coasting(PLACED));
+    assert_eq!(placed.settled(Certainty::Settled).status(), TrackStatus::Coasting);
+    assert_eq!(placed.accepted().settled(Certainty::Settled), Life::Tracking(NONE));
 }
 
 #[test]
@@ -123,16 +132,21 @@ fn a_believed_track_outlives_more_refusals_than_a_doubted_one() {
 #[test]
 fn a_place_nothing_confirms_starts_the_track_anew() {
     let placed = Life::Tracking(refused(5)).placed_anew();
-    assert_eq!(placed, Life::Tracking(PLACED));
+    assert_eq!(placed, Life::Coasting(PLACED));
     assert_eq!(placed.refused().verdict(5, true), Verdict::Keep);
     assert_eq!(placed.refused().refused().verdict(5, true), Verdict::Start);
-    assert_eq!(placed.accepted(), Life::Tracking(NONE));
+    assert_eq!(placed.accepted(), Life::Coasting(NONE));
 }
 
 #[test]
 fn a_track_in_doubt_is_believed_no_more_until_it_settles() {
     for life in [Life::Tracking(refused(1)), Life::Coasting(refused(1))] {
-        assert_eq!(life.settled(Certainty::Doubtful), acquiring(FRAMES_TO_TRACK, refused(1)));
+        let doubted = life.settled(Certainty::Doubtful);
+        assert_eq!(doubted, acquiring(BELIEVED_BEFORE, refused(1)));
+        assert_eq!(doubted.unseen(&away(5.0)), doubted, "it is not forgotten");
+        assert_eq!(doubted.unseen(&away(31.0)), Life::Lost);
+        let back = Circumstances { heading_doubtful: true, ..away(5.0) };
+        assert_eq!(doubted.on_sight(&back), OnSight::PlaceAnew);
     }
     assert_eq!(acquiring(FRAMES_TO_TRACK, NONE).settled(Certainty::Settled), Life::Tracking(NONE));
     assert_eq!(Certainty::of(0.2, 0.9), Certainty::Settled);

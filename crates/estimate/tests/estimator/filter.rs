@@ -86,7 +86,7 @@ pub(super) fn fly(name: &str, seconds: f64, seed: u64, change: impl FnOnce(&mut 
 }
 
 impl Flight {
-    fn rig(&self) -> &Rig {
+    pub(super) fn rig(&self) -> &Rig {
         &self.world.scenario().rig
     }
 
@@ -94,8 +94,18 @@ impl Flight {
         Estimator::new(self.rig(), &EstimatorConfig::default(), &self.site)
     }
 
-    fn outputs(&self) -> Vec<EstimatorOutput> {
-        let (mut filter, mut out) = (self.filter(), Vec::new());
+    pub(super) fn outputs(&self) -> Vec<EstimatorOutput> {
+        self.through(self.filter())
+    }
+
+    /// Through a filter of another configuration.
+    pub(super) fn outputs_as(&self, rig: &Rig, ground: Ground) -> Vec<EstimatorOutput> {
+        let site = Site { ground, ..self.site.clone() };
+        self.through(Estimator::new(rig, &EstimatorConfig::default(), &site))
+    }
+
+    fn through(&self, mut filter: Estimator) -> Vec<EstimatorOutput> {
+        let mut out = Vec::new();
         for heard in &self.heard {
             heard.give(&mut filter, &mut out);
         }
@@ -104,7 +114,7 @@ impl Flight {
     }
 }
 
-fn estimates(out: &[EstimatorOutput]) -> Vec<TargetEstimate> {
+pub(super) fn estimates(out: &[EstimatorOutput]) -> Vec<TargetEstimate> {
     out.iter().filter_map(|o| if let EstimatorOutput::Estimate(e) = o { Some(*e) } else { None }).collect()
 }
 
@@ -113,16 +123,16 @@ fn smoothed(out: &[EstimatorOutput]) -> Vec<TargetEstimate> {
 }
 
 /// RMSE of heading (rad), speed, yaw rate; NEES of the three; share of frames with a live estimate.
-#[derive(Debug)]
-struct Score {
-    heading: f64,
-    speed: f64,
-    yaw_rate: f64,
-    nees: f64,
-    coverage: f64,
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Score {
+    pub(super) heading: f64,
+    pub(super) speed: f64,
+    pub(super) yaw_rate: f64,
+    pub(super) nees: f64,
+    pub(super) coverage: f64,
 }
 
-fn score(estimates: &[TargetEstimate], world: &World, from_s: f64) -> Score {
+pub(super) fn score(estimates: &[TargetEstimate], world: &World, from_s: f64) -> Score {
     let (mut sums, mut nees, mut live, mut owed) = ([0.0; 3], 0.0, 0.0, 0.0);
     for estimate in estimates.iter().filter(|e| world.seconds(e.t_valid) >= from_s) {
         owed += 1.0;

@@ -4,5 +4,6 @@ mod blind;
 mod filter;
 mod ground;
 mod honesty;
+mod misfit;
 mod ownship;
 mod time;

@@ -95,3 +95,29 @@ fn in_a_silence_it_grows_vague_and_ends() {
     let longest = latest.t_valid - last;
     assert!((9.5..=10.0).contains(&longest.s()), "{} s", longest.s());
 }
+
+#[test]
+fn a_frame_that_is_not_taken_shows_what_is_known_of_its_time_and_nothing_later() {
+    let flight = fly("follow", 12.0, 6, |_| {});
+    let (mut filter, mut out) = (flight.filter(), Vec::new());
+    flight.heard.iter().for_each(|heard| heard.give(&mut filter, &mut out));
+    let last = flight.heard[flight.heard.len() - 1].t_recv();
+    // Stamped after its arrival by far more than clocks differ, and long before everything that is kept.
+    for off in [Span::from_s(1000.0), Span::from_s(0.5), Span::from_s(-3600.0)] {
+        let t_valid = last + off;
+        let value = FrameObservations { frame: 77, ..FrameObservations::default() };
+        out.clear();
+        filter.frame(&Stamped { t_valid, t_recv: last, seq: u64::MAX, value }, &mut out);
+        let estimates = out.iter().filter_map(|o| match o {
+            EstimatorOutput::Estimate(e) => Some((e.frame, e.t_valid)),
+            EstimatorOutput::Ownship(own) => Some((own.frame.unwrap_or(0), own.t_valid)),
+            _ => None,
+        });
+        let estimates: Vec<(u32, MonoTime)> = estimates.collect();
+        assert_eq!(estimates.len(), 2, "{off:?}: one target and the helicopter");
+        for (frame, t) in estimates {
+            assert!(frame == 77 && t <= last, "{off:?}: {t:?} after {last:?}");
+            assert!(t == t_valid || off.s() > 0.0 || t > t_valid, "{off:?}: {t:?}");
+        }
+    }
+}

@@ -28,7 +28,7 @@ fn errors(described: &str) -> [f64; 2] {
                 Sample::Attitude { stamped, .. } => filter.attitude(stamped, &mut out),
                 Sample::Frame { truth, seq } => {
                     let value = suite.observations().clone();
-                    let (t_valid, t_recv) = (exposures.exposed(truth.t_stamp), truth.t_recv);
+                    let (t_valid, t_recv) = (exposures.exposed(truth.t_stamp, truth.t_recv), truth.t_recv);
                     filter.frame(&Stamped { t_valid, t_recv, seq: *seq, value }, &mut out);
                 }
             }

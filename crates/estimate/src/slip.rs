@@ -1,0 +1,106 @@
+//! Side slip of a vehicle, fitted in flight: one that slides does not go where it points.
+//!
+//! A frame moves the vehicle's place across its heading, as seen from the helicopter, by `d`; an honest filter has
+//! `E[d²] = P⁻ − P⁺` of that place. Where it is more the walk across grows, and where it is not it falls back to what is
+//! configured: of a vehicle that rolls nothing is given away.
+
+use nalgebra::{Matrix2, Vector2};
+
+use super::blocks::own;
+use super::core::Core;
+use super::state::State;
+
+/// Time over which it is fitted, s.
+const OVER_S: f64 = 1.5;
+/// Mean of d² over what is due beyond which slip grows: what other errors of the model make.
+const LEAST_RATIO: f64 = 3.0;
+/// Most, as a factor on the walk configured.
+const MOST: f64 = 50.0;
+/// Least share of the variance that a frame must have found out.
+const LEAST_TOLD: f64 = 0.3;
+
+/// Slip of one vehicle.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub(crate) struct Slip {
+    /// Logarithm of the walk's intensity over that configured.
+    growth: f64,
+}
+
+impl Slip {
+    /// Factor on the configured intensity.
+    pub(crate) fn factor(self) -> f64 {
+        self.growth.exp()
+    }
+
+    /// Takes a frame's d² over what was due.
+    fn take(&mut self, ratio: f64, since_s: f64) {
+        if ratio.is_finite() && ratio > 0.0 {
+            // Never beyond what explains this one.
+            let step = (since_s / OVER_S * (ratio - LEAST_RATIO)).min(ratio.ln().max(0.0));
+            self.growth = (self.growth + step).clamp(0.0, 2.0 * MOST.ln());
+        }
+    }
+}
+
+/// Where a vehicle was across its heading before a frame was fused.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Across {
+    direction: Vector2<f64>,
+    from_us: Vector2<f64>,
+    var: f64,
+}
+
+impl State {
+    /// Where target `i` is across its heading.
+    pub(crate) fn across(&self, i: usize) -> Across {
+        let [north, east, heading, ..] = self.targets[i].mean;
+        let (sin, cos) = heading.sin_cos();
+        let direction = Vector2::new(-sin, cos);
+        let from_us = Vector2::new(north, east) - self.own.position.xy();
+        Across { direction, from_us, var: self.var_from_us(i, &direction) }
+    }
+
+    /// Variance of target `i`'s place, as seen from the helicopter, in a direction.
+    fn var_from_us(&self, i: usize, direction: &Vector2<f64>) -> f64 {
+        let (place, us) = (self.layout().target(i).place(), own::POSITION.part::<2>(0));
+        let both: Matrix2<f64> = self.cov.block(place, place) + self.cov.block(us, us)
+            - self.cov.block(place, us)
+            - self.cov.block(us, place);
+        direction.dot(&(both * direction))
+    }
+}
+
+impl Core {
+    /// Fits target `i`'s slip by what a frame has made of where it was; `since_s` is the time since it was seen before.
+    pub(crate) fn learn_slip(&mut self, i: usize, before: &Across, since_s: f64) {
+        if !self.learning.on || !self.models.targets[i].moves() {
+            return;
+        }
+        let found = before.var - self.state.var_from_us(i, &before.direction);
+        if found < LEAST_TOLD * before.var {
+            return;
+        }
+        let now = self.state.across(i);
+        let moved = before.direction.dot(&(now.from_us - before.from_us));
+        self.state.targets[i].slip.take(moved * moved / found, since_s.clamp(0.0, 0.2));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn slip_grows_where_a_vehicle_slides_and_falls_back() {
+        let mut slip = Slip::default();
+        // Squares that an honest filter sees: 1 on average.
+        for ratio in [0.1, 2.5, 0.3, 1.1, 0.0, 3.5, 0.2, 0.8] {
+            slip.take(ratio, 0.1);
+        }
+        assert!(slip.factor() < 1.1, "{slip:?}");
+        (0..5).for_each(|_| slip.take(100.0, 0.1));
+        assert!(slip.factor() > 1e3, "{slip:?}");
+        (0..200).for_each(|_| slip.take(1.0, 0.1));
+        assert_eq!(slip.factor(), 1.0);
+    }
+}

@@ -1,0 +1,39 @@
+//! What does not fit of the vehicles, their tags and the ground about them, as it is told.
+
+use windhover_base::msg::{FusionSource, MisfitCause};
+
+use super::core::Core;
+use super::state::State;
+
+/// Markers over which the share of those outside the gate is kept (some five seconds of two tags), and the share beyond
+/// which it is told. A flight that fits has a few in a thousand, one with 3 % of gross errors 3 %.
+const MARKERS: f64 = 100.0;
+const OUTSIDE_SHARE: f64 = 0.12;
+/// Share of the tracked features that move, beyond which it is told.
+const MOVING_SHARE: f64 = 0.2;
+
+impl Core {
+    /// What does not fit: its source, what it is, and the figure that shows it.
+    pub(crate) fn vehicle_misfits(&self) -> impl Iterator<Item = (FusionSource, MisfitCause, f64)> {
+        let state = &self.state;
+        let height =
+            state.height.placed.map(|(_, _, rise_m)| (FusionSource::Marker, MisfitCause::Height, rise_m));
+        let share = state.moving_share;
+        let moving =
+            (share > MOVING_SHARE).then_some((FusionSource::Feature, MisfitCause::MovingGround, share));
+        let turns = state.targets.iter().enumerate().filter(|(_, target)| target.spin.is_free());
+        let turns = turns.map(|(target, track)| {
+            (FusionSource::Marker, MisfitCause::TargetTurns { target }, track.spin.over_the_bound())
+        });
+        let share = state.markers_outside;
+        let outside = (share > OUTSIDE_SHARE).then_some((FusionSource::Marker, MisfitCause::Outside, share));
+        height.into_iter().chain(outside).chain(moving).chain(turns).chain(self.tag_misfits())
+    }
+}
+
+impl State {
+    /// Keeps the share of markers outside the gate.
+    pub(crate) fn note_marker(&mut self, outside: bool) {
+        self.markers_outside += (f64::from(u8::from(outside)) - self.markers_outside) / MARKERS;
+    }
+}
