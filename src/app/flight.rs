@@ -37,6 +37,9 @@ pub struct FrameArrival {
     pub bytes: usize,
 }
 
+/// Targets that are kept: a configuration has half as many at most.
+const TARGETS: usize = 64;
+
 /// A flight.
 #[derive(Clone, Debug, Default)]
 pub struct Flight {
@@ -104,7 +107,7 @@ impl Flight {
                 _ => flight.take(&item.raw),
             }
         }
-        flight.warnings = reader.take_warnings();
+        flight.warnings.extend(reader.take_warnings());
         flight.ownship.sort_by_key(|own| host_time(own.timestamp.as_ref()));
         flight.utc = flight.epochs.iter().find_map(|e| e.utc_ns).map(UtcTime::from_unix_ns);
         Ok(flight)
@@ -139,6 +142,13 @@ impl Flight {
         };
         let wanted = matches!(what, "state" | "smoothed" | "paper");
         if !wanted {
+            return;
+        }
+        if self.targets.len() >= TARGETS && !self.targets.contains_key(name) {
+            let words = format!("there are more than {TARGETS} targets: the rest is left out");
+            if !self.warnings.contains(&words) {
+                self.warnings.push(words);
+            }
             return;
         }
         let track = self.targets.entry(name.to_owned()).or_default();

@@ -10,7 +10,7 @@ use crate::io::clock::HostClock;
 use crate::pixels;
 use crate::text::counted;
 use windhover_base::msg::{GrayImage, TagFamily};
-use windhover_detect::{Detector, LARGEST_IMAGE_PX, Limits, TagDetection};
+use windhover_detect::{Detector, LARGEST_IMAGE_PX, Limits, TagDetection, TagLayout};
 
 /// Find markers in images.
 #[derive(clap::Args, Debug)]
@@ -25,6 +25,9 @@ pub(super) struct Args {
     /// Family of the tags
     #[arg(long, default_value = "36h11", value_parser = family)]
     family: TagFamily,
+    /// Width of the border, cells: 1 as AprilTags are printed, 2 as Kalibr prints them
+    #[arg(long, value_name = "CELLS", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=2))]
+    border: u8,
     /// Smallest edge of a tag's black square that is looked for, pixels
     #[arg(long, value_name = "N", default_value_t = 16.0, value_parser = min_px)]
     min_px: f64,
@@ -51,7 +54,8 @@ fn min_px(text: &str) -> Result<f64, String> {
 
 pub(super) fn run(args: &Args) -> CliResult {
     let limits = Limits { min_px: args.min_px, max_hamming: args.max_hamming };
-    let mut detector = Detector::new(&[args.family], limits);
+    let layout = TagLayout { family: args.family, border: args.border };
+    let mut detector = Detector::new(&[layout], limits);
     let mut failed = 0;
     for path in &args.images {
         let image = match read(path) {

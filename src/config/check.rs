@@ -405,6 +405,7 @@ fn check_marker(marker: &MarkerConfig) -> Result<(), ConfigError> {
             if id as usize >= family.codes() {
                 refuse("target.marker.id", format!("{} has ids 0 to {}", family.name(), family.codes() - 1))?;
             }
+            within("target.marker.border", f64::from(marker.border), 1.0, 2.0)?;
             match marker.size_m {
                 Some(size) => within("target.marker.size_m", size, 0.005, 50.0),
                 None => refuse("target.marker.size_m", "an apriltag needs the edge of its black square"),

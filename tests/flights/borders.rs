@@ -77,13 +77,18 @@ fn no_command_writes_over_what_it_reads_or_did_not_make() {
     assert_eq!(beside.count(), 0);
 }
 
-/// A flight in which a stranger named a target and gave its figures.
+/// A flight in which a stranger named targets and gave their figures.
 fn hostile(path: &Path) {
+    flight_of(path, &[("=1+1,<b>&\"", 30.0), ("nowhere", f64::NAN), ("nowhere", f64::INFINITY)]);
+}
+
+/// A flight of these targets at these latitudes.
+fn flight_of(path: &Path, targets: &[(&str, f64)]) {
     let file = std::io::BufWriter::new(std::fs::File::create(path).unwrap());
     let mut writer = mcap::Writer::new(file).unwrap();
     let schema = schema_of_package("windhover");
     let mut sequence = 0;
-    for (name, lat_deg) in [("=1+1,<b>&\"", 30.0), ("nowhere", f64::NAN), ("nowhere", f64::INFINITY)] {
+    for &(name, lat_deg) in targets {
         let schema = writer.add_schema("windhover.TargetState", "protobuf", &schema).unwrap();
         let topic = format!("/target/{name}/state");
         let channel_id = writer.add_channel(schema, &topic, "protobuf", &BTreeMap::new()).unwrap();
@@ -237,6 +242,18 @@ fn a_segment_that_is_none_is_skipped_and_told() {
         assert_eq!(words.lines().filter(|l| l.contains(bad) && l.contains("skipped")).count(), 1, "{words}");
     }
     assert!(!words.contains("._000000"), "{words}");
+}
+
+#[test]
+fn a_flight_of_a_thousand_targets_is_reported_in_part() {
+    let dir = scratch();
+    let names: Vec<String> = (0..1_000).map(|n| format!("t{n}")).collect();
+    let states: Vec<(&str, f64)> = names.iter().map(|name| (name.as_str(), 30.0)).collect();
+    flight_of(&dir.path().join("h.mcap"), &states);
+    let run = windhover(&["report", "h.mcap"], dir.path());
+    assert!(run.status.success(), "{}", said(&run));
+    let page = std::fs::read_to_string(dir.path().join("report.html")).unwrap();
+    assert!(page.contains("more than 64 targets") && page.len() < 20_000_000, "{} bytes", page.len());
 }
 
 #[test]

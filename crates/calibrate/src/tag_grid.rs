@@ -4,7 +4,7 @@ use nalgebra::Vector2;
 
 use super::zhang::{PlaneView, homography};
 use windhover_base::msg::{ImageView, TagFamily};
-use windhover_detect::{Detector, Limits, TagDetection};
+use windhover_detect::{Detector, Limits, TagDetection, TagLayout};
 
 /// Smallest edge of a tag that is used, pixels: corners of smaller ones are too rough.
 const LEAST_PX: f64 = 14.0;
@@ -51,6 +51,9 @@ impl TagGrid {
     /// The corners of every tag seen, with their places on the sheet (x right, y down, origin at the
     /// first corner of the tag at top left). A part of the grid will do.
     ///
+    /// Borders of one cell and of two, as Kalibr prints them, are both looked for: of a sheet that was printed with
+    /// either, more is seen with its own.
+    ///
     /// Numbers may count from the top row down or, as Kalibr prints them, from the bottom row up:
     /// whichever the image agrees with is taken.
     ///
@@ -58,8 +61,11 @@ impl TagGrid {
     /// Where too few tags of the grid are seen, or they do not lie as on this grid.
     pub fn find(&self, image: ImageView<'_>) -> Result<PlaneView, TagGridError> {
         let limits = Limits { min_px: LEAST_PX, max_hamming: 1 };
-        let mut detector = Detector::new(&[self.family], limits);
-        let seen = detector.detect(image);
+        let [narrow, wide] = [1, 2].map(|border| {
+            let layout = TagLayout { family: self.family, border };
+            Detector::new(&[layout], limits).detect(image).to_vec()
+        });
+        let seen = if wide.len() > narrow.len() { wide } else { narrow };
         let wanted = self.columns * self.rows;
         let tags: Vec<(usize, [Vector2<f64>; 4])> = seen.iter().filter_map(|m| self.tag_of(m)).collect();
         let mut numbers: Vec<usize> = tags.iter().map(|t| t.0).collect();

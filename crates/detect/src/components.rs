@@ -101,12 +101,35 @@ impl Marks {
         m.ended as usize + (m.ends & ((1 << (u & 63)) - 1)).count_ones() as usize
     }
 
+    /// Runs that end at column `u` or before.
+    #[inline(always)]
+    fn ended_by(row: &[Self], u: u16) -> usize {
+        let m = &row[usize::from(u >> 6)];
+        m.ended as usize + (m.ends & (u64::MAX >> (63 - (u & 63)))).count_ones() as usize
+    }
+
+    /// Runs that start before column `u`.
+    #[inline(always)]
+    fn started_before(row: &[Self], u: u16) -> usize {
+        let m = &row[usize::from(u >> 6)];
+        m.started as usize + (m.starts & ((1 << (u & 63)) - 1)).count_ones() as usize
+    }
+
     /// Runs that start at column `u` or before.
     #[inline(always)]
     fn started_by(row: &[Self], u: u16) -> usize {
         let m = &row[usize::from(u >> 6)];
         m.started as usize + (m.starts & (u64::MAX >> (63 - (u & 63)))).count_ones() as usize
     }
+}
+
+/// By what pixels of one component touch.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Touch {
+    /// By a side: two squares that touch by a corner are two.
+    Sides,
+    /// By a side or a corner: a thin border seen aslant holds together by corners.
+    Corners,
 }
 
 /// Labels bitmaps; keeps its buffers.
@@ -132,10 +155,13 @@ pub(super) struct Labeller {
 }
 
 impl Labeller {
-    /// Finds the components of a bitmap (pixels that touch by a side or a corner) and outlines those that
-    /// `keep` accepts. Bitmaps are less than 65 000 pixels wide and high.
-    pub fn label(&mut self, bits: &Bitmap, simd: Simd, keep: impl Fn(&Component) -> bool) {
-        simd.run(FindRuns { labeller: self, bits });
+    /// Finds the components of a bitmap and outlines those that `keep` accepts. Bitmaps are less than 65 000 pixels
+    /// wide and high.
+    pub fn label(&mut self, bits: &Bitmap, touch: Touch, simd: Simd, keep: impl Fn(&Component) -> bool) {
+        match touch {
+            Touch::Sides => simd.run(FindRuns::<false> { labeller: self, bits }),
+            Touch::Corners => simd.run(FindRuns::<true> { labeller: self, bits }),
+        }
         self.gather(keep);
         simd.run(FindOutlines { labeller: self, words: bits.width.div_ceil(64) });
     }
@@ -152,7 +178,7 @@ impl Labeller {
 
     /// Splits rows into runs and labels them by what they touch in the row above.
     #[inline(always)]
-    fn find_runs(&mut self, bits: &Bitmap) {
+    fn find_runs<const BY_CORNERS: bool>(&mut self, bits: &Bitmap) {
         self.rows.clear();
         // One more than there are words: a run may end just behind the last.
         let marks = bits.width.div_ceil(64) + 1;
@@ -162,8 +188,14 @@ impl Labeller {
         (self.count, self.joined) = (0, 0);
         for v in 0..bits.height {
             self.rows.push(first as u32);
-            let after = first + self.split_row(bits.row(v), first, (v + 1) * marks);
-            self.label_row(above, first..after, v as u16, v * marks..(v + 1) * marks);
+            let words = bits.row(v);
+            if words.iter().fold(0, |any, word| any | word) == 0 {
+                self.marks[(v + 1) * marks..(v + 2) * marks].fill(Marks::default());
+                above = first;
+                continue;
+            }
+            let after = first + self.split_row(words, first, (v + 1) * marks);
+            self.label_row::<BY_CORNERS>(above, first..after, v as u16, v * marks..(v + 1) * marks);
             (above, first) = (first, after);
         }
         for &(a, b) in &self.joins[..self.joined] {
@@ -217,7 +249,13 @@ impl Labeller {
     /// Labels the runs of a row; those of the row above start at `above` and have these marks. Nothing branches
     /// on what a run touches, save where it touches three or more.
     #[inline(always)]
-    fn label_row(&mut self, above: usize, row: Range<usize>, v: u16, marks: Range<usize>) {
+    fn label_row<const BY_CORNERS: bool>(
+        &mut self,
+        above: usize,
+        row: Range<usize>,
+        v: u16,
+        marks: Range<usize>,
+    ) {
         let marks = &self.marks[marks];
         // One more than there can be: what is too much is written over.
         let most = row.end + 1;
@@ -232,9 +270,12 @@ impl Labeller {
         let (parents, sums) = (&mut self.parents[..most], &mut self.sums[..most]);
         let joins = &mut self.joins[..most];
         for (run, k) in runs.iter().zip(row.start - above..) {
-            // Runs touch by corners too: one above may end where this starts, or start where it ends.
-            let from = Marks::ended_before(marks, run.start);
-            let to = Marks::started_by(marks, run.end);
+            // By a corner touch one above that ends where this starts, and one that starts where it ends.
+            let (from, to) = if BY_CORNERS {
+                (Marks::ended_before(marks, run.start), Marks::started_by(marks, run.end))
+            } else {
+                (Marks::ended_by(marks, run.start), Marks::started_before(marks, run.end))
+            };
             let is_new = from >= to;
             parents[count] = count as u32;
             sums[count] = Sums::from_row(v);
@@ -298,15 +339,15 @@ impl Labeller {
 }
 
 /// `Labeller::find_runs`, with the instructions this processor has.
-struct FindRuns<'a> {
+struct FindRuns<'a, const BY_CORNERS: bool> {
     labeller: &'a mut Labeller,
     bits: &'a Bitmap,
 }
 
-impl Kernel for FindRuns<'_> {
+impl<const BY_CORNERS: bool> Kernel for FindRuns<'_, BY_CORNERS> {
     #[inline(always)]
     fn run(self) {
-        self.labeller.find_runs(self.bits);
+        self.labeller.find_runs::<BY_CORNERS>(self.bits);
     }
 }
 
@@ -330,7 +371,7 @@ mod tests {
     use super::*;
 
     /// Flood fill, the plain way.
-    fn flooded(bits: &Bitmap) -> Vec<Component> {
+    fn flooded(bits: &Bitmap, touch: Touch) -> Vec<Component> {
         let dark = |u: usize, v: usize| bits.row(v)[u / 64] >> (u % 64) & 1 == 1;
         let mut seen = vec![false; bits.width * bits.height];
         let mut found = Vec::new();
@@ -348,7 +389,8 @@ mod tests {
                 c.merge(&pixel);
                 for nv in v.saturating_sub(1)..(v + 2).min(bits.height) {
                     for nu in u.saturating_sub(1)..(u + 2).min(bits.width) {
-                        if dark(nu, nv) && !seen[nv * bits.width + nu] {
+                        let is_near = touch == Touch::Corners || nu == u || nv == v;
+                        if is_near && dark(nu, nv) && !seen[nv * bits.width + nu] {
                             seen[nv * bits.width + nu] = true;
                             stack.push((nu, nv));
                         }
@@ -375,16 +417,18 @@ mod tests {
                 .collect();
             let bits = Bitmap::from_pixels(width, height, &dark);
             let mut labeller = Labeller::default();
-            labeller.label(&bits, Simd::best(), |_| true);
-            let mut labelled: Vec<Component> = labeller.kept().map(|(c, _)| Component { runs: 0, ..*c }).collect();
-            let mut expected = flooded(&bits);
-            let key = |c: &Component| (c.top, c.left, c.bottom, c.right, c.area);
-            labelled.sort_by_key(key);
-            expected.sort_by_key(key);
-            prop_assert_eq!(labelled, expected);
-            for (c, outline) in labeller.kept() {
-                prop_assert_eq!(outline.iter().map(|lr| lr.0).min(), Some(c.left));
-                prop_assert_eq!(outline.iter().map(|lr| lr.1).max(), Some(c.right));
+            for touch in [Touch::Sides, Touch::Corners] {
+                labeller.label(&bits, touch, Simd::best(), |_| true);
+                let found = labeller.kept().map(|(c, _)| Component { runs: 0, ..*c });
+                let (mut labelled, mut expected): (Vec<Component>, _) = (found.collect(), flooded(&bits, touch));
+                let key = |c: &Component| (c.top, c.left, c.bottom, c.right, c.area);
+                labelled.sort_by_key(key);
+                expected.sort_by_key(key);
+                prop_assert_eq!(labelled, expected);
+                for (c, outline) in labeller.kept() {
+                    prop_assert_eq!(outline.iter().map(|lr| lr.0).min(), Some(c.left));
+                    prop_assert_eq!(outline.iter().map(|lr| lr.1).max(), Some(c.right));
+                }
             }
         }
     }

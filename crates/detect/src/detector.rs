@@ -1,13 +1,13 @@
 //! The tag detector: from an image to tags with their corners.
 
 use super::binarise::{Binariser, Bitmap, Where};
-use super::components::Labeller;
+use super::components::{Labeller, Touch};
 use super::detection::TagDetection;
 use super::edges::{EdgeSearch, fit_sides};
-use super::family::{Family, Word};
+use super::family::{Family, TagLayout, Word};
 use super::noise::noise_sigma;
 use super::payload;
-use super::pyramid::{Base, Level, Pyramid};
+use super::pyramid::{Base, Level, Pyramid, Rim};
 use super::quad::{Quad, QuadFinder, SizeLimits, distance, looks_like_tag, may_be_border, polygon_area};
 use super::refine::Refiner;
 use super::roi::Roi;
@@ -30,6 +30,8 @@ pub struct Detector {
     finder: QuadFinder,
     refiner: Refiner,
     found: Vec<Found>,
+    /// Levels and quadrilaterals that were read.
+    tried: Vec<(usize, Quad)>,
     detections: Vec<TagDetection>,
     negative: GrayImage,
     /// Of a frame pixel, grey levels.
@@ -64,6 +66,22 @@ struct Found {
     refined: Refined,
 }
 
+/// How regions of a level are looked at once more, those that touch by a corner alone taken apart.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+enum Look {
+    /// Not at all.
+    Whole,
+    /// At the highest division: ground with a tag here and there.
+    Ground,
+    /// At every division: sheets of tags that touch each other's corners.
+    Print,
+    /// The same, and whole regions too, where lower divisions were left out because there is so much of it.
+    BusyPrint,
+}
+
+/// Most levels of an image that are searched.
+const MOST_SEARCHED: usize = 3;
+
 /// Where between the local minimum and maximum dark and light are divided, of 256. Low keeps a border whole
 /// where a shadow's edge crosses the tag; a second time higher up for borders that are blurred, which the
 /// coarser levels can afford, and small tags need in the finest. In the coarser ones a third time lower still:
@@ -72,18 +90,42 @@ const FRACTIONS_ONCE: [u16; 1] = [85];
 const FRACTIONS_TWICE: [u16; 2] = [72, 116];
 const FRACTIONS_THRICE: [u16; 3] = [40, 72, 116];
 
+/// And where white is over-exposed: it spreads into the border from both sides and leaves little of it dark.
+const FRACTION_SATURATED: u16 = 195;
+
 /// Smallest edge in a level at which a border can be told from its surroundings, pixels.
 const LEAST_EDGE_IN_LEVEL: f32 = 12.0;
+
+/// Where weak contrast is divided.
+const FRACTION_DIM: u16 = 100;
+
+/// Pixels of a level for each run of dark ones from which it is looked at for contrast that is weaker than that of
+/// print in clear air, where there is such too. In the finest level it is not: weak tags beside clear contrast are found
+/// from twice the least size on.
+const AREA_OF_RUN: usize = 20;
+
+/// The same by the share of a level that has such contrast, which is known before pixels are marked.
+const MOST_DIM: f32 = 0.25;
+
+/// Least step across a side, as a share of the light outside it, in clear air.
+const CLEAR_STEP: f32 = 0.1;
+
+/// Least contrast that is looked at where an image has hardly any noise, grey levels: in clear air, and at all.
+const CLEAR_GATE: f32 = 12.0;
+const LEAST_GATE: f32 = 6.0;
+
+/// Farthest that corners of two quadrilaterals may be from each other to be read alike, pixels of a level.
+const SAME_QUAD: f32 = 0.3;
 
 /// Largest image, pixels on a side.
 pub const LARGEST_IMAGE_PX: usize = 32_767;
 
 impl Detector {
-    /// A detector of tags of these families.
-    pub fn new(families: &[TagFamily], limits: Limits) -> Self {
+    /// A detector of tags of these families, or of these families with these borders.
+    pub fn new<L: Into<TagLayout> + Copy>(layouts: &[L], limits: Limits) -> Self {
         let Limits { min_px, max_hamming } = limits;
         Self {
-            families: families.iter().map(|&f| Family::new(f, max_hamming)).collect(),
+            families: layouts.iter().map(|&l| Family::new(l.into(), max_hamming)).collect(),
             min_px: min_px as f32,
             simd: Simd::best(),
             pyramid: Pyramid::default(),
@@ -93,6 +135,7 @@ impl Detector {
             finder: QuadFinder::default(),
             refiner: Refiner::new(Simd::best()),
             found: Vec::new(),
+            tried: Vec::new(),
             detections: Vec::new(),
             negative: GrayImage::default(),
             noise: 0.0,
@@ -111,7 +154,7 @@ impl Detector {
 
     /// Every tag found in a part of an image, in coordinates of the whole image.
     pub fn detect_roi(&mut self, image: ImageView<'_>, roi: Roi) -> &[TagDetection] {
-        self.search_all(image.crop(roi.u, roi.v, roi.width, roi.height));
+        self.search_all(image.crop(roi.u, roi.v, roi.width, roi.height), Rim::LeftOut);
         let origin = Vector2::new(roi.u as f64, roi.v as f64);
         self.detections.iter_mut().for_each(|found| *found = found.moved(origin));
         &self.detections
@@ -119,11 +162,11 @@ impl Detector {
 
     /// Every tag found in an image, each once. Images with a side over [`LARGEST_IMAGE_PX`] are not searched.
     pub fn detect(&mut self, image: ImageView<'_>) -> &[TagDetection] {
-        self.search_all(image);
+        self.search_all(image, Rim::Kept);
         &self.detections
     }
 
-    fn search_all(&mut self, image: ImageView<'_>) {
+    fn search_all(&mut self, image: ImageView<'_>, rim: Rim) {
         self.found.clear();
         self.detections.clear();
         let sides = [image.width, image.height];
@@ -131,19 +174,19 @@ impl Detector {
             return;
         }
         if self.families.iter().any(|f| !f.inverted) {
-            self.search(image, false);
+            self.search(image, rim, false);
         }
         if self.families.iter().any(|f| f.inverted) {
             let mut negative = std::mem::take(&mut self.negative);
             negate(image, &mut negative);
-            self.search(negative.view(), true);
+            self.search(negative.view(), rim, true);
             self.negative = negative;
         }
         self.detections.extend(self.found.iter().map(detection));
     }
 
     /// Searches an image, or its negative for the families whose border is light.
-    fn search(&mut self, image: ImageView<'_>, inverted: bool) {
+    fn search(&mut self, image: ImageView<'_>, rim: Rim, inverted: bool) {
         let base = if self.min_px >= LEAST_EDGE_IN_LEVEL * 2.0 {
             Base::Half
         } else if self.min_px >= LEAST_EDGE_IN_LEVEL * 1.3 {
@@ -151,58 +194,156 @@ impl Detector {
         } else {
             Base::Full
         };
-        self.pyramid.build(image, base, 16, self.simd);
+        self.pyramid.build(image, base, rim, 16, self.simd);
         self.noise = noise_sigma(image);
         let first = usize::from(base != Base::Full).min(self.pyramid.len() - 1);
-        let last = (first + 2).min(self.pyramid.len() - 1);
-        for n in (first..=last).rev() {
-            let fractions: &[u16] = match (n == first, base) {
+        let last = (first + MOST_SEARCHED - 1).min(self.pyramid.len() - 1);
+        let fractions = |n: usize| -> &[u16] {
+            match (n == first, base) {
                 (true, Base::Half) => &FRACTIONS_ONCE,
                 (true, _) => &FRACTIONS_TWICE,
                 (false, _) => &FRACTIONS_THRICE,
-            };
-            self.search_level(image, n, fractions, inverted);
+            }
+        };
+        self.tried.clear();
+        let mut looks = [Look::Whole; MOST_SEARCHED];
+        for n in (first..=last).rev() {
+            looks[n - first] = self.search_level(image, n, fractions(n), n == first, inverted);
+        }
+        // What touches others by a corner comes last: what is found without needs no second look. While tracking a region
+        // is foretold, and has to be searched fast.
+        if rim == Rim::LeftOut {
+            return;
+        }
+        for n in (first..=last).rev() {
+            self.search_parts(image, n, fractions(n), looks[n - first], inverted);
         }
     }
 
-    fn search_level(&mut self, image: ImageView<'_>, n: usize, fractions: &[u16], inverted: bool) {
+    /// Looks for tags in a level; how their parts are to be looked at afterwards.
+    fn search_level(
+        &mut self,
+        image: ImageView<'_>,
+        n: usize,
+        fractions: &[u16],
+        finest: bool,
+        inverted: bool,
+    ) -> Look {
+        self.measure(image, n, inverted);
+        let (is_busy, highest) = (self.binariser.is_busy(), fractions.last().copied());
+        for &fraction in fractions {
+            let is_lower = is_busy && Some(fraction) != highest;
+            let at = if is_lower { Where::LightChanges } else { Where::Everywhere };
+            self.search_division(image, n, (fraction, at, Touch::Corners), inverted);
+        }
+        if self.binariser.is_saturated() {
+            let division = (FRACTION_SATURATED, Where::Saturated, Touch::Corners);
+            self.search_division(image, n, division, inverted);
+        }
+        let most_dim = match (self.binariser.is_hazy(), finest) {
+            (true, _) => 1.0,
+            (false, false) => MOST_DIM,
+            (false, true) => 0.0,
+        };
+        if (f32::MIN_POSITIVE..=most_dim).contains(&self.binariser.dim_share()) {
+            self.search_division(image, n, (FRACTION_DIM, Where::AboveNoise, Touch::Corners), inverted);
+        }
+        match self.binariser.is_print() {
+            true if is_busy => Look::BusyPrint,
+            true => Look::Print,
+            false if !is_busy && !finest => Look::Ground,
+            false => Look::Whole,
+        }
+    }
+
+    /// Looks for tags among what is left of regions when those that touch by a corner alone are taken apart.
+    fn search_parts(
+        &mut self,
+        image: ImageView<'_>,
+        n: usize,
+        fractions: &[u16],
+        look: Look,
+        inverted: bool,
+    ) {
+        if look == Look::Whole {
+            return;
+        }
+        self.measure(image, n, inverted);
+        // Higher up borders are thick, and hold together by their sides.
+        let from = if look == Look::Ground { fractions.len() - 1 } else { 0 };
+        for &fraction in &fractions[from..] {
+            let at = Where::Everywhere;
+            self.search_division(image, n, (fraction, at, Touch::Sides), inverted);
+            if look == Look::BusyPrint {
+                self.search_regions(image, n, at, Touch::Corners, inverted);
+            }
+        }
+    }
+
+    fn measure(&mut self, image: ImageView<'_>, n: usize, inverted: bool) {
         let level = self.pyramid.level(image, n);
+        // Noise alone spans some five sigmas in the 144 pixels of a neighbourhood.
+        let gate = (7.0 * self.noise / level.scale).clamp(LEAST_GATE, 60.0) as u8;
+        self.binariser.measure(level.image, (gate, gate.max(CLEAR_GATE as u8)), inverted, self.simd);
+    }
+
+    /// Looks for tags among the dark regions that one division into dark and light makes of a level.
+    fn search_division(
+        &mut self,
+        image: ImageView<'_>,
+        n: usize,
+        (fraction, at, touch): (u16, Where, Touch),
+        inverted: bool,
+    ) {
+        let level = self.pyramid.level(image, n).image;
+        self.binariser.mark(level, fraction, at, &mut self.bits, self.simd);
+        let is_dim = at == Where::AboveNoise && !self.binariser.is_hazy();
+        if is_dim && self.bits.runs() * AREA_OF_RUN > level.width * level.height {
+            return;
+        }
+        self.search_regions(image, n, at, touch, inverted);
+    }
+
+    /// Looks for tags among the marked regions of a level.
+    fn search_regions(&mut self, image: ImageView<'_>, n: usize, at: Where, touch: Touch, inverted: bool) {
+        let Self { pyramid, bits, labeller, finder, refiner, found, tried, families, noise, .. } = self;
+        let level = pyramid.level(image, n);
         let limits = SizeLimits { least: (self.min_px / level.scale).max(8.0), most: f32::MAX };
         let (width, height) = (level.image.width, level.image.height);
-        // Noise alone spans some five sigmas in the 144 pixels of a neighbourhood.
-        let gate = (7.0 * self.noise / level.scale).clamp(12.0, 60.0) as u8;
-        self.binariser.measure(level.image, gate, self.simd);
-        for &fraction in fractions {
-            let is_highest = Some(&fraction) == fractions.last();
-            let at =
-                if self.binariser.is_busy() && !is_highest { Where::LightChanges } else { Where::Everywhere };
-            self.binariser.mark(level.image, fraction, at, &mut self.bits, self.simd);
-            self.labeller.label(&self.bits, self.simd, |c| may_be_border(c, limits, width, height));
-            for (component, outline) in self.labeller.kept() {
-                let Some(quad) = self.finder.quad(component, outline, limits) else { continue };
-                let in_frame = quad.map(|p| p.map(|c| level.to_frame(c)));
-                if self.found.iter().any(|f| same_place(&f.corners, &in_frame)) {
-                    continue;
-                }
-                let Some(straight) = straighten(level, &quad, gate) else { continue };
-                // Of a small tag a side may be drawn to what is beside it: then as it was.
-                let found = [straight, in_frame].iter().find_map(|quad| {
-                    let mut families = self.families.iter().filter(|f| f.inverted == inverted);
-                    families.find_map(|f| decode(image, &self.pyramid, quad, f, &mut self.refiner))
-                });
-                self.found.extend(found);
+        labeller.label(bits, touch, self.simd, |c| may_be_border(c, limits, width, height));
+        let (least_gate, least_share) =
+            if at == Where::AboveNoise { (LEAST_GATE, 0.0) } else { (CLEAR_GATE, CLEAR_STEP) };
+        let gate = (7.0 * *noise / level.scale).clamp(least_gate, 60.0) as u8;
+        for (component, outline) in labeller.kept() {
+            let Some(quad) = finder.quad(component, outline, limits) else { continue };
+            let in_frame = quad.map(|p| p.map(|c| level.to_frame(c)));
+            if found.iter().any(|f| same_place(&f.corners, &in_frame)) {
+                continue;
             }
+            let is_again =
+                |t: &(usize, Quad)| t.0 == n && (0..4).all(|i| distance(t.1[i], quad[i]) < SAME_QUAD);
+            if tried.iter().any(is_again) {
+                continue;
+            }
+            let Some(straight) = straighten(level, &quad, gate, least_share) else { continue };
+            tried.push((n, quad));
+            // Of a small tag a side may be drawn to what is beside it: then as it was.
+            let tag = [straight, in_frame].iter().find_map(|quad| {
+                let mut families = families.iter().filter(|f| f.inverted == inverted);
+                families.find_map(|f| decode(image, pyramid, quad, f, refiner))
+            });
+            found.extend(tag);
         }
     }
 }
 
 /// A quadrilateral of a level, in frame coordinates, with its sides fitted to the image; `None` where the
 /// image does not step from dark to light along them.
-fn straighten(level: Level<'_>, quad: &Quad, gate: u8) -> Option<Quad> {
+fn straighten(level: Level<'_>, quad: &Quad, gate: u8, least_share: f32) -> Option<Quad> {
     // Seen aslant, a cell is narrower one way than the other.
     let narrow = polygon_area(quad) / longest_edge(quad).max(1.0);
     let least_step = f32::from(gate) / 3.0;
-    if !looks_like_tag(level.image, quad, (narrow / 16.0).clamp(0.8, 4.0), least_step) {
+    if !looks_like_tag(level.image, quad, (narrow / 16.0).clamp(0.8, 4.0), least_step, least_share) {
         return None;
     }
     let search = EdgeSearch { reach: (narrow / 8.0).clamp(1.0, 3.0), least_step };
@@ -230,7 +371,13 @@ fn decode(
     let reading = payload::read(image, pyramid, quad, family)?;
     let word = reading.word;
     let corners: Quad = std::array::from_fn(|i| quad[(i + word.turns) % 4]);
-    let refined = refiner.refine(image, &corners, family, word.id).unwrap_or_else(|| unrefined(&corners));
+    let refined = refiner
+        .refine(image, &corners, family, word.id, reading.is_over_exposed)
+        .unwrap_or_else(|| unrefined(&corners));
+    let fitted = refined.corners.map(|c| [c.x as f32, c.y as f32]);
+    if !payload::agrees(image, pyramid, &fitted, family, word.id) {
+        return None;
+    }
     Some(Found { family: family.family, word, margin: reading.margin, corners, refined })
 }
 

@@ -4,7 +4,7 @@
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
 use super::binarise::{Binariser, Bitmap, Where};
-use super::components::{Component, Labeller, Outline};
+use super::components::{Component, Labeller, Outline, Touch};
 use super::quad::bilinear;
 use super::simd::Simd;
 use windhover_base::msg::ImageView;
@@ -61,7 +61,7 @@ impl DiscFinder {
             return;
         }
         let least = sizes.0.max(LEAST_DIAMETER);
-        self.binariser.measure(image, LEAST_STEP, self.simd);
+        self.binariser.measure(image, (LEAST_STEP, LEAST_STEP), false, self.simd);
         self.binariser.mark(image, 128, Where::Everywhere, &mut self.bits, self.simd);
         let (width, height) = (image.width, image.height);
         let keep = |c: &Component| {
@@ -75,7 +75,7 @@ impl DiscFinder {
                 && w.min(h) <= sizes.1 + 2.0
                 && w.min(h) >= LEAST_AXES * 0.9 * w.max(h)
         };
-        self.labeller.label(&self.bits, self.simd, keep);
+        self.labeller.label(&self.bits, Touch::Corners, self.simd, keep);
         for (component, outline) in self.labeller.kept() {
             if let Some(rough) = ellipse_of(component, outline)
                 && let Some(blob) = refine(image, &rough)

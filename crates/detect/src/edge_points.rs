@@ -5,9 +5,9 @@ use super::quad::Point;
 use super::simd::Kernel;
 use windhover_base::msg::ImageView;
 
-/// Of a tag's model: a homography, a bow, a barrel, a twist and what neighbouring cells do to edges along ξ and
-/// along η.
-pub(super) const PARAMETERS: usize = 15;
+/// Of a tag's model: a homography, a bow, a barrel, a twist, what neighbouring cells do to edges along ξ and along η,
+/// and by how much light spreads.
+pub(super) const PARAMETERS: usize = 16;
 
 /// How many edges are dealt with side by side, in loops that a compiler turns into vector instructions.
 pub(super) const LANES: usize = 16;
@@ -49,6 +49,8 @@ pub(super) struct NarrowModel {
     pub theta: [f32; PARAMETERS],
     pub sides: [Point; 2],
     pub origin: Point,
+    /// 1 where light spreads from white cells, else 0.
+    pub spreads: f32,
 }
 
 /// Edge points in the image: pixels, normals from dark to light, what the parameters do along those.
@@ -111,7 +113,8 @@ impl NarrowModel {
             let narrow = points[lane].narrow;
             (rows[11][lane], rows[12][lane]) = (even * n[0] - odd * n[1], -odd * n[0] - even * n[1]);
             (rows[13][lane], rows[14][lane]) = (narrow * lx, narrow * ly);
-            to.shift[lane] = narrow * (lx * t[13] + ly * t[14]);
+            rows[15][lane] = -self.spreads;
+            to.shift[lane] = narrow * (lx * t[13] + ly * t[14]) - t[15];
         }
     }
 }

@@ -7,6 +7,22 @@
 
 use windhover_base::msg::{FamilySpec, TagFamily};
 
+/// How a tag is printed: its family, and how many cells wide its border is.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub struct TagLayout {
+    /// Family of the code words.
+    pub family: TagFamily,
+    /// Width of the border, cells: 1 as the families' authors print it, 2 as Kalibr does. The corners are those of the
+    /// border's outer square in either case.
+    pub border: u8,
+}
+
+impl From<TagFamily> for TagLayout {
+    fn from(family: TagFamily) -> Self {
+        Self { family, border: 1 }
+    }
+}
+
 /// What a grid of bits was recognised as.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) struct Word {
@@ -18,12 +34,21 @@ pub(super) struct Word {
     pub turns: usize,
 }
 
+/// A cell of a tag and whether it is light.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Cell {
+    /// Of the code word.
+    Data(bool),
+    /// Of the border, or of the ring around it.
+    Frame(bool),
+}
+
 /// One family, ready for lookup.
 #[derive(Clone, Debug)]
 pub(super) struct Family {
     /// Which.
     pub family: TagFamily,
-    /// Border cells on a side.
+    /// Cells on a side of the border's outer square.
     pub width: usize,
     /// Cells sampled around the border: 1, or 2 where data lie outside.
     pub pad: usize,
@@ -39,9 +64,12 @@ pub(super) struct Family {
 
 impl Family {
     /// The tables of a family; `max_hamming` is cut to what the family allows.
-    pub fn new(family: TagFamily, max_hamming: u8) -> Self {
-        let &FamilySpec { border: width, pad, inverted, correctable: limit, codes, .. } = family.spec();
-        let cells = data_cells(width, pad);
+    pub fn new(layout: TagLayout, max_hamming: u8) -> Self {
+        let TagLayout { family, border } = layout;
+        let &FamilySpec { border: square, pad, inverted, correctable: limit, codes, .. } = family.spec();
+        let border = usize::from(border.max(1));
+        let width = square + 2 * (border - 1);
+        let cells = data_cells(width, pad, border as i32);
         let turned = std::array::from_fn(|turns| {
             cells.iter().map(|&cell| grid_index(turn(cell, width, turns), width, pad)).collect()
         });
@@ -61,19 +89,28 @@ impl Family {
         bit != self.inverted
     }
 
+    /// Most wrong bits that are corrected.
+    pub fn max_hamming(&self) -> u8 {
+        self.index.max_hamming
+    }
+
+    /// What cell (x, y) of the sampled grid of tag `id` is in the (possibly inverted) image.
+    pub fn cell(&self, id: u32, x: i32, y: i32) -> Cell {
+        let w = self.width as i32;
+        match self.cells.iter().position(|&c| c == (x, y)) {
+            Some(cell) => Cell::Data(self.bit(id, cell)),
+            None => Cell::Frame(!((0..w).contains(&x) && (0..w).contains(&y))),
+        }
+    }
+
     /// Whether cell (x, y) of tag `id` is light in the (possibly inverted) image: data, border (dark) or the
     /// ring around it (light). `None` beyond the ring, where it is not known.
     pub fn is_light(&self, id: u32, x: i32, y: i32) -> Option<bool> {
         let w = self.width as i32;
-        let inside = |margin: i32| (margin..w - margin).contains(&x) && (margin..w - margin).contains(&y);
-        if !inside(-1) {
-            return None;
-        }
-        if inside(1) {
-            let cell = self.cells.iter().position(|&c| c == (x, y))?;
-            return Some(self.bit(id, cell));
-        }
-        Some(!inside(0))
+        let is_known = (-1..=w).contains(&x) && (-1..=w).contains(&y);
+        is_known.then(|| match self.cell(id, x, y) {
+            Cell::Data(light) | Cell::Frame(light) => light,
+        })
     }
 
     /// The word nearest to a grid of bits (`grid_side²`, row by row, true for white), if any is near
@@ -93,14 +130,14 @@ impl Family {
     }
 }
 
-/// Data cells row by row: all inside the border ring, and the outermost ring where `pad` is 2.
-fn data_cells(width: usize, pad: usize) -> Vec<(i32, i32)> {
+/// Data cells row by row: all inside the border, and the outermost ring where `pad` is 2.
+fn data_cells(width: usize, pad: usize, border: i32) -> Vec<(i32, i32)> {
     let (w, p) = (width as i32, pad as i32);
     let mut cells = Vec::new();
     for y in -p..w + p {
         for x in -p..w + p {
             let inside = |margin: i32| (margin..w - margin).contains(&x) && (margin..w - margin).contains(&y);
-            if inside(1) || (p == 2 && !inside(-1)) {
+            if inside(border) || (p == 2 && !inside(-1)) {
                 cells.push((x, y));
             }
         }
@@ -197,7 +234,7 @@ mod tests {
     #[test]
     fn every_word_is_found_in_every_turn() {
         for family in TagFamily::ALL {
-            let table = Family::new(family, 3);
+            let table = Family::new(family.into(), 3);
             assert_eq!(table.codes.len(), family.codes());
             for id in 0..family.codes() as u32 {
                 for turns in 0..4 {
@@ -210,7 +247,7 @@ mod tests {
 
     #[test]
     fn wrong_bits_are_corrected_up_to_the_limit() {
-        let table = Family::new(TagFamily::Tag36h11, 2);
+        let table = Family::new(TagFamily::Tag36h11.into(), 2);
         for wrong in [[3usize, 17], [0, 35], [11, 12]] {
             let mut grid = grid_of(&table, 42, 1);
             for w in wrong {
@@ -232,7 +269,7 @@ mod tests {
             (TagFamily::Tag16h5, 5),
             (TagFamily::Tag41h12, 12),
         ] {
-            let codes = Family::new(family, 0).codes;
+            let codes = Family::new(family.into(), 0).codes;
             let nearest = (0..codes.len().min(400))
                 .flat_map(|i| (i + 1..codes.len()).map(move |j| (codes[i] ^ codes[j]).count_ones()))
                 .min();

@@ -7,7 +7,7 @@ use nalgebra::Vector2;
 
 use super::corners::{Corner, Corners};
 use super::flow::Flow;
-use super::pyramid::{Base, Pyramid};
+use super::pyramid::{Base, Pyramid, Rim};
 use super::simd::Simd;
 use super::template::{Template, Warp};
 use windhover_base::msg::{FeatureTrack, ImageView};
@@ -106,7 +106,7 @@ impl FeatureTracker {
             return;
         }
         std::mem::swap(&mut self.pyramid, &mut self.before);
-        self.pyramid.build(image, Base::Half, 32, self.simd);
+        self.pyramid.build(image, Base::Half, Rim::LeftOut, 32, self.simd);
         if self.size == (image.width, image.height) {
             self.follow(image, off.occupied);
         } else {

@@ -33,6 +33,7 @@ mod windows;
 
 pub use detection::TagDetection;
 pub use detector::{Detector, LARGEST_IMAGE_PX, Limits};
+pub use family::TagLayout;
 pub use pattern::{TagPattern, tag_pattern};
 pub use pose::{TagPose, TagPoses, tag_poses};
 pub use roi::Roi;

@@ -1,7 +1,6 @@
 //! What a tag looks like in print.
 
-use super::family::Family;
-use windhover_base::msg::TagFamily;
+use super::family::{Family, TagLayout};
 
 /// A tag as printed: white and black cells, the ring around its border included.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -24,21 +23,20 @@ impl TagPattern {
     }
 }
 
-/// The print of a tag as AprilRobotics draws it.
+/// The print of a tag: of a family as its authors draw it, or of a layout with another border.
 ///
 /// # Panics
 /// Where the family has no tag of this number.
-pub fn tag_pattern(family: TagFamily, id: u32) -> TagPattern {
-    let tables = Family::new(family, 0);
+pub fn tag_pattern(layout: impl Into<TagLayout>, id: u32) -> TagPattern {
+    let tables = Family::new(layout.into(), 0);
     let (side, pad) = (tables.grid_side(), tables.pad as i32);
     let last = tables.width as i32 - 1;
     let mut white: Vec<bool> = (0..side * side)
         .map(|i| {
             let (x, y) = ((i % side) as i32 - pad, (i / side) as i32 - pad);
-            let on_border =
-                (0..=last).contains(&x) && (0..=last).contains(&y) && (x.min(y) == 0 || x.max(y) == last);
             // The border is black in a white ring, or white in a black one.
-            on_border == tables.inverted
+            let in_square = (0..=last).contains(&x) && (0..=last).contains(&y);
+            in_square == tables.inverted
         })
         .collect();
     for (cell, (x, y)) in tables.cells.iter().enumerate() {
@@ -50,6 +48,7 @@ pub fn tag_pattern(family: TagFamily, id: u32) -> TagPattern {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use windhover_base::msg::TagFamily;
 
     #[test]
     fn borders_and_rings_have_their_colours() {

@@ -1,13 +1,13 @@
 //! What a quadrilateral says: its cells sampled, told white from black, and looked up.
 
-use super::family::{Family, Word};
+use super::family::{Cell, Family, Word};
 use super::homography::{Homography, narrow, wide};
 use super::pyramid::Pyramid;
-use super::quad::{Quad, bilinear, distance};
+use super::quad::{Quad, bilinear, distance, polygon_area};
 use windhover_base::msg::ImageView;
 
-/// Largest grid side: tag36h11 with its ring.
-const MOST: usize = 10;
+/// Largest grid side: tag36h11 with a border of two cells and its ring.
+const MOST: usize = 12;
 
 /// A word read from a quadrilateral.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -15,10 +15,15 @@ pub(super) struct Reading {
     pub word: Word,
     /// Mean distance of the cells from the threshold, of the white or the black ones, whichever is less.
     pub margin: f32,
+    /// Whether most white cells are as light as a pixel can be: light spreads from them over the black ones.
+    pub is_over_exposed: bool,
 }
 
+/// From where on a cell is as light as a pixel can be, grey levels.
+const OVER_EXPOSED: f32 = 250.0;
+
 /// Least step from black border to white ring, grey levels.
-const LEAST_CONTRAST: f32 = 8.0;
+const LEAST_CONTRAST: f32 = 5.0;
 
 /// Share of border and ring cells that may lie on the wrong side of the threshold.
 const MOST_WRONG_BORDER: f32 = 0.2;
@@ -33,9 +38,9 @@ struct Grid {
 impl Grid {
     fn sample(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family: &Family) -> Option<Self> {
         let h = Homography::of_square(family.width as f64, &wide(quad))?;
-        let edge = (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).sum::<f32>() / 4.0;
-        // Averaging over the cell: the level in which a cell is two to four pixels wide.
-        let cell = edge / family.width as f32;
+        let longest = (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).fold(1.0, f32::max);
+        // Averaging over the cell: the level in which a cell is two to four pixels wide, seen aslant the narrow way.
+        let cell = polygon_area(quad) / longest / family.width as f32;
         let level = pyramid.for_size(image, cell, 2.0);
         let (side, pad) = (family.grid_side(), family.pad);
         let mut values = [0.0; MOST * MOST];
@@ -211,8 +216,43 @@ impl Grid {
             sum.1 += 1.0f32;
         }
         let mean = |s: (f32, f32)| s.0 / s.1.max(1.0);
-        Some(Reading { word, margin: mean(white).min(mean(black)) })
+        let lights = (0..cells).filter(|&i| bits[i]);
+        let saturated = lights.filter(|&i| self.values[i] >= OVER_EXPOSED).count() as f32;
+        let is_over_exposed = saturated > 0.5 * white.1;
+        Some(Reading { word, margin: mean(white).min(mean(black)), is_over_exposed })
     }
+
+    /// Whether the cells are those of tag `id`, as nearly as they must be to be read.
+    fn agrees(&self, thresholds: &[f32; MOST * MOST], family: &Family, id: u32) -> bool {
+        let (mut wrong_data, mut wrong, mut all) = (0, 0.0, 0.0);
+        for i in 0..self.side * self.side {
+            let [x, y] = [i % self.side, i / self.side].map(|c| c as i32 - self.pad as i32);
+            let is_light = self.values[i] > thresholds[i];
+            match family.cell(id, x, y) {
+                Cell::Data(light) => wrong_data += u8::from(light != is_light),
+                Cell::Frame(light) => {
+                    wrong += f32::from(u8::from(light != is_light));
+                    all += 1.0;
+                }
+            }
+        }
+        wrong_data <= family.max_hamming() && wrong <= MOST_WRONG_BORDER * all
+    }
+}
+
+/// Whether a quadrilateral in the tag's own order holds tag `id`: what `read` says of a candidate, asked once more of
+/// what was made of it. A fit that took hold of other edges than the tag's fails here: the border of two cells that
+/// Kalibr prints has another square inside, without light around it.
+pub(super) fn agrees(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family: &Family, id: u32) -> bool {
+    let Some(grid) = Grid::sample(image, pyramid, quad, family) else { return false };
+    let Some(plane) = grid.plane_threshold() else { return false };
+    if grid.agrees(&plane, family, id) || grid.sharpened().agrees(&plane, family, id) {
+        return true;
+    }
+    let border = grid.border_levels();
+    grid.is_shaded(&border)
+        && (grid.halves_threshold(&border).is_some_and(|t| grid.agrees(&t, family, id))
+            || grid.agrees(&grid.blended_threshold(&border), family, id))
 }
 
 /// Reads a quadrilateral given in frame coordinates. Illumination is tried as a plane, then as lit and shaded

@@ -17,6 +17,15 @@ pub(super) enum Base {
     Half,
 }
 
+/// What becomes of a last row or column that does not fill a pixel of the next level.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Rim {
+    /// It is left out: all pixels are means of what is in the frame.
+    LeftOut,
+    /// It is repeated: all of the frame is there.
+    Kept,
+}
+
 /// An image and how many frame pixels are one of its own.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(super) struct Level<'a> {
@@ -48,13 +57,17 @@ const MOST_LEVELS: usize = 8;
 
 impl Pyramid {
     /// Builds as many levels as leave at least `least` pixels on the shorter side.
-    pub fn build(&mut self, image: ImageView<'_>, base: Base, least: usize, simd: Simd) {
+    pub fn build(&mut self, image: ImageView<'_>, base: Base, rim: Rim, least: usize, simd: Simd) {
         self.scales.clear();
         let mut scale = 1.0;
         let (mut width, mut height) = (image.width, image.height);
         for n in 0..MOST_LEVELS {
             let first_by_thirds = n == 0 && base == Base::TwoThirds;
-            let reduced = |size: usize| if first_by_thirds { size / 3 * 2 } else { size / 2 };
+            let (block, to) = if first_by_thirds { (3, 2) } else { (2, 1) };
+            let reduced = |size: usize| match rim {
+                Rim::LeftOut => size / block * to,
+                Rim::Kept => size.div_ceil(block) * to,
+            };
             if reduced(width).min(reduced(height)) < least.max(1) {
                 break;
             }
@@ -97,18 +110,32 @@ impl Pyramid {
     }
 }
 
-/// Averages 2×2 blocks, halves rounded up; an odd last row or column is left out.
+/// Averages 2×2 blocks, halves rounded up; beyond an odd last row or column it is repeated.
 fn halve(from: ImageView<'_>, to: &mut GrayImage, simd: Simd) {
-    for (v, row) in to.data.chunks_exact_mut(to.width).enumerate() {
-        simd.halve_rows(from.row(2 * v), from.row(2 * v + 1), row);
+    let width = to.width;
+    for (v, row) in to.data.chunks_exact_mut(width).enumerate() {
+        let rows = [2 * v, 2 * v + 1].map(|v| from.row(v.min(from.height - 1)));
+        let whole = from.width / 2;
+        simd.halve_rows(rows[0], rows[1], &mut row[..whole]);
+        if whole < width {
+            let [above, below] = rows.map(|row| [row[from.width - 1]; 2]);
+            simd.halve_rows(&above, &below, &mut row[whole..]);
+        }
     }
 }
 
-/// Averages blocks of 3/2×3/2; what is left over on the right and below is left out.
+/// Averages blocks of 3/2×3/2; beyond what is left over on the right and below the last pixel is repeated.
 fn two_thirds(from: ImageView<'_>, to: &mut GrayImage, simd: Simd) {
-    for (k, rows) in to.data.chunks_exact_mut(2 * to.width).enumerate() {
-        let (first, second) = rows.split_at_mut(to.width);
-        simd.two_thirds_rows([from.row(3 * k), from.row(3 * k + 1), from.row(3 * k + 2)], [first, second]);
+    let (whole, width) = (from.width / 3, to.width);
+    for (k, rows) in to.data.chunks_exact_mut(2 * width).enumerate() {
+        let (first, second) = rows.split_at_mut(width);
+        let rows = [3 * k, 3 * k + 1, 3 * k + 2].map(|v| from.row(v.min(from.height - 1)));
+        simd.two_thirds_rows(rows, [&mut first[..2 * whole], &mut second[..2 * whole]]);
+        if 2 * whole < width {
+            let last = rows.map(|row| [0, 1, 2].map(|u| row[(3 * whole + u).min(from.width - 1)]));
+            let last = last.each_ref().map(|row| &row[..]);
+            simd.two_thirds_rows(last, [&mut first[2 * whole..], &mut second[2 * whole..]]);
+        }
     }
 }
 
@@ -118,14 +145,14 @@ mod tests {
 
     #[test]
     fn a_ramp_keeps_its_place() {
-        let ramp = GrayImage::from_vec(60, 12, (0..720).map(|i| (i % 60 * 4) as u8).collect()).expect("size");
+        let ramp = GrayImage::from_vec(61, 13, (0..793).map(|i| (i % 61 * 4) as u8).collect()).expect("size");
         for (base, scales) in [
             (Base::Half, vec![1.0, 2.0, 4.0]),
             (Base::TwoThirds, vec![1.0, 1.5, 3.0]),
             (Base::Full, vec![1.0, 2.0, 4.0]),
         ] {
             let mut pyramid = Pyramid::default();
-            pyramid.build(ramp.view(), base, 3, Simd::best());
+            pyramid.build(ramp.view(), base, Rim::Kept, 4, Simd::best());
             assert_eq!(
                 (0..pyramid.len()).map(|n| pyramid.level(ramp.view(), n).scale).collect::<Vec<_>>(),
                 scales
@@ -133,8 +160,12 @@ mod tests {
             for n in 0..pyramid.len() {
                 let level = pyramid.level(ramp.view(), n);
                 for u in 0..level.image.width {
-                    let expected = 4.0 * level.to_frame(u as f32);
-                    assert!((f32::from(level.image.row(0)[u]) - expected).abs() <= 1.0);
+                    // Beyond the frame its last pixel is repeated.
+                    let expected = (4.0 * level.to_frame(u as f32)).min(240.0);
+                    assert!(
+                        (f32::from(level.image.row(0)[u]) - expected).abs()
+                            <= if u + 2 < level.image.width { 1.0 } else { 6.0 }
+                    );
                     assert!((level.of_frame(level.to_frame(u as f32)) - u as f32).abs() < 1e-5);
                 }
             }
@@ -146,7 +177,7 @@ mod tests {
         for (width, height) in [(1, 1), (1, 90), (3, 3)] {
             for base in [Base::Full, Base::TwoThirds, Base::Half] {
                 let mut pyramid = Pyramid::default();
-                pyramid.build(GrayImage::new(width, height).view(), base, 4, Simd::best());
+                pyramid.build(GrayImage::new(width, height).view(), base, Rim::Kept, 4, Simd::best());
                 assert_eq!(pyramid.len(), 1);
             }
         }

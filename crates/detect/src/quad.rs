@@ -18,8 +18,11 @@ pub(super) struct SizeLimits {
     pub most: f32,
 }
 
-/// Shortest side over longest at which a square is still read: 70° off its normal, and blur.
-const LEAST_ASPECT: f32 = 0.25;
+/// Shortest side over longest at which a square is still read: 80° off its normal, and blur.
+const LEAST_ASPECT: f32 = 0.13;
+
+/// Narrowest way across a border, pixels of a level, that still counts however large the least edge: seen aslant.
+const LEAST_SHORT: f32 = 5.0;
 
 /// Largest share of its hull that a border with the dark cells it holds together covers.
 const MOST_FILL: f32 = 0.93;
@@ -35,7 +38,8 @@ pub(super) fn may_be_border(c: &Component, limits: SizeLimits, width: usize, hei
     // A square's box is 1 to √2 of its edge; blur and threshold may eat a pixel. A tag of the least size
     // seen aslant is shorter one way and longer the other.
     let size_fits = long + 1.0 >= limits.least && short <= 1.5 * limits.most;
-    let shape_fits = short + 1.0 >= 0.55 * limits.least && short >= 0.6 * LEAST_ASPECT * long;
+    let is_wide = short + 1.0 >= 0.55 * limits.least || (short >= LEAST_SHORT && long >= 1.6 * limits.least);
+    let shape_fits = is_wide && short >= 0.6 * LEAST_ASPECT * long;
     // A border is a quarter to a half of its tag; of a large one only a rim is dark against what is near.
     let area = c.area as f32;
     let fill_fits = area >= (0.17 * w * h).min(2.0 * (w + h)) && area <= MOST_FILL * w * h;
@@ -253,21 +257,27 @@ pub(super) fn corners_of(lines: &[Line; 4]) -> Option<Quad> {
 }
 
 /// Whether a quadrilateral looks like a tag at a glance: 13 of 16 pairs of pixels across its sides are darker
-/// inside, by `least_step` and by a tenth of what the outer one is, and among 36 pixels further in some are
+/// inside, by `least_step` and by `least_share` of what the outer one is, and among 36 pixels further in some are
 /// about as light as outside and some about as dark as the border.
 ///
 /// `reach` is how far inside and outside the side the pairs lie, pixels.
-pub(super) fn looks_like_tag(image: ImageView<'_>, quad: &Quad, reach: f32, least_step: f32) -> bool {
+pub(super) fn looks_like_tag(
+    image: ImageView<'_>,
+    quad: &Quad,
+    reach: f32,
+    least_step: f32,
+    least_share: f32,
+) -> bool {
     let (mut wrong, mut dark, mut light) = (0, 0.0, 0.0);
     for i in 0..4 {
         let (a, b) = (quad[i], quad[(i + 1) % 4]);
         let n = Line::through(a, b).n;
         for t in [0.2, 0.4, 0.6, 0.8] {
             let at = [a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])];
-            let pixel = |d: f32| nearest(image, [at[0] + d * n[0], at[1] + d * n[1]]);
-            let (Some(inside), Some(outside)) = (pixel(-reach), pixel(reach)) else { return false };
-            let (inside, outside) = (f32::from(inside), f32::from(outside));
-            wrong += u32::from(outside - inside < least_step.max(0.1 * outside));
+            // At the image's rim the last pixel stands for what is beyond it.
+            let pixel = |d: f32| f32::from(nearest_inside(image, [at[0] + d * n[0], at[1] + d * n[1]]));
+            let (inside, outside) = (pixel(-reach), pixel(reach));
+            wrong += u32::from(outside - inside < least_step.max(least_share * outside));
             dark += inside / 16.0;
             light += outside / 16.0;
         }
@@ -284,28 +294,24 @@ pub(super) fn looks_like_tag(image: ImageView<'_>, quad: &Quad, reach: f32, leas
                 (quad[0][c] + x * (quad[1][c] - quad[0][c]), quad[3][c] + x * (quad[2][c] - quad[3][c]));
             top + y * (bottom - top)
         };
-        let value = nearest(image, [mix(0), mix(1)]).map_or(0.0, f32::from);
+        let value = f32::from(nearest_inside(image, [mix(0), mix(1)]));
         lights += u32::from(value > high);
         darks += u32::from(value < low);
     }
     lights >= 4 && darks >= 4
 }
 
-fn nearest(image: ImageView<'_>, [u, v]: Point) -> Option<u8> {
-    let (u, v) = (u + 0.5, v + 0.5);
-    (u >= 0.0 && v >= 0.0 && (u as usize) < image.width && (v as usize) < image.height)
-        .then(|| image.data[v as usize * image.stride + u as usize])
+/// The pixel nearest to a place, which is clamped to the image.
+fn nearest_inside(image: ImageView<'_>, [u, v]: Point) -> u8 {
+    let (u, v) = ((u + 0.5).max(0.0) as usize, (v + 0.5).max(0.0) as usize);
+    image.data[v.min(image.height - 1) * image.stride + u.min(image.width - 1)]
 }
 
 /// Bilinear pixel value; coordinates are clamped to the image.
 #[inline]
 pub(super) fn bilinear(image: ImageView<'_>, [u, v]: Point) -> f32 {
     if image.width < 2 || image.height < 2 {
-        return nearest(
-            image,
-            [u.clamp(0.0, (image.width - 1) as f32), v.clamp(0.0, (image.height - 1) as f32)],
-        )
-        .map_or(0.0, f32::from);
+        return f32::from(nearest_inside(image, [u, v]));
     }
     let (u, v) = (u.clamp(0.0, (image.width - 1) as f32), v.clamp(0.0, (image.height - 1) as f32));
     let (iu, iv) = ((u as usize).min(image.width - 2), (v as usize).min(image.height - 2));

@@ -9,7 +9,8 @@
 //! makes up every quadratic. a and b are half the tag's sides in the image over their mean length, so that the bow c
 //! and the barrel k change nothing at a square's corners; all are held near nought by what a wide lens does. Beside a
 //! cell that is one wide, blur lets an edge appear nearer the other cell; by how much is one more unknown for edges
-//! along ξ and one for those along η. Gauss–Newton on distances along edge normals, each weighed by how well its edge
+//! along ξ and one for those along η. Where white is over-exposed, light spreads from every light cell over its dark
+//! neighbours: all edges are nearer the dark by the last unknown. Gauss–Newton on distances along edge normals, each weighed by how well its edge
 //! is placed, Cauchy's weights on top.
 
 use nalgebra::{Cholesky, Const, Vector2};
@@ -44,6 +45,10 @@ const TAKEN_UP: f64 = 0.375;
 
 /// Most that a neighbouring cell's nearness shifts an edge, in cells: what the shift is held near nought by.
 const NARROW_SHIFT: f64 = 0.1;
+
+/// How far light spreads over the edges of cells, in cells, where white is over-exposed or ink has run: held near
+/// nought by this.
+const SPREAD: f64 = 0.1;
 
 /// Error that neighbouring cells leave on all edges of one direction alike, their shift being fitted: pixels, at a
 /// blur of one pixel and one pixel a cell (it grows with the square of the blur and falls with the cube of the cell),
@@ -84,17 +89,18 @@ impl Refiner {
     }
 
     /// Refines corners given in the tag's own order; `None` where too few edges are seen or the fit leaves
-    /// what was given.
+    /// what was given. Where white `spreads`, by how much is fitted too.
     pub fn refine(
         &mut self,
         image: ImageView<'_>,
         corners: &Quad,
         family: &Family,
         id: u32,
+        spreads: bool,
     ) -> Option<Refined> {
         let edge = (0..4).map(|i| distance(corners[i], corners[(i + 1) % 4])).sum::<f32>() / 4.0;
         let cell = f64::from(edge) / family.width as f64;
-        let mut model = Model::of_corners(corners)?;
+        let mut model = Model::of_corners(corners, spreads)?;
         self.edges.place(family, id, cell);
         let held = held(0.5 * f64::from(edge), cell);
         let (covariance, windows) = self.fit(image, &mut model, family.width, held)?;
@@ -281,7 +287,7 @@ impl Refiner {
 fn held(half: f64, cell: f64) -> [f64; HELD] {
     let (bow, barrel) = (LENS_CURVATURE * half.powi(2) / 2.0, LENS_BARREL * half.powi(3));
     let (twist, shift) = (LENS_TWIST * half.powi(2), NARROW_SHIFT * cell);
-    [bow, bow, barrel, twist, twist, shift, shift]
+    [bow, bow, barrel, twist, twist, shift, shift, SPREAD * cell]
 }
 
 /// One step of the fit.

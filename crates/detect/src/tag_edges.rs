@@ -7,7 +7,7 @@ use super::family::Family;
 const BLOCK: usize = 2;
 
 /// Blocks of the largest grid.
-pub(super) const MOST_BLOCKS: usize = 32;
+pub(super) const MOST_BLOCKS: usize = 64;
 
 /// How far the ground beside a tag is from the light of its ring towards the dark of its border: most ground
 /// reflects a fifth to a half of the light, paper 85 %, ink 7 %.

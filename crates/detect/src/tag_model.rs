@@ -22,7 +22,8 @@ pub(super) struct Refined {
 /// What stays of an edge's error when noise is averaged away: sampling, neighbouring cells, print. Pixels.
 pub(super) const FLOOR_PX: f64 = 0.02;
 
-/// Homography in ξ, η (row by row, last entry 1), the bow, the barrel, the twist and the shifts of edges.
+/// Homography in ξ, η (row by row, last entry 1), the bow, the barrel, the twist, the shifts of edges and
+/// the spread of light.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Model {
     pub theta: Row,
@@ -30,10 +31,12 @@ pub(super) struct Model {
     sides: [Vector2<f64>; 2],
     /// Of the pixels meant here: near the tag, so that the parameters are of one size.
     origin: Vector2<f64>,
+    /// Whether light spreads from white cells.
+    spreads: bool,
 }
 
 impl Model {
-    pub fn of_corners(corners: &Quad) -> Option<Self> {
+    pub fn of_corners(corners: &Quad, spreads: bool) -> Option<Self> {
         let origin = [0, 1].map(|k| corners.iter().map(|p| f64::from(p[k])).sum::<f64>() / 4.0);
         let wide = corners.map(|p| [f64::from(p[0]) - origin[0], f64::from(p[1]) - origin[1]]);
         // A square from 0 to 2, moved by one.
@@ -50,7 +53,7 @@ impl Model {
         let side = |a: usize, b: usize| Vector2::new(wide[b][0] - wide[a][0], wide[b][1] - wide[a][1]);
         let sides = [side(0, 1) + side(3, 2), side(0, 3) + side(1, 2)];
         let length = (0.5 * (sides[0].norm_squared() + sides[1].norm_squared())).sqrt();
-        Some(Self { theta, sides: sides.map(|s| s / length.max(1e-9)), origin: origin.into() })
+        Some(Self { theta, sides: sides.map(|s| s / length.max(1e-9)), origin: origin.into(), spreads })
     }
 
     /// How far a corner is from where another model has it, at most.
@@ -71,8 +74,8 @@ impl Model {
         let p = Vector2::new(u, v) + (Vector2::new(t[8], t[9]) + q * t[10]) * far + twist;
         #[rustfmt::skip]
         let jacobian = SMatrix::<f64, 2, PARAMETERS>::from_row_slice(&[
-            xi * w, eta * w, w, 0.0, 0.0, 0.0, -u * xi * w, -u * eta * w, far, 0.0, far * q.x, even, -odd, 0.0, 0.0,
-            0.0, 0.0, 0.0, xi * w, eta * w, w, -v * xi * w, -v * eta * w, 0.0, far, far * q.y, -odd, -even, 0.0, 0.0,
+            xi * w, eta * w, w, 0.0, 0.0, 0.0, -u * xi * w, -u * eta * w, far, 0.0, far * q.x, even, -odd, 0.0, 0.0, 0.0,
+            0.0, 0.0, 0.0, xi * w, eta * w, w, -v * xi * w, -v * eta * w, 0.0, far, far * q.y, -odd, -even, 0.0, 0.0, 0.0,
         ]);
         (p, jacobian)
     }
@@ -82,6 +85,7 @@ impl Model {
             theta: std::array::from_fn(|i| self.theta[i] as f32),
             sides: self.sides.map(|a| [a.x as f32, a.y as f32]),
             origin: [self.origin.x as f32, self.origin.y as f32],
+            spreads: f32::from(u8::from(self.spreads)),
         }
     }
 
@@ -99,7 +103,7 @@ impl Model {
     /// By how much blur lets edges beside cells that are one wide appear nearer the other cell, of edges crossed along
     /// ξ (0) or η (1), pixels.
     pub fn shift(&self, axis: usize) -> f64 {
-        self.theta[PARAMETERS - 2 + axis]
+        self.theta[13 + axis]
     }
 
     /// Corners and centre with their covariances; `common` are variances that all edges crossed along ξ and all those

@@ -5,10 +5,10 @@
 
 use super::detector::{Detector, Limits};
 use super::disc_pairs::DiscPairs;
+use super::family::TagLayout;
 use super::features::{Circle, FeatureTracker, Obstacles};
 use super::roi::Roi;
 use windhover_base::geo::CameraModel;
-use windhover_base::msg::TagFamily;
 use windhover_base::msg::{
     FrameObservations, FramePrediction, ImageView, MarkerDetection, MarkerId, MarkerPrediction, RgbImage,
 };
@@ -44,16 +44,16 @@ pub struct FrameDetector {
 impl FrameDetector {
     /// For the markers of `targets`, seen through `lens`.
     pub fn new(detector: &DetectorConfig, targets: &[TargetConfig], lens: &CameraModel) -> Self {
-        let mut families: Vec<TagFamily> = targets
+        let mut layouts: Vec<TagLayout> = targets
             .iter()
             .flat_map(|t| &t.marker)
             .filter(|m| m.kind == MarkerKind::Apriltag)
-            .filter_map(|m| m.family)
+            .filter_map(|m| Some(TagLayout { family: m.family?, border: m.border }))
             .collect();
-        families.sort_unstable();
-        families.dedup();
+        layouts.sort_unstable();
+        layouts.dedup();
         let limits = Limits { min_px: detector.min_px, max_hamming: detector.max_hamming };
-        let tags = (!families.is_empty()).then(|| Detector::new(&families, limits));
+        let tags = (!layouts.is_empty()).then(|| Detector::new(&layouts, limits));
         Self {
             tags,
             min_px: detector.min_px,

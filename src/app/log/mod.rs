@@ -86,11 +86,11 @@ pub fn start(config: &LogConfig, clock: HostClock) -> (Log, LogEnd) {
     (log.clone(), LogEnd { log, _ends: ends })
 }
 
-/// Starts the log of a command for people: words alone, on standard error.
+/// Starts the log of a command for people: words alone, on standard error, and throttled: strangers make some of them.
 pub fn start_plain(clock: HostClock) -> LogEnd {
     let (queue, end) = queue("stderr", Stream::Error);
     let sink = Sink { format: Format::Plain, way: Way::Queue(queue.clone()), clock };
-    let level = install(vec![sink], LogLevel::Info, None);
+    let level = install(vec![sink], LogLevel::Info, Some(Throttle::new(clock)));
     LogEnd { log: Log { level, reopen: Arc::default(), queues: vec![queue], clock }, _ends: vec![end] }
 }
 

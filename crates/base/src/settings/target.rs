@@ -46,7 +46,10 @@ pub struct MarkerConfig {
     /// Identity of a tag.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub id: Option<u32>,
-    /// Edge of a tag's black square, metres.
+    /// Width of a tag's border, cells: 1 as the families' authors print it, 2 as Kalibr does.
+    #[serde(default = "one_cell", skip_serializing_if = "is_one_cell")]
+    pub border: u8,
+    /// Edge of a tag's black square, its whole border included, metres.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub size_m: Option<f64>,
     /// Diameter of a disc, metres.
@@ -63,6 +66,15 @@ pub struct MarkerConfig {
     /// Where the top of the printed tag points, degrees clockwise from vehicle forward.
     #[serde(default)]
     pub yaw_deg: f64,
+}
+
+fn one_cell() -> u8 {
+    1
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde hands over references")]
+fn is_one_cell(border: &u8) -> bool {
+    *border == 1
 }
 
 /// Kinds of marker.

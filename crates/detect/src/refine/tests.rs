@@ -92,7 +92,7 @@ struct Tally {
 impl Tally {
     /// Refines tags 0 to 15 of a family from corners off by up to a fifth of a cell.
     fn of(cell: f64, blur: f64, noise: f64) -> Self {
-        let family = Family::new(TagFamily::Tag36h11, 2);
+        let family = Family::new(TagFamily::Tag36h11.into(), 2);
         let mut refiner = Refiner::new(Simd::best());
         let mut rng = ChaCha8Rng::seed_from_u64((cell * 100.0 + blur * 10_000.0) as u64);
         let mut tally = Self::default();
@@ -106,12 +106,12 @@ impl Tally {
             };
             let given =
                 sample.corners.map(|p| [p.x, p.y].map(|x| (x + cell * rng.random_range(-0.2..0.2)) as f32));
-            let Some(refined) = refiner.refine(image, &given, &family, id) else {
+            let Some(refined) = refiner.refine(image, &given, &family, id, false) else {
                 tally.refused += 1;
                 continue;
             };
             tally.add(&refiner, &refined, &sample);
-            let mut model = Model::of_corners(&given).expect("a square");
+            let mut model = Model::of_corners(&given, false).expect("a square");
             let held = held(0.5 * cell * family.width as f64, cell);
             let (_, windows) = refiner.fit(image, &mut model, family.width, held).expect("it was refined");
             tally.blur2 += 0.5 * windows.blurs_squared().iter().sum::<f64>();

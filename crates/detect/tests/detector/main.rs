@@ -2,4 +2,5 @@
 
 mod common;
 mod discs;
+mod faults;
 mod tags;

@@ -4,7 +4,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::super::company::Looks;
 use windhover_base::settings::{Brightness, MarkerConfig, MarkerKind, TargetConfig};
-use windhover_detect::{TagPattern, tag_pattern};
+use windhover_detect::{TagLayout, TagPattern, tag_pattern};
 
 /// Grey levels of printed white and black, of a body, its windscreen and its sides in full light.
 const WHITE: f32 = 222.0;
@@ -222,7 +222,9 @@ impl Plate {
         let (s, c) = (marker.yaw_deg.to_radians() as f32).sin_cos();
         let half = 0.5 * marker.size_m.or(marker.diameter_m).unwrap_or(0.0) as f32;
         let face = match (marker.kind, marker.family, marker.id) {
-            (MarkerKind::Apriltag, Some(family), Some(id)) => Face::Tag(tag_pattern(family, id)),
+            (MarkerKind::Apriltag, Some(family), Some(id)) => {
+                Face::Tag(tag_pattern(TagLayout { family, border: marker.border }, id))
+            }
             _ => Face::Disc(disc_level(marker)),
         };
         Self { centre, top: (c, s), half, face }
