@@ -172,7 +172,7 @@ mod tests {
         let (mut clock, mut stamp) = (FrameClock::default(), MonoTime::from_ns(1 << 60));
         for frame in 0..400 {
             let apart_ms = 150.0 + 80.0 * Distribution::<f64>::sample(&StandardNormal, &mut rng);
-            stamp = stamp + Span::from_ms(apart_ms.max(20.0));
+            stamp += Span::from_ms(apart_ms.max(20.0));
             assert_eq!(clock.exposed(stamp, stamp), stamp, "frame {frame}");
         }
     }
