@@ -237,3 +237,99 @@ impl AutopilotLink<'_> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use mavlink::dialects::development::*;
+    use tokio::sync::mpsc;
+
+    use super::*;
+    use crate::io::mavlink::packet::{Sender, Signature};
+
+    const SENDER: Sender = Sender { system: 1, component: 1 };
+
+    fn heartbeat() -> MavMessage {
+        MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+            mavtype: MavType::MAV_TYPE_HELICOPTER,
+            autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+            ..HEARTBEAT_DATA::DEFAULT
+        })
+    }
+
+    /// What the task reports of these datagrams, and what it sends within a moment.
+    async fn served(key: Option<SigningKey>, datagrams: Vec<Vec<u8>>) -> (Vec<Report>, Vec<MavlinkFrame>) {
+        let port = UdpSocket::bind("127.0.0.1:0").await.expect("a port").local_addr().expect("an address");
+        let autopilot = UdpSocket::bind("127.0.0.1:0").await.expect("a socket");
+        let settings = AutopilotSettings {
+            reached: Reached::Udp(port.to_string()),
+            system_id: None,
+            configure: false,
+            key,
+            signing_link_id: 1,
+        };
+        let (sender, mut told) = mpsc::unbounded_channel();
+        let reports = move |report| drop(sender.send(report));
+        let outgoing = ToAutopilot::default();
+        let flying = async {
+            for datagram in datagrams {
+                tokio::time::sleep(Duration::from_millis(100)).await;
+                autopilot.send_to(&datagram, port).await.expect("sent");
+            }
+            tokio::time::sleep(Duration::from_millis(100)).await;
+            outgoing.send(b"to the autopilot");
+            let (mut frames, mut all, mut buffer) = (MavlinkFrames::default(), Vec::new(), [0; 512]);
+            let wait = Duration::from_millis(1_500);
+            while let Ok(Ok(count)) = tokio::time::timeout(wait, autopilot.recv(&mut buffer)).await {
+                frames.push(&buffer[..count], &mut all);
+                if all.len() >= 2 {
+                    break;
+                }
+            }
+            all
+        };
+        let clock = HostClock::start();
+        let heard = tokio::select! {
+            never = run(&settings, &outgoing, clock, &reports) => match never {},
+            heard = flying => heard,
+        };
+        let mut all = Vec::new();
+        while let Ok(report) = told.try_recv() {
+            if !matches!(report, Report::Beat) {
+                all.push(report);
+            }
+        }
+        (all, heard)
+    }
+
+    fn bytes(reports: &[Report]) -> Vec<Vec<u8>> {
+        let of =
+            |report: &Report| if let Report::Bytes(_, bytes) = report { Some(bytes.clone()) } else { None };
+        reports.iter().filter_map(of).collect()
+    }
+
+    #[tokio::test]
+    async fn what_is_heard_goes_on_as_it_came_and_its_time_is_asked_for() {
+        let beat = packet::encode(0, SENDER, &heartbeat(), None);
+        let (reports, heard) = served(None, vec![beat.clone()]).await;
+        assert_eq!(bytes(&reports), [beat]);
+        assert!(
+            heard.iter().any(|frame| matches!(&frame.message, MavMessage::TIMESYNC(sync) if sync.tc1 == 0))
+        );
+        assert!(heard.iter().all(|frame| (frame.system, frame.component) == (1, 191)));
+    }
+
+    #[tokio::test]
+    async fn with_a_key_only_what_is_signed_with_it_is_heard() {
+        let (key, wrong) = (SigningKey([1; 32]), SigningKey([2; 32]));
+        let signed = |key, time_stamp| {
+            let signature = Signature { key, link_id: 0, time_stamp };
+            packet::encode(0, SENDER, &heartbeat(), Some(signature))
+        };
+        let good = signed(&key, 1);
+        let sent = vec![packet::encode(0, SENDER, &heartbeat(), None), signed(&wrong, 1), good.clone()];
+        let (reports, _) = served(Some(key), sent).await;
+        assert_eq!(bytes(&reports), [good]);
+        let refused = |report: &&Report| matches!(report, Report::Note(NoteKind::Autopilot, _, words) if words.contains("not signed"));
+        assert_eq!(reports.iter().filter(refused).count(), 2);
+    }
+}

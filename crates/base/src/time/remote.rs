@@ -48,7 +48,7 @@ pub struct RemoteClock {
 
 impl RemoteClock {
     /// A message that says `remote` was heard at `t`. False where that cannot be: the clock jumped, which is believed
-    /// when it is said [`BELIEVED`] times in a row.
+    /// when it is said three times in a row.
     pub fn heard(&mut self, remote: Span, t: MonoTime) -> bool {
         self.now = t;
         if self.has_jumped(remote, t) {

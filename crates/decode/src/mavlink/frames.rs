@@ -115,8 +115,11 @@ fn first(rest: &[u8]) -> Found {
     };
     if MavMessage::default_message_from_id(id).is_none() {
         // Its checksum cannot be computed: what follows tells whether it was a frame.
-        let followed = rest.get(length).is_none_or(|next| MAGIC.contains(next));
-        return if followed { Found::Unknown(length) } else { Found::Noise(None) };
+        return match rest.get(length) {
+            None => Found::Part,
+            Some(next) if MAGIC.contains(next) => Found::Unknown(length),
+            Some(_) => Found::Noise(None),
+        };
     }
     let checksum = u16::from_le_bytes([rest[body], rest[body + 1]]);
     if calculate_crc(&rest[1..body], MavMessage::extra_crc(id)) != checksum {
