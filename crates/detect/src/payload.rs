@@ -31,6 +31,9 @@ const MOST_WRONG_BORDER: f32 = 0.2;
 const MOST_WRONG_OF_FEW: f32 = 0.04;
 const FEW_BITS: usize = 20;
 
+/// And how far every cell of theirs must be from the threshold, over the mean.
+const CLEAR_OF_FEW: f32 = 0.45;
+
 fn most_wrong(family: &Family) -> f32 {
     if family.cells.len() < FEW_BITS { MOST_WRONG_OF_FEW } else { MOST_WRONG_BORDER }
 }
@@ -223,6 +226,11 @@ impl Grid {
             sum.1 += 1.0f32;
         }
         let mean = |s: (f32, f32)| s.0 / s.1.max(1.0);
+        let is_clear =
+            |i: usize| (self.values[i] - thresholds[i]).abs() >= CLEAR_OF_FEW * mean(white).min(mean(black));
+        if family.cells.len() < FEW_BITS && !(0..cells).all(is_clear) {
+            return None;
+        }
         let lights = (0..cells).filter(|&i| bits[i]);
         let saturated = lights.filter(|&i| self.values[i] >= OVER_EXPOSED).count() as f32;
         let is_over_exposed = saturated > 0.5 * white.1;
