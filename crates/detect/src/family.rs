@@ -5,7 +5,7 @@
 //! colour; tagStandard41h12 has its data outside that ring as well, and its border is the light
 //! square inside a dark ring: it is looked for in the inverted image.
 
-use windhover_base::msg::{FamilySpec, TagFamily};
+use windhover_base::msg::{FamilySpec, Form, TagFamily};
 
 /// How a tag is printed: its family, and how many cells wide its border is.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
@@ -41,6 +41,8 @@ pub(super) enum Cell {
     Data(bool),
     /// Of the border, or of the ring around it.
     Frame(bool),
+    /// Of what is beside or within the print.
+    Other,
 }
 
 /// One family, ready for lookup.
@@ -50,7 +52,9 @@ pub(super) struct Family {
     pub family: TagFamily,
     /// Cells on a side of the border's outer square.
     pub width: usize,
-    /// Cells sampled around the border: 1, or 2 where data lie outside.
+    /// How many cells wide the border is.
+    pub border: usize,
+    /// Cells sampled around the border: 1, or more where data lie outside.
     pub pad: usize,
     /// Whether the border is light inside a dark ring.
     pub inverted: bool,
@@ -66,16 +70,17 @@ impl Family {
     /// The tables of a family; `max_hamming` is cut to what the family allows.
     pub fn new(layout: TagLayout, max_hamming: u8) -> Self {
         let TagLayout { family, border } = layout;
-        let &FamilySpec { border: square, pad, inverted, correctable: limit, codes, .. } = family.spec();
+        let &FamilySpec { border: square, pad, form, inverted, correctable: limit, codes, .. } =
+            family.spec();
         let border = usize::from(border.max(1));
         let width = square + 2 * (border - 1);
-        let cells = data_cells(width, pad, border as i32);
+        let cells = data_cells(width, pad, border as i32, form);
         let turned = std::array::from_fn(|turns| {
             cells.iter().map(|&cell| grid_index(turn(cell, width, turns), width, pad)).collect()
         });
         let max_hamming = max_hamming.min(limit);
         let index = ChunkIndex::new(codes, cells.len(), max_hamming);
-        Self { family, width, pad, inverted, cells, codes, turned, index }
+        Self { family, width, border, pad, inverted, cells, codes, turned, index }
     }
 
     /// Cells on a side of the sampled grid.
@@ -99,18 +104,19 @@ impl Family {
         let w = self.width as i32;
         match self.cells.iter().position(|&c| c == (x, y)) {
             Some(cell) => Cell::Data(self.bit(id, cell)),
-            None => Cell::Frame(!((0..w).contains(&x) && (0..w).contains(&y))),
+            None if inside(w, 0, (x, y)) && !inside(w, self.border as i32, (x, y)) => Cell::Frame(false),
+            None if inside(w, -1, (x, y)) && !inside(w, 0, (x, y)) => Cell::Frame(true),
+            None => Cell::Other,
         }
     }
 
     /// Whether cell (x, y) of tag `id` is light in the (possibly inverted) image: data, border (dark) or the
-    /// ring around it (light). `None` beyond the ring, where it is not known.
+    /// ring around it (light). `None` beyond the ring and where it is not known.
     pub fn is_light(&self, id: u32, x: i32, y: i32) -> Option<bool> {
-        let w = self.width as i32;
-        let is_known = (-1..=w).contains(&x) && (-1..=w).contains(&y);
-        is_known.then(|| match self.cell(id, x, y) {
-            Cell::Data(light) | Cell::Frame(light) => light,
-        })
+        match self.cell(id, x, y) {
+            Cell::Data(light) | Cell::Frame(light) if inside(self.width as i32, -1, (x, y)) => Some(light),
+            _ => None,
+        }
     }
 
     /// The word nearest to a grid of bits (`grid_side²`, row by row, true for white), if any is near
@@ -130,19 +136,28 @@ impl Family {
     }
 }
 
-/// Data cells row by row: all inside the border, and the outermost ring where `pad` is 2.
-fn data_cells(width: usize, pad: usize, border: i32) -> Vec<(i32, i32)> {
+/// Whether a cell lies in a square of `w` cells a side less a margin.
+fn inside(w: i32, margin: i32, (x, y): (i32, i32)) -> bool {
+    (margin..w - margin).contains(&x) && (margin..w - margin).contains(&y)
+}
+
+/// Data cells row by row: those inside the border and outside the ring, as far as the family's form has them.
+fn data_cells(width: usize, pad: usize, border: i32, form: Form) -> Vec<(i32, i32)> {
     let (w, p) = (width as i32, pad as i32);
-    let mut cells = Vec::new();
-    for y in -p..w + p {
-        for x in -p..w + p {
-            let inside = |margin: i32| (margin..w - margin).contains(&x) && (margin..w - margin).contains(&y);
-            if inside(border) || (p == 2 && !inside(-1)) {
-                cells.push((x, y));
+    let has_data = |cell: (i32, i32)| {
+        // Twice the distance of a cell's middle from the print's, and of the outermost row's.
+        let from_middle = [cell.0, cell.1].map(|c| 2 * c + 1 - w);
+        let outermost = w + 2 * p - 1;
+        let fits = match form {
+            Form::Square => true,
+            Form::Nested => from_middle.iter().any(|d| d.abs() > 1),
+            Form::Round => {
+                from_middle.iter().map(|d| d * d).sum::<i32>() <= outermost * outermost + outermost
             }
-        }
-    }
-    cells
+        };
+        fits && (inside(w, border, cell) || !inside(w, -1, cell))
+    };
+    (-p..w + p).flat_map(|y| (-p..w + p).map(move |x| (x, y))).filter(|&cell| has_data(cell)).collect()
 }
 
 /// A cell after `turns` quarter turns, clockwise as seen, about the tag's centre.

@@ -1,6 +1,6 @@
 //! What a tag looks like in print.
 
-use super::family::{Family, TagLayout};
+use super::family::{Cell, Family, TagLayout};
 
 /// A tag as printed: white and black cells, the ring around its border included.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -36,7 +36,8 @@ pub fn tag_pattern(layout: impl Into<TagLayout>, id: u32) -> TagPattern {
             let (x, y) = ((i % side) as i32 - pad, (i / side) as i32 - pad);
             // The border is black in a white ring, or white in a black one.
             let in_square = (0..=last).contains(&x) && (0..=last).contains(&y);
-            in_square == tables.inverted
+            let is_free = matches!(tables.cell(id, x, y), Cell::Other);
+            is_free || in_square == tables.inverted
         })
         .collect();
     for (cell, (x, y)) in tables.cells.iter().enumerate() {

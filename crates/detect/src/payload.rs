@@ -25,8 +25,18 @@ const OVER_EXPOSED: f32 = 250.0;
 /// Least step from black border to white ring, grey levels.
 const LEAST_CONTRAST: f32 = 5.0;
 
-/// Share of border and ring cells that may lie on the wrong side of the threshold.
+/// Share of border and ring cells that may lie on the wrong side of the threshold; of families with few bits, whose
+/// words chance makes often, less.
 const MOST_WRONG_BORDER: f32 = 0.2;
+const MOST_WRONG_OF_FEW: f32 = 0.04;
+const FEW_BITS: usize = 20;
+
+/// And how far every cell of theirs must be from the threshold, over the mean.
+const CLEAR_OF_FEW: f32 = 0.45;
+
+fn most_wrong(family: &Family) -> f32 {
+    if family.cells.len() < FEW_BITS { MOST_WRONG_OF_FEW } else { MOST_WRONG_BORDER }
+}
 
 /// Grey values of the grid of cells of a tag.
 struct Grid {
@@ -205,7 +215,7 @@ impl Grid {
         }
         let wrong = self.ring(0).filter(|&i| bits[i]).count() + self.ring(1).filter(|&i| !bits[i]).count();
         let all = self.ring(0).count() + self.ring(1).count();
-        if wrong as f32 > MOST_WRONG_BORDER * all as f32 {
+        if wrong as f32 > most_wrong(family) * all as f32 {
             return None;
         }
         let word = family.find(&bits[..cells])?;
@@ -216,6 +226,11 @@ impl Grid {
             sum.1 += 1.0f32;
         }
         let mean = |s: (f32, f32)| s.0 / s.1.max(1.0);
+        let is_clear =
+            |i: usize| (self.values[i] - thresholds[i]).abs() >= CLEAR_OF_FEW * mean(white).min(mean(black));
+        if family.cells.len() < FEW_BITS && !(0..cells).all(is_clear) {
+            return None;
+        }
         let lights = (0..cells).filter(|&i| bits[i]);
         let saturated = lights.filter(|&i| self.values[i] >= OVER_EXPOSED).count() as f32;
         let is_over_exposed = saturated > 0.5 * white.1;
@@ -234,9 +249,10 @@ impl Grid {
                     wrong += f32::from(u8::from(light != is_light));
                     all += 1.0;
                 }
+                Cell::Other => {}
             }
         }
-        wrong_data <= family.max_hamming() && wrong <= MOST_WRONG_BORDER * all
+        wrong_data <= family.max_hamming() && wrong <= most_wrong(family) * all
     }
 }
 

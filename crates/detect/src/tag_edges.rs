@@ -22,8 +22,8 @@ const MOST_POINTS: f64 = 8.0;
 pub(super) struct TagEdges {
     /// On edges crossed along ξ, and along η.
     pub points: [Vec<EdgePoint>; 2],
-    /// Whether the tag's cells, its ring included, are light, row by row.
-    lights: Vec<bool>,
+    /// Whether the tag's cells, its ring included, are light, row by row, where that is known.
+    lights: Vec<Option<bool>>,
 }
 
 impl TagEdges {
@@ -34,7 +34,7 @@ impl TagEdges {
         let per_cell = (cell / SPACING_PX).clamp(2.0, MOST_POINTS) as usize;
         self.lights.clear();
         let around = (-1..=w).flat_map(|y| (-1..=w).map(move |x| (x, y)));
-        self.lights.extend(around.map(|(x, y)| family.is_light(id, x, y) == Some(true)));
+        self.lights.extend(around.map(|(x, y)| family.is_light(id, x, y)));
         let scale = 2.0 / w as f32;
         let blocks = w as usize / BLOCK + 1;
         // Edges before cell x of row y, or where rows and columns change places, before row x of column y.
@@ -44,14 +44,14 @@ impl TagEdges {
                 let (x, y) = turned(x);
                 self.lights[((y + 1) * (w + 2) + x + 1) as usize]
             };
-            let (before, after) = (light(x - 1), light(x));
+            let (Some(before), Some(after)) = (light(x - 1), light(x)) else { continue };
             if before == after {
                 continue;
             }
             // How far what is beyond a cell is from it to the other colour.
-            let contrast = |beyond: i32, cell: bool| match (-1..=w).contains(&beyond) {
-                true => f32::from(u8::from(light(beyond) != cell)),
-                false => GROUND,
+            let contrast = |beyond: i32, cell: bool| {
+                let beyond = (-1..=w).contains(&beyond).then(|| light(beyond)).flatten();
+                beyond.map_or(GROUND, |light| f32::from(u8::from(light != cell)))
             };
             let (far_before, far_after) = (contrast(x - 2, before), contrast(x + 1, after));
             let towards = if after { 1.0 } else { -1.0 };

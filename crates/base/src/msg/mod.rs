@@ -17,7 +17,7 @@ pub use estimate::{
     Ownship, TargetEstimate, TargetState, TrackStatus,
 };
 pub use event::{Bayer, Event, EventBody, FrameEncoding, FramePayload};
-pub use family::{FamilySpec, TagFamily};
+pub use family::{FamilySpec, Form, TagFamily};
 pub use health::{Health, SourceHealth, TargetHealth};
 pub use image::{GrayImage, ImageView, RgbImage};
 pub use measure::{

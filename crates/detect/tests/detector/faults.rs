@@ -207,6 +207,17 @@ fn a_tag_tilted_by_80_degrees_is_read() {
 }
 
 #[test]
+fn tags_of_every_family_are_found() {
+    for family in TagFamily::ALL {
+        let cells = tag_pattern(family, 7).border as f64;
+        for (edge, turn) in [(4.5 * cells, 0.3), (10.0 * cells, 1.9)] {
+            let scene = Scene { layout: family.into(), edge, turn, ..Scene::default() };
+            scene.assert_found(&[12.0], 0.35, &format!("{}, {edge} px", family.name()));
+        }
+    }
+}
+
+#[test]
 fn textured_ground_of_any_contrast_holds_no_tags() {
     let mut rng = ChaCha8Rng::seed_from_u64(9);
     for (coarse, span) in [(2, 20), (3, 60), (5, 30), (9, 120)] {

@@ -4,10 +4,16 @@
 
 use serde::{Deserialize, Serialize};
 
+mod aruco;
+mod circle21h7;
+mod circle49h12;
+mod mip36h12;
 mod tag16h5;
 mod tag25h9;
 mod tag36h11;
 mod tag41h12;
+mod tag48h12;
+mod tag52h13;
 
 /// How the tags of a family are made.
 ///
@@ -19,8 +25,10 @@ pub struct FamilySpec {
     pub name: &'static str,
     /// Cells of the border on a side.
     pub border: usize,
-    /// Cells of the print around the border: 1, or 2 where data cells lie outside the ring.
+    /// Cells of the print around the border: 1, or more where data cells lie outside the ring.
     pub pad: usize,
+    /// Which of the cells inside the border and outside the ring hold data.
+    pub form: Form,
     /// Whether the border is light and the ring dark.
     pub inverted: bool,
     /// Most wrong bits that may be corrected.
@@ -33,10 +41,32 @@ pub struct FamilySpec {
     pub codes: &'static [u64],
 }
 
+/// Which of the cells inside the border and outside the ring hold data.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Form {
+    /// All of them.
+    Square,
+    /// All but four in the middle, where another tag may be.
+    Nested,
+    /// Those whose middle is in a circle: at most half a cell's length more from the print's middle, squared and in
+    /// cells, than the outermost row.
+    Round,
+}
+
+/// Words of eight bytes, the lowest first.
+const fn words<const N: usize>(bytes: &[u8]) -> [u64; N] {
+    let (chunks, mut words, mut k) = (bytes.as_chunks().0, [0; N], 0);
+    while k < N {
+        words[k] = u64::from_le_bytes(chunks[k]);
+        k += 1;
+    }
+    words
+}
+
 /// The enum, its list and the lookup of its specifications, out of one row a family.
 macro_rules! families {
-    ($($(#[$about:meta])* $variant:ident, $text:literal, $codes:ident,
-       border $border:literal pad $pad:literal inverted $inverted:literal correctable $correctable:literal;)*) => {
+    ($($(#[$about:meta])* $variant:ident, $text:literal, $codes:expr,
+       $form:ident border $border:literal pad $pad:literal inverted $inverted:literal correctable $correctable:literal;)*) => {
         /// Families of square tags.
         #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug, Default, Serialize, Deserialize)]
         pub enum TagFamily {
@@ -55,9 +85,10 @@ macro_rules! families {
                             name: $text,
                             border: $border,
                             pad: $pad,
+                            form: Form::$form,
                             inverted: $inverted,
                             correctable: $correctable,
-                            codes: &$codes::CODES,
+                            codes: $codes,
                         };
                         &SPEC
                     })*
@@ -70,13 +101,47 @@ macro_rules! families {
 families! {
     /// 36 bits, 11 apart: 587 tags.
     #[default]
-    Tag36h11, "36h11", tag36h11, border 8 pad 1 inverted false correctable 2;
+    Tag36h11, "36h11", &tag36h11::CODES, Square border 8 pad 1 inverted false correctable 2;
     /// 25 bits, 9 apart: 35 tags.
-    Tag25h9, "25h9", tag25h9, border 7 pad 1 inverted false correctable 1;
+    Tag25h9, "25h9", &tag25h9::CODES, Square border 7 pad 1 inverted false correctable 1;
     /// 16 bits, 5 apart: 30 tags.
-    Tag16h5, "16h5", tag16h5, border 6 pad 1 inverted false correctable 0;
+    Tag16h5, "16h5", &tag16h5::CODES, Square border 6 pad 1 inverted false correctable 0;
     /// 41 bits, 12 apart, white border inside: 2115 tags.
-    Tag41h12, "41h12", tag41h12, border 5 pad 2 inverted true correctable 3;
+    Tag41h12, "41h12", &tag41h12::CODES, Square border 5 pad 2 inverted true correctable 3;
+    /// 52 bits, 13 apart, white border inside: 48 714 tags.
+    Tag52h13, "52h13", &tag52h13::CODES, Square border 6 pad 2 inverted true correctable 3;
+    /// 48 bits, 12 apart, white border inside, the middle left free for another tag: 42 211 tags.
+    Tag48h12, "48h12", &tag48h12::CODES, Nested border 6 pad 2 inverted true correctable 3;
+    /// 21 bits, 7 apart, round: 38 tags.
+    Circle21h7, "circle21h7", &circle21h7::CODES, Round border 5 pad 2 inverted true correctable 0;
+    /// 49 bits, 12 apart, round: 65 535 tags.
+    Circle49h12, "circle49h12", &circle49h12::CODES, Round border 5 pad 3 inverted true correctable 3;
+    /// ArUco, 36 bits, 12 apart: 250 tags.
+    Mip36h12, "mip_36h12", &mip36h12::CODES, Square border 8 pad 1 inverted false correctable 3;
+    /// ArUco of OpenCV, 16 bits: the first 50 tags.
+    Aruco4x4N50, "4x4_50", aruco::CODES_4X4.split_at(50).0, Square border 6 pad 1 inverted false correctable 0;
+    /// ArUco of OpenCV, 16 bits: the first 100 tags.
+    Aruco4x4N100, "4x4_100", aruco::CODES_4X4.split_at(100).0, Square border 6 pad 1 inverted false correctable 0;
+    /// ArUco of OpenCV, 16 bits: the first 250 tags.
+    Aruco4x4N250, "4x4_250", aruco::CODES_4X4.split_at(250).0, Square border 6 pad 1 inverted false correctable 0;
+    /// ArUco of OpenCV, 16 bits: 1000 tags.
+    Aruco4x4N1000, "4x4_1000", aruco::CODES_4X4.split_at(1000).0, Square border 6 pad 1 inverted false correctable 0;
+    /// ArUco of OpenCV, 25 bits: the first 50 tags.
+    Aruco5x5N50, "5x5_50", aruco::CODES_5X5.split_at(50).0, Square border 7 pad 1 inverted false correctable 1;
+    /// ArUco of OpenCV, 25 bits: the first 100 tags.
+    Aruco5x5N100, "5x5_100", aruco::CODES_5X5.split_at(100).0, Square border 7 pad 1 inverted false correctable 0;
+    /// ArUco of OpenCV, 25 bits: the first 250 tags.
+    Aruco5x5N250, "5x5_250", aruco::CODES_5X5.split_at(250).0, Square border 7 pad 1 inverted false correctable 0;
+    /// ArUco of OpenCV, 25 bits: 1000 tags.
+    Aruco5x5N1000, "5x5_1000", aruco::CODES_5X5.split_at(1000).0, Square border 7 pad 1 inverted false correctable 0;
+    /// ArUco of OpenCV, 36 bits: the first 50 tags.
+    Aruco6x6N50, "6x6_50", aruco::CODES_6X6.split_at(50).0, Square border 8 pad 1 inverted false correctable 3;
+    /// ArUco of OpenCV, 36 bits: the first 100 tags.
+    Aruco6x6N100, "6x6_100", aruco::CODES_6X6.split_at(100).0, Square border 8 pad 1 inverted false correctable 3;
+    /// ArUco of OpenCV, 36 bits: the first 250 tags.
+    Aruco6x6N250, "6x6_250", aruco::CODES_6X6.split_at(250).0, Square border 8 pad 1 inverted false correctable 3;
+    /// ArUco of OpenCV, 36 bits: 1000 tags.
+    Aruco6x6N1000, "6x6_1000", aruco::CODES_6X6.split_at(1000).0, Square border 8 pad 1 inverted false correctable 2;
 }
 
 impl TagFamily {
@@ -93,9 +158,18 @@ impl TagFamily {
 
 impl std::str::FromStr for TagFamily {
     type Err = String;
+
+    /// Names are taken as AprilTag and OpenCV write them too: `tagStandard41h12`, `DICT_4X4_50`. Of `4x4`, all that
+    /// there are.
     fn from_str(name: &str) -> Result<Self, String> {
-        let known = Self::ALL.into_iter().find(|family| family.name() == name.trim_start_matches("tag"));
-        known.ok_or_else(|| {
+        let plain = |name: &str| {
+            let name = name.to_ascii_lowercase().replace('_', "");
+            let words = ["dict", "apriltag", "aruco", "tag", "standard", "custom", "circle"];
+            words.iter().fold(name, |name, word| name.strip_prefix(word).unwrap_or(&name).to_owned())
+        };
+        let wanted = plain(name);
+        let known = |wanted: &str| Self::ALL.into_iter().find(|family| plain(family.name()) == wanted);
+        known(&wanted).or_else(|| known(&format!("{wanted}1000"))).ok_or_else(|| {
             format!("{name:?} is no tag family; known are {}", Self::ALL.map(Self::name).join(", "))
         })
     }
@@ -112,11 +186,30 @@ mod tests {
             (TagFamily::Tag25h9, 25, 35),
             (TagFamily::Tag16h5, 16, 30),
             (TagFamily::Tag41h12, 41, 2115),
+            (TagFamily::Tag52h13, 52, 48_714),
+            (TagFamily::Tag48h12, 48, 42_211),
+            (TagFamily::Circle21h7, 21, 38),
+            (TagFamily::Circle49h12, 49, 65_535),
+            (TagFamily::Mip36h12, 36, 250),
+            (TagFamily::Aruco4x4N50, 16, 50),
+            (TagFamily::Aruco5x5N250, 25, 250),
+            (TagFamily::Aruco6x6N1000, 36, 1000),
         ] {
             assert_eq!(family.name().parse(), Ok(family));
             assert_eq!(family.codes(), count);
             assert!(family.spec().codes.iter().all(|code| code >> bits == 0), "{}", family.name());
         }
-        assert!("17h4".parse::<TagFamily>().is_err_and(|e| e.ends_with("36h11, 25h9, 16h5, 41h12")));
+        assert!("17h4".parse::<TagFamily>().is_err_and(|e| e.contains("36h11, 25h9, 16h5, 41h12")));
+        for (name, family) in [
+            ("tagStandard52h13", TagFamily::Tag52h13),
+            ("tagCustom48h12", TagFamily::Tag48h12),
+            ("tagCircle21h7", TagFamily::Circle21h7),
+            ("DICT_4X4_100", TagFamily::Aruco4x4N100),
+            ("5x5", TagFamily::Aruco5x5N1000),
+            ("DICT_ARUCO_MIP_36h12", TagFamily::Mip36h12),
+            ("DICT_APRILTAG_36h11", TagFamily::Tag36h11),
+        ] {
+            assert_eq!(name.parse(), Ok(family), "{name}");
+        }
     }
 }
