@@ -5,11 +5,12 @@ use std::process::{Child, Command};
 
 use rustix::process::{Pid, Signal, kill_process};
 
-use super::{CliError, CliResult};
+use super::{CliError, CliResult, place};
 use crate::app::live::{LiveFlight, LiveFolder, LoopSettings};
 use crate::cli::out::note;
 use crate::config::Config;
 use crate::io::link::keys::{Authority, Role};
+use crate::io::new_file::Inputs;
 use windhover_base::time::{NS_PER_S, UtcTime};
 use windhover_simulate::Scenario;
 
@@ -30,6 +31,9 @@ pub(super) struct Live<'a> {
     pub(super) no_daemon: bool,
 }
 
+/// The first line of the configuration that is written.
+const MADE_BY: &str = "# Made by windhover simulate --live.";
+
 /// Flies a scenario in real time.
 pub(super) fn run(scenario: Scenario, live: &Live<'_>) -> CliResult {
     std::fs::create_dir_all(live.folder).map_err(|e| cannot("make", live.folder, &e))?;
@@ -38,8 +42,9 @@ pub(super) fn run(scenario: Scenario, live: &Live<'_>) -> CliResult {
     let mut config = folder.config_of(&scenario);
     with_link(&mut config, &folder.0.join("keys"))?;
     let file = folder.config_file();
-    let text = config.to_toml().map_err(CliError::config)?;
-    std::fs::write(&file, text).map_err(|e| cannot("write", &file, &e))?;
+    let text = format!("{MADE_BY}\n{}", config.to_toml().map_err(CliError::config)?);
+    place::check(&file, &Inputs::default(), &[MADE_BY])?;
+    place::write(&file, &text)?;
     let card = folder.0.join("card");
     std::fs::create_dir_all(&card).map_err(|e| cannot("make", &card, &e))?;
     let threads = std::thread::available_parallelism().map_or(1, usize::from);

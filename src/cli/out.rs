@@ -36,7 +36,7 @@ pub(super) fn print(words: Arguments<'_>) -> Result<(), CliError> {
 /// What became of something written to standard output.
 ///
 /// # Errors
-/// As [`print`].
+/// As [`print()`].
 pub(super) fn written<T>(outcome: io::Result<T>) -> Result<T, CliError> {
     outcome.map_err(|error| match error.kind() {
         ErrorKind::BrokenPipe => CliError::unread(),
@@ -47,7 +47,7 @@ pub(super) fn written<T>(outcome: io::Result<T>) -> Result<T, CliError> {
 /// Writes what standard output still holds.
 ///
 /// # Errors
-/// As [`print`].
+/// As [`print()`].
 pub(super) fn flush() -> Result<(), CliError> {
     written(io::stdout().flush())
 }

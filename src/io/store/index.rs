@@ -142,7 +142,7 @@ pub struct Index {
 
 impl Index {
     /// Opens the index in directory `dir`, or makes an empty one, and reads what is asked of it at every start. A panic
-    /// inside sled is an error, and so is an index over which sled broods for longer than [`PATIENCE`]: its thread is left
+    /// inside sled is an error, and so is an index over which sled broods for longer than twenty seconds: its thread is left
     /// behind with the least claim to the processor, and ends with the process.
     pub fn open(dir: &Path) -> Result<Self, IndexError> {
         let unusable = |reason: &str| IndexError::Unusable { path: dir.to_owned(), reason: reason.into() };
