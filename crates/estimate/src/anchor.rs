@@ -131,9 +131,7 @@ impl State {
             }
             for axis in 0..2 {
                 let (to, from) = (place.column(axis), own::POSITION.column(axis));
-                self.cov.add_row_from(to, factor, from);
-                self.cov.add_column_from(to, factor, from);
-                self.copies_in_use().for_each(|copy| copy.cross.add_column_from(to, factor, from));
+                self.shear([(to, factor)], from);
             }
         }
     }

@@ -121,6 +121,13 @@ impl Core {
         outcome
     }
 
+    /// The normalised innovation squared over the gate of what stands in `self.z`, which is not fused; `None` where it cannot
+    /// be computed.
+    pub(crate) fn gate_ratio(&mut self) -> Option<f64> {
+        let square = self.work.square(&self.state, &self.z)?;
+        Some(square / self.models.gates[self.z.m])
+    }
+
     /// Whether a measurement says something of the noise of good ones.
     pub(crate) fn teaches(&self, outcome: &Outcome) -> bool {
         self.learning.on && outcome.ratio < LEARN_RATIO

@@ -102,9 +102,7 @@ impl Core {
             Ok(()) if self.at_truth => return 0.0,
             Ok(()) => {}
         }
-        self.work
-            .square(&self.state, &self.z)
-            .map_or(f64::INFINITY, |square| square / self.models.gates[self.z.m])
+        self.gate_ratio().unwrap_or(f64::INFINITY)
     }
 
     /// Fuses one marker through the gate: a tag's four corners at once, or its or a disc's centre. Whether it was inside.

@@ -116,8 +116,7 @@ impl Core {
         if refused_before == 0 || !self.learning.on || !self.state.is_blind() {
             return;
         }
-        let gate = self.models.gates[self.z.m];
-        if self.work.ratio(&self.state, &self.z, gate).is_some_and(|ratio| ratio > 1.0) {
+        if self.gate_ratio().is_some_and(|ratio| ratio > 1.0) {
             self.state.wake_own();
         }
     }

@@ -242,20 +242,24 @@ impl State {
         let level: [Block<2>; 4] = [own::POSITION.part(0), own::VELOCITY.part(0), own::WIND, own::GUST];
         for block in level.into_iter().chain(self.layout().places()) {
             let moved = block.of(dx);
-            if moved.x == 0.0 && moved.y == 0.0 {
-                continue;
-            }
-            let cross = [(block.column(0), -moved.y), (block.column(1), moved.x)];
-            for (to, factor) in cross {
-                self.cov.add_row_from(to, factor, turn);
-            }
-            for (to, factor) in cross {
-                self.cov.add_column_from(to, factor, turn);
-            }
-            for copy in self.copies_in_use() {
-                for (to, factor) in cross {
-                    copy.cross.add_column_from(to, factor, turn);
-                }
+            self.shear([(block.column(0), -moved.y), (block.column(1), moved.x)], turn);
+        }
+    }
+
+    /// Adds multiples of one state's error to those of others.
+    pub(crate) fn shear<const N: usize>(&mut self, to: [(usize, f64); N], from: usize) {
+        if to.iter().all(|(_, factor)| *factor == 0.0) {
+            return;
+        }
+        for (to, factor) in to {
+            self.cov.add_row_from(to, factor, from);
+        }
+        for (to, factor) in to {
+            self.cov.add_column_from(to, factor, from);
+        }
+        for copy in self.copies_in_use() {
+            for (to, factor) in to {
+                copy.cross.add_column_from(to, factor, from);
             }
         }
     }

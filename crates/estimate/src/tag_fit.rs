@@ -267,34 +267,25 @@ impl State {
     pub(crate) fn keep_scale_unobserved(&mut self, dx: &[f64]) {
         let Some(Scale { column, share }) = self.scale else { return };
         let layout = self.layout();
+        let mut enlarge = |to: usize, by: f64| self.shear([(to, by)], column);
         let moved = own::POSITION.of(dx);
-        self.shear(own::POSITION.column(2), moved.z, column);
-        self.shear(own::GPS_BIAS.column(2), -moved.z, column);
+        enlarge(own::POSITION.column(2), moved.z);
+        enlarge(own::GPS_BIAS.column(2), -moved.z);
         let faster = own::VELOCITY.of(dx);
         for axis in 0..3 {
-            self.shear(own::VELOCITY.column(axis), share * faster[axis], column);
+            enlarge(own::VELOCITY.column(axis), share * faster[axis]);
         }
         for (slot, place) in layout.places().enumerate() {
             let scale = if slot < layout.targets { 1.0 } else { share };
             let by = place.of(dx) - moved.xy();
-            (0..2).for_each(|axis| self.shear(place.column(axis), scale * by[axis], column));
+            (0..2).for_each(|axis| enlarge(place.column(axis), scale * by[axis]));
         }
         for i in 0..layout.targets {
             let (s, c) = self.targets[i].mean[2].sin_cos();
             let speed = layout.target(i).speed().column(0);
             let by = dx[speed] - (1.0 - share) * (faster.x * c + faster.y * s);
-            self.shear(speed, by, column);
+            self.shear([(speed, by)], column);
         }
-    }
-
-    /// Adds a multiple of one state's error to another's.
-    fn shear(&mut self, to: usize, factor: f64, from: usize) {
-        if factor == 0.0 {
-            return;
-        }
-        self.cov.add_row_from(to, factor, from);
-        self.cov.add_column_from(to, factor, from);
-        self.copies_in_use().for_each(|copy| copy.cross.add_column_from(to, factor, from));
     }
 
     /// Sizes of the fitted tags over those configured, in percent, with their sigmas.

@@ -79,18 +79,6 @@ impl Workspace {
         }
     }
 
-    /// Normalised innovation squared over the gate, without fusing; `None` where it cannot be computed.
-    pub(crate) fn ratio(&mut self, state: &State, z: &Measurement, gate: f64) -> Option<f64> {
-        self.project(state, z);
-        let mut s = self.innovation_covariance(z);
-        if !z.is_finite() || !cholesky(&mut s, z.m) {
-            return None;
-        }
-        let mut white = z.residual;
-        forward(&s, z.m, &mut white);
-        Some(white[..z.m].iter().map(|x| x * x).sum::<f64>() / gate)
-    }
-
     /// Fuses `z`. With a gate (a chi-square value) the noise of a measurement outside it is raised until
     /// its innovation lies on the gate (soft gate: `R ← R + (ratio − 1) S`, so its weight falls as
     /// 1/ratio however uncertain the state is), and one absurdly far outside is refused. States that are held do

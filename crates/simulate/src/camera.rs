@@ -7,6 +7,7 @@ use super::random::{Purpose, Stream};
 use super::scenario::{vector, within};
 use super::world::World;
 use windhover_base::geo::ned_from_body_321;
+use windhover_base::msg::{FrameEncoding, FramePayload, GrayImage};
 use windhover_base::time::{MonoTime, Span};
 
 /// Iterations that find the row in which a point is seen: each is closer by its motion over a row's share of a pixel.
@@ -47,6 +48,22 @@ pub struct FrameTruth {
     pub t_stamp: MonoTime,
     /// When the frame was dequeued.
     pub t_recv: MonoTime,
+}
+
+impl FrameTruth {
+    /// The frame as a camera without compression delivers it, of its picture.
+    pub fn in_grey(&self, image: GrayImage) -> FramePayload {
+        let width = image.width as u32;
+        FramePayload {
+            index: self.frame,
+            t_exposure: self.t_stamp,
+            encoding: FrameEncoding::Grey,
+            width,
+            height: image.height as u32,
+            stride: width,
+            data: image.data.into(),
+        }
+    }
 }
 
 /// The exposures of a flight, in order.

@@ -14,7 +14,7 @@ use super::line::Line;
 use super::random::{Purpose, Stream};
 use super::render::Renderer;
 use super::world::World;
-use windhover_base::msg::{Event, EventBody, FrameEncoding, FramePayload, GrayImage, Source};
+use windhover_base::msg::{Event, EventBody, GrayImage, Source};
 use windhover_base::time::{MonoTime, Span};
 
 /// A frame's exposure is jittered: it is taken this long after its nominal time has been flown, s.
@@ -142,16 +142,7 @@ impl ClosedFlight {
                 continue;
             };
             renderer.render(truth.t_true, truth.frame, &mut image);
-            let (width, height) = (image.width as u32, image.height as u32);
-            let frame = FramePayload {
-                index: truth.frame,
-                t_exposure: truth.t_stamp,
-                encoding: FrameEncoding::Grey,
-                width,
-                height,
-                stride: width,
-                data: image.data.into(),
-            };
+            let frame = truth.in_grey(image);
             let late = Span::from_ms(self.late.uniform(0.0, self.lateness.frames_ms.max(1e-9)));
             self.put(truth.t_recv + late, EventBody::Frame(frame));
         }

@@ -140,7 +140,6 @@ impl Flight {
             renderer.render(truth.t_true, truth.frame, &mut self.image);
         }
         let image = &self.image;
-        let (width, height) = (image.width as u32, image.height as u32);
         let payload = match &self.storage {
             FrameStorage::Jpeg(encode) => FramePayload {
                 index: truth.frame,
@@ -153,15 +152,7 @@ impl Flight {
                     .map_err(|reason| FlightError::Jpeg { frame: truth.frame, reason })?
                     .into(),
             },
-            FrameStorage::Raw | FrameStorage::None => FramePayload {
-                index: truth.frame,
-                t_exposure: truth.t_stamp,
-                encoding: FrameEncoding::Grey,
-                width,
-                height,
-                stride: width,
-                data: image.data.clone().into(),
-            },
+            FrameStorage::Raw | FrameStorage::None => truth.in_grey(image.clone()),
         };
         Ok(self.event(truth.t_recv, EventBody::Frame(payload)))
     }

@@ -15,7 +15,7 @@ use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 
 use crate::io::camera::grey_header;
 use crate::io::clock::HostClock;
-use windhover_base::msg::{FrameEncoding, FramePayload, GrayImage};
+use windhover_base::msg::{FramePayload, GrayImage};
 use windhover_base::time::Span;
 use windhover_simulate::render::Renderer;
 use windhover_simulate::{FrameTruth, World};
@@ -133,16 +133,7 @@ impl Darkroom {
             let (renderer, mut image) = (Renderer::new(world).with_threads(threads), GrayImage::default());
             for truth in frames {
                 renderer.render(truth.t_true, truth.frame, &mut image);
-                let (width, height) = (image.width as u32, image.height as u32);
-                let frame = FramePayload {
-                    index: truth.frame,
-                    t_exposure: truth.t_stamp,
-                    encoding: FrameEncoding::Grey,
-                    width,
-                    height,
-                    stride: width,
-                    data: image.data.clone().into(),
-                };
+                let frame = truth.in_grey(image.clone());
                 if let Ok(left) = u64::try_from((truth.t_recv - clock.now()).ns()) {
                     std::thread::sleep(Duration::from_nanos(left));
                 }

@@ -108,7 +108,8 @@ impl Tag<'_> {
             return false;
         }
         let worse = core.worse_than_assumed(self.target);
-        if contradicts && core.is_outside(worse) {
+        core.z.scale_noise(worse);
+        if contradicts && !core.at_truth && core.gate_ratio().is_none_or(|ratio| ratio > 1.0) {
             core.refuse(FusionSource::Marker, Disposition::GateRejected);
             core.state.note_marker(true);
             return false;
@@ -117,10 +118,9 @@ impl Tag<'_> {
     }
 }
 
-/// Fuses the marker that stands in `z` through the gate, its noise raised by a factor; whether it was inside.
+/// Fuses the marker that stands in `z` through the gate, its noise raised by a factor before; whether it was inside.
 pub(super) fn fuse_expected(core: &mut Core, target: usize, worse: f64) -> bool {
     let settled = !core.z.unsettled;
-    core.z.scale_noise(worse);
     let outcome = core.fuse_gated(FusionSource::Marker);
     core.note_marker_unrest(target, &outcome);
     core.state.note_marker(outcome.ratio > 1.0);
@@ -132,15 +132,6 @@ pub(super) fn fuse_expected(core: &mut Core, target: usize, worse: f64) -> bool 
 }
 
 impl Core {
-    /// Whether what stands in `self.z` lies outside the gate, with its noise raised by a factor.
-    fn is_outside(&mut self, worse: f64) -> bool {
-        let noise = self.z.noise;
-        self.z.scale_noise(worse);
-        let square = self.work.square(&self.state, &self.z);
-        self.z.noise = noise;
-        !self.at_truth && square.is_none_or(|square| square > self.models.gates[self.z.m])
-    }
-
     /// By what factor the variance of the tag's pixels in `self.z` is larger than assumed, by what its shape shows:
     /// 1 unless that is beyond the gate, or so far beyond that it is no tag of ours.
     fn worse_than_assumed(&self, target: usize) -> f64 {
