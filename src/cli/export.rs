@@ -1,4 +1,4 @@
-//! `windhover export FLIGHT --format csv|geojson|kml|rosbag2 [--out DIR]`
+//! `windhover export FLIGHT --format csv|geojson|kml|rosbag2|klv-ts [--out DIR]`
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use crate::cli::out::note;
 use crate::io::new_file::Inputs;
 use crate::text::one_line;
 
-/// Write the outputs of a flight for other tools: tables, GIS, Google Earth, ROS 2.
+/// Write the outputs of a flight for other tools: tables, GIS, Google Earth, ROS 2, video with its metadata.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
   windhover export flight.mcap --format csv             # estimates.csv and more, into ./flight/

@@ -26,3 +26,4 @@ pub mod serial;
 pub mod store;
 pub mod terrain;
 pub mod mavlink;
+pub mod video;

@@ -1,8 +1,9 @@
-//! The outputs of a flight for other tools: CSV, GeoJSON, KML, bags of ROS 2.
+//! The outputs of a flight for other tools: CSV, GeoJSON, KML, bags of ROS 2, video with its metadata.
 
 mod csv;
 mod geojson;
 mod kml;
+mod klv_ts;
 mod rosbag2;
 mod tracks;
 
@@ -10,6 +11,7 @@ use std::path::{Path, PathBuf};
 
 use crate::io::mcap_read::{McapReader, ReadError};
 use crate::io::mcap_write::WriteError;
+use crate::io::video::VideoError;
 
 /// A format of `windhover export`.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, clap::ValueEnum)]
@@ -22,6 +24,8 @@ pub enum Format {
     Kml,
     /// A bag for ROS 2 (MCAP): odometry, fixes, images, transforms, detections, diagnostics
     Rosbag2,
+    /// Video (H.264 in an MPEG transport stream) with its metadata (KLV after MISB ST 0601 and 0903)
+    KlvTs,
 }
 
 /// Why a flight could not be exported.
@@ -40,6 +44,15 @@ pub enum ExportError {
         path: PathBuf,
         /// What the system said.
         source: std::io::Error,
+    },
+    /// The video could not be encoded.
+    #[error(transparent)]
+    Video(#[from] VideoError),
+    /// The recording holds no frames.
+    #[error("{} holds no frames that can be decoded: there is nothing to show", path.display())]
+    NoFrames {
+        /// The recording.
+        path: PathBuf,
     },
     /// The recording holds no outputs.
     #[error("{} holds no estimates: it is a capture; make a flight of it with `windhover replay`", path.display())]
@@ -66,6 +79,7 @@ impl Format {
             Self::Geojson => &[geojson::FILE],
             Self::Kml => &[kml::FILE],
             Self::Rosbag2 => &rosbag2::FILES,
+            Self::KlvTs => &[klv_ts::FILE],
         }
     }
 }
@@ -80,6 +94,7 @@ pub fn export(flight: &Path, format: Format, out: &Path) -> Result<Exported, Exp
         Format::Geojson => geojson::export(reader, out)?,
         Format::Kml => kml::export(reader, out)?,
         Format::Rosbag2 => rosbag2::export(flight, out)?,
+        Format::KlvTs => klv_ts::export(flight, reader, out)?,
     };
     if exported.files.is_empty() {
         if is_new {
