@@ -25,6 +25,7 @@ pub mod power_task;
 pub mod presence;
 pub mod reload;
 pub mod recording;
+pub mod refine;
 pub mod replay;
 pub mod report;
 pub mod run;

@@ -39,6 +39,8 @@ pub enum Maker {
     Capture,
     /// `replay`.
     Replay,
+    /// `refine`.
+    Refine,
 }
 
 impl Maker {
@@ -46,6 +48,7 @@ impl Maker {
         match self {
             Self::Capture => concat!("windhover ", env!("CARGO_PKG_VERSION"), " capture"),
             Self::Replay => concat!("windhover ", env!("CARGO_PKG_VERSION"), " replay"),
+            Self::Refine => concat!("windhover ", env!("CARGO_PKG_VERSION"), " refine"),
         }
     }
 
@@ -54,6 +57,7 @@ impl Maker {
         match self {
             Self::Capture => ["windhover ", " capture"],
             Self::Replay => ["windhover ", " replay"],
+            Self::Refine => ["windhover ", " refine"],
         }
     }
 }

@@ -15,6 +15,7 @@ mod site;
 mod ticks;
 
 pub use settings::PipelineSettings;
+pub use site::site_of;
 
 use std::sync::Arc;
 
