@@ -23,6 +23,7 @@ pub mod outlets;
 pub mod pipeline_task;
 pub mod power_task;
 pub mod presence;
+pub mod ros;
 pub mod reload;
 pub mod recording;
 pub mod replay;
