@@ -164,11 +164,14 @@ fn a_receivers_line_may_tell_the_heading_too() {
     config.compass.device.clone_from(&config.gps.device);
     let config = Config::parse(&config.to_toml().expect("writable")).expect("it is accepted");
     let mut pipeline = Pipeline::new((&config).into());
-    let mut outputs = Vec::new();
+    let (mut outputs, mut packet) = (Vec::new(), Vec::new());
     for event in Flight::new(world, FrameStorage::None, 1) {
         let mut event = event.expect("serial lines need no encoder");
-        if let EventBody::Bytes { source, .. } = &mut event.body {
-            *source = Source::Gps;
+        if let EventBody::Bytes { source: source @ Source::Compass, data } = &mut event.body {
+            // A packet of 64 bytes and what is around them goes out in one piece.
+            packet.append(data);
+            let whole = packet.len() / 72 * 72;
+            (*source, *data) = (Source::Gps, packet.drain(..whole).collect());
         }
         pipeline.handle(&event, &mut outputs);
     }

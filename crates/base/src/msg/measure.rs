@@ -131,6 +131,10 @@ pub struct AutopilotPosition {
 }
 
 /// What a source's bytes were decoded to.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "some hundred readings a second, moved from a list to the filter"
+)]
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum SensorReading {
     /// Of a GPS receiver.

@@ -37,6 +37,7 @@ pub struct HeardAutopilot {
 
 /// What an autopilot says.
 #[derive(Clone, Copy, PartialEq, Debug)]
+#[expect(clippy::large_enum_variant, reason = "a value at a time, handed on")]
 pub enum AutopilotSaid {
     /// Attitude, its heading true.
     Attitude(AttitudeSample),
@@ -286,7 +287,7 @@ impl AutopilotDecoder {
                 .zip(up)
                 .map(|(across, up)| Vector3::new(across, across, up))
                 .filter(|_| there),
-            velocity_sigma_mps: metres(fix.vel_acc).map(|sigma| Vector3::repeat(sigma)).filter(|_| there),
+            velocity_sigma_mps: metres(fix.vel_acc).map(Vector3::repeat).filter(|_| there),
             sats: (fix.satellites_visible != u8::MAX).then(|| fix.satellites_visible.into()),
             hdop: known(fix.eph).map(|dop| dop * 1e-2),
             ..GnssEpoch::default()
