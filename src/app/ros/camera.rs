@@ -4,9 +4,9 @@ use super::CAMERA;
 use crate::io::proto::windhover::{Detections, Marker};
 use crate::io::proto::{foxglove as fox, host_time};
 use crate::io::ros::{
-    AprilTag, AprilTagDetectionArray, CameraInfo, CompressedImage, Header, Image, RosRecord,
+    AprilTag, AprilTagDetectionArray, CameraInfo, CompressedImage, Header, Image, RosRecord, encoding_name,
 };
-use windhover_base::msg::{Bayer, FrameEncoding, FramePayload};
+use windhover_base::msg::{FrameEncoding, FramePayload};
 use windhover_base::time::MonoTime;
 
 /// How an image goes out.
@@ -21,21 +21,12 @@ enum Form {
 }
 
 fn form(encoding: FrameEncoding) -> Form {
-    match encoding {
-        FrameEncoding::Jpeg => Form::Compressed("jpeg"),
-        FrameEncoding::Png => Form::Compressed("png"),
-        FrameEncoding::Grey => Form::Raw("mono8"),
-        FrameEncoding::Yuyv => Form::Raw("yuv422_yuy2"),
-        FrameEncoding::Uyvy => Form::Raw("yuv422"),
-        FrameEncoding::Rgb24 => Form::Raw("rgb8"),
-        FrameEncoding::Bgr24 => Form::Raw("bgr8"),
-        FrameEncoding::Bayer(Bayer::Rggb) => Form::Raw("bayer_rggb8"),
-        FrameEncoding::Bayer(Bayer::Bggr) => Form::Raw("bayer_bggr8"),
-        FrameEncoding::Bayer(Bayer::Gbrg) => Form::Raw("bayer_gbrg8"),
-        FrameEncoding::Bayer(Bayer::Grbg) => Form::Raw("bayer_grbg8"),
-        FrameEncoding::Y10 | FrameEncoding::Y12 | FrameEncoding::Y16 => Form::Raw("mono16"),
-        FrameEncoding::Nv12 => Form::Luma,
-        FrameEncoding::Y10Packed | FrameEncoding::Unknown => Form::None,
+    match (encoding, encoding_name(encoding)) {
+        (FrameEncoding::Jpeg, _) => Form::Compressed("jpeg"),
+        (FrameEncoding::Png, _) => Form::Compressed("png"),
+        (FrameEncoding::Nv12, _) => Form::Luma,
+        (_, Some(name)) => Form::Raw(name),
+        (_, None) => Form::None,
     }
 }
 

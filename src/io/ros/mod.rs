@@ -3,10 +3,12 @@
 mod bag;
 mod cdr;
 mod definitions;
+mod encodings;
 mod messages;
 
 pub use bag::{Bag, FILES as BAG_FILES};
 pub use definitions::RosType;
+pub use encodings::{encoding_name, frame_encoding};
 pub use messages::{
     AprilTag, AprilTagDetectionArray, CameraInfo, CompressedImage, DiagnosticArray, DiagnosticStatus, Header,
     Image, Imu, Log, NavSatFix, Odometry, RosMessage, TfMessage, Transform,
