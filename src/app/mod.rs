@@ -26,6 +26,7 @@ pub mod presence;
 pub mod ros;
 pub mod reload;
 pub mod recording;
+pub mod refine;
 pub mod replay;
 pub mod report;
 pub mod run;

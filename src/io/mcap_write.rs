@@ -42,6 +42,8 @@ pub enum Maker {
     Capture,
     /// `replay`.
     Replay,
+    /// `refine`.
+    Refine,
 }
 
 impl Maker {
@@ -49,6 +51,7 @@ impl Maker {
         match self {
             Self::Capture => concat!("windhover ", env!("CARGO_PKG_VERSION"), " capture"),
             Self::Replay => concat!("windhover ", env!("CARGO_PKG_VERSION"), " replay"),
+            Self::Refine => concat!("windhover ", env!("CARGO_PKG_VERSION"), " refine"),
         }
     }
 
@@ -57,6 +60,7 @@ impl Maker {
         match self {
             Self::Capture => ["windhover ", " capture"],
             Self::Replay => ["windhover ", " replay"],
+            Self::Refine => ["windhover ", " refine"],
         }
     }
 }
