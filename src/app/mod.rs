@@ -17,6 +17,8 @@ pub mod ground;
 pub mod health;
 pub mod import;
 pub mod latencies;
+pub mod metrics_task;
+pub mod openmetrics;
 pub mod live;
 pub mod log;
 pub mod outlets;

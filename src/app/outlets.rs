@@ -6,15 +6,23 @@ use crate::io::records::OutputEncoder;
 use super::downlink::Downlink;
 use super::flight_store::FlightStore;
 use super::sink::{Outlets, Sink};
-use super::sinks::{CardSink, LinkSink, MavlinkSink};
+use super::sinks::{CardSink, LatestHealth, LinkSink, MavlinkSink, MetricsSink};
 
 /// The daemon's sinks, one row each. The link stands before the card: the ground gets a record before the card
 /// does, and the card keeps it under the number that the link gave it.
-pub fn of_daemon(config: &Config, flight_store: &FlightStore, downlink: &Downlink) -> Outlets<Box<dyn Sink>> {
-    let sinks: Vec<Box<dyn Sink>> = vec![
+pub fn of_daemon(
+    config: &Config,
+    flight_store: &FlightStore,
+    downlink: &Downlink,
+    metrics: &LatestHealth,
+) -> Outlets<Box<dyn Sink>> {
+    let mut sinks: Vec<Box<dyn Sink>> = vec![
         Box::new(LinkSink::new(downlink.clone())),
         Box::new(MavlinkSink::new(downlink.clone())),
         Box::new(CardSink::new(config.camera.clone(), flight_store.clone(), downlink.clone())),
     ];
+    if config.daemon.metrics.is_some() {
+        sinks.push(Box::new(MetricsSink::new(metrics.clone())));
+    }
     Outlets::new(OutputEncoder::new(&config.target), sinks)
 }

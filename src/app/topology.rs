@@ -20,6 +20,7 @@
 //! | power | the GPIO line's descriptor, a second's timer | the same |
 //! | store | notices of the store, the pipeline's end, power going | opens the card again; the daemon flies on without |
 //! | link | its socket | calls again; the daemon flies on without |
+//! | metrics | its port on loopback, where one is configured | the port again; the daemon flies on without |
 //! | health | signals, the end of any task, a quarter-second timer | is the main thread; nothing restarts it |
 //!
 //! Threads of their own, and why:
@@ -67,10 +68,12 @@ use super::devices;
 use super::downlink::{self, Downlink, LinkTask};
 use super::event_queue::EventQueue;
 use super::flight_store::{FlightStore, StoreOrders};
+use super::metrics_task;
 use super::outlets;
 use super::pipeline_task::{self, Parts};
 use super::power_task::{self, PowerView};
 use super::presence::Presence;
+use super::sinks::LatestHealth;
 use super::status::SharedStatus;
 use super::supervise::{Restart, Supervisor, TaskRule};
 
@@ -92,6 +95,9 @@ pub const POWER: TaskRule = TaskRule { name: "power", restart: Restart::Retries 
 pub const AUTOPILOT: TaskRule = TaskRule { name: "autopilot", restart: Restart::Retries };
 /// The wireless link.
 pub const LINK: TaskRule = TaskRule { name: "link", restart: Restart::Retries };
+
+/// Answers on loopback, where they are configured.
+pub const METRICS: TaskRule = TaskRule { name: "metrics", restart: Restart::Retries };
 
 /// The running graph, as its health task sees it.
 pub struct Graph {
@@ -122,6 +128,7 @@ pub fn start(loaded: Loaded, clock: HostClock) -> std::io::Result<Graph> {
     let (flight_store, orders) = (FlightStore::default(), StoreOrders::default());
     let to_autopilot = ToAutopilot::default();
     let downlink = Downlink::new(&config, &to_autopilot);
+    let metrics = LatestHealth::default();
     let mut tasks = Supervisor::new(clock);
 
     tasks.spawn(LINK, |heart| {
@@ -137,7 +144,7 @@ pub fn start(loaded: Loaded, clock: HostClock) -> std::io::Result<Graph> {
     });
     tasks.spawn_thread(PIPELINE, {
         let (config, context, status) = (Arc::clone(&config), context.clone(), status.clone());
-        let outlets = outlets::of_daemon(&config, &flight_store, &downlink);
+        let outlets = outlets::of_daemon(&config, &flight_store, &downlink, &metrics);
         let orders = orders.clone();
         move |heart| {
             let parts = Parts { config, terrain, context, status, flight_store, outlets, orders, heart };
@@ -158,6 +165,9 @@ pub fn start(loaded: Loaded, clock: HostClock) -> std::io::Result<Graph> {
     if config.autopilot.is_some() {
         let (config, context, to_autopilot) = (Arc::clone(&config), context.clone(), to_autopilot.clone());
         tasks.spawn(AUTOPILOT, |heart| devices::autopilot(config, to_autopilot, context, heart));
+    }
+    if let Some(address) = config.daemon.metrics {
+        tasks.spawn(METRICS, |heart| metrics_task::run(address, metrics, context.clone(), heart));
     }
     tasks.spawn(CAMERA, |heart| devices::camera(Arc::clone(&config), context.clone(), heart));
     Ok(Graph { context, status, orders, power, tasks })

@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use super::{CliError, CliResult};
-use crate::app::ground::{self, GroundSettings};
+use crate::app::ground::{self, CotKeys, CotTo, GroundSettings};
 use crate::app::log;
 use crate::io::clock::HostClock;
 use crate::io::link::StationSettings;
@@ -58,6 +58,19 @@ pub(super) struct Args {
     /// Serve the vehicles as NMEA (RMC, GGA, GSA, GST) over TCP here, for example 127.0.0.1:10110
     #[arg(long, value_name = "ADDRESS:PORT")]
     nmea: Option<SocketAddr>,
+    /// Send vehicles and helicopters as Cursor on Target, for TAK: udp://ADDRESS:PORT (239.2.3.1:6969 is TAK's group),
+    /// tcp://HOST:PORT or tls://HOST:PORT; may be given several times
+    #[arg(long, value_name = "URL")]
+    cot: Vec<CotTo>,
+    /// Certificate of the authority that signed the TAK server's
+    #[arg(long, value_name = "FILE")]
+    cot_authority: Option<PathBuf>,
+    /// Own certificate for the TAK server
+    #[arg(long, value_name = "FILE", requires = "cot_key")]
+    cot_certificate: Option<PathBuf>,
+    /// Private key of that certificate
+    #[arg(long, value_name = "FILE", requires = "cot_certificate")]
+    cot_key: Option<PathBuf>,
     /// Serve Foxglove over its WebSocket; elsewhere than on loopback the token is asked for
     #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1:8765")]
     foxglove: Option<SocketAddr>,
@@ -130,6 +143,11 @@ pub(super) fn run(args: &Args) -> CliResult {
         position: args.position,
         nmea: args.nmea,
         foxglove: args.foxglove,
+        cot: args.cot.clone(),
+        cot_keys: CotKeys {
+            authority: args.cot_authority.clone(),
+            own: args.cot_certificate.clone().zip(args.cot_key.clone()),
+        },
         #[cfg(feature = "zenoh")]
         zenoh: args.zenoh.clone(),
         terminal: std::io::stdout().is_terminal(),

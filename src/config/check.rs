@@ -342,6 +342,12 @@ impl Config {
     fn check_daemon(&self) -> Result<(), ConfigError> {
         within("daemon.answer_within_s", self.daemon.answer_within_s, 1.0, 600.0)?;
         within("daemon.frame_queue", self.daemon.frame_queue as f64, 1.0, 30.0)?;
+        if let Some(address) = self.daemon.metrics.filter(|address| !address.ip().is_loopback()) {
+            refuse(
+                "daemon.metrics",
+                format!("{address} is not on loopback; the station tells metrics to others"),
+            )?;
+        }
         if let Some(volts) = self.power.low_voltage_v {
             within("power.low_voltage_v", volts, 0.1, 1_000.0)?;
         }

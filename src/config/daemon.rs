@@ -1,5 +1,7 @@
 //! `[daemon]` and `[power]`: what running unattended needs.
 
+use std::net::SocketAddr;
+
 use serde::{Deserialize, Serialize};
 
 /// `[daemon]`
@@ -14,11 +16,14 @@ pub struct DaemonConfig {
     /// recorded as dropped. More frames mean more latency under load, never more throughput. (A burst of up
     /// to 16 frames that is handled within half a second loses none.)
     pub frame_queue: usize,
+    /// Where health is told as OpenMetrics (`/metrics`), on loopback; nowhere where absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub metrics: Option<SocketAddr>,
 }
 
 impl Default for DaemonConfig {
     fn default() -> Self {
-        Self { optional: Vec::new(), answer_within_s: 5.0, frame_queue: 3 }
+        Self { optional: Vec::new(), answer_within_s: 5.0, frame_queue: 3, metrics: None }
     }
 }
 

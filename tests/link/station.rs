@@ -6,7 +6,7 @@ use std::time::Duration;
 use prost::Message as _;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
-use windhover::app::ground::{self, GroundSettings, mirror};
+use windhover::app::ground::{self, CotKeys, GroundSettings, mirror};
 use windhover::io::link::keys::Role;
 use windhover::io::proto::{timestamp, windhover as wh};
 use windhover::io::records::{Record, Schema};
@@ -72,6 +72,8 @@ fn alone(keys: &Keys, web: SocketAddr) -> GroundSettings {
         tiles: None,
         position: None,
         nmea: None,
+        cot: Vec::new(),
+        cot_keys: CotKeys::default(),
         foxglove: None,
         #[cfg(feature = "zenoh")]
         zenoh: None,

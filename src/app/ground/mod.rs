@@ -2,11 +2,12 @@
 //!
 //! ```text
 //! payloads ─► io::link ─► intake ─┬─► mirror (thread: MCAP, fsync once a second) ─► "stored" to the payload
-//!                                 ├─► view ─► web page, GeoJSON, KML, NMEA
+//!                                 ├─► view ─► web page, GeoJSON, KML, NMEA, Cursor on Target, OpenMetrics
 //!                                 ├─► Foxglove, Zenoh
 //!                                 └─► one line a second per payload
 //! ```
 
+mod cot;
 mod door;
 mod feeds;
 #[cfg(feature = "zenoh")]
@@ -20,6 +21,8 @@ mod nmea_port;
 mod terminal;
 pub mod view;
 pub mod web;
+
+pub use cot::{CotKeys, CotTo};
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -65,6 +68,10 @@ pub struct GroundSettings {
     pub position: Option<[f64; 2]>,
     /// Where NMEA is served over TCP.
     pub nmea: Option<SocketAddr>,
+    /// Where position reports are sent as Cursor on Target.
+    pub cot: Vec<CotTo>,
+    /// With which files, over TLS.
+    pub cot_keys: CotKeys,
     /// Where Foxglove is served over its WebSocket.
     pub foxglove: Option<SocketAddr>,
     /// How Zenoh is joined: an endpoint, or a file with Zenoh's own configuration.
@@ -100,6 +107,9 @@ pub enum GroundError {
         /// What Zenoh said.
         source: zenoh::Error,
     },
+    /// Cursor on Target over TLS.
+    #[error("station: {0}")]
+    Cot(String),
     /// The system.
     #[error("station: {0}")]
     System(#[from] std::io::Error),
@@ -182,6 +192,15 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
         let listener = listen(address).await?;
         terminal.line(format_args!("NMEA at tcp://{}", listener.local_addr()?));
         tasks.spawn(nmea_port::serve(Door::new(listener, "nmea"), Arc::clone(&view)));
+    }
+    if !settings.cot.is_empty() {
+        let over_tls = settings.cot.iter().any(|to| matches!(to, CotTo::Tls(_)));
+        let tls =
+            over_tls.then(|| cot::connector(&settings.cot_keys)).transpose().map_err(GroundError::Cot)?;
+        for to in &settings.cot {
+            terminal.line(format_args!("Cursor on Target to {to}"));
+        }
+        tasks.spawn(cot::serve(settings.cot.clone(), tls, Arc::clone(&view)));
     }
     let (to_disk, from_link) = std::sync::mpsc::sync_channel(DISK_QUEUE);
     let disk_handle = handle.clone();

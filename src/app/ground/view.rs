@@ -7,6 +7,7 @@ use prost::Message as _;
 use serde_json::{Value, json};
 use tokio::time::Instant;
 
+use crate::app::openmetrics::{self, Told};
 use crate::io::link::{Arrival, PayloadStatus};
 use crate::io::proto::{foxglove, host_time, link::Thumbnail, windhover as wh};
 use crate::io::records::topic;
@@ -64,6 +65,19 @@ impl Vehicle {
     }
 }
 
+/// A helicopter as last known.
+#[derive(Clone, Debug)]
+pub struct Helicopter {
+    /// Name of the payload.
+    pub payload: String,
+    /// Its own state.
+    pub state: wh::Ownship,
+    /// How old that state is.
+    pub age: Span,
+    /// UTC of that state, where the payload's receiver told it.
+    pub utc: Option<UtcTime>,
+}
+
 #[derive(Default)]
 struct Target {
     latest: Option<wh::TargetState>,
@@ -76,7 +90,10 @@ struct Target {
 struct Payload {
     targets: BTreeMap<String, Target>,
     own: Option<(i64, Arc<str>)>,
+    own_state: Option<wh::Ownship>,
     health: Option<(i64, Arc<str>)>,
+    health_told: Option<wh::Health>,
+    linked: Option<(bool, f64)>,
     datum: Option<Arc<str>>,
     notices: VecDeque<Arc<str>>,
     thumbnail: Option<(Arc<str>, Arc<[u8]>)>,
@@ -182,6 +199,7 @@ impl View {
                 payload.live_hz = grown(s.live, payload.live.0) / passed_s.max(0.1);
                 payload.kbps = grown(s.bytes, payload.live.1) * 8e-3 / passed_s.max(0.1);
                 payload.live = (s.live, s.bytes);
+                payload.linked = Some((s.connected, s.rtt_ms));
                 let (at, utc_ms) = (payload.clock.at(now).map(ms), payload.clock.utc_minus_host_ms());
                 json!({"name": s.name, "up": s.connected, "now": at, "utc_ms": utc_ms, "address": s.address.to_string(),
                     "rtt_ms": s.rtt_ms, "silent_ms": s.silent.as_millis() as u64, "software": s.software,
@@ -240,6 +258,27 @@ impl View {
             p.targets.iter().filter_map(known).collect()
         };
         self.payloads.iter().flat_map(of).collect()
+    }
+
+    /// Every helicopter whose place is one of now.
+    pub fn helicopters(&self, now: Instant) -> Vec<Helicopter> {
+        let of = |(name, p): (&String, &Payload)| {
+            let state = p.own_state.clone()?;
+            let t = host_time(state.timestamp.as_ref());
+            let age = p.clock.age(t, now);
+            (age <= CURRENT).then(|| Helicopter { payload: name.clone(), age, utc: p.clock.utc(t), state })
+        };
+        self.payloads.iter().filter_map(of).collect()
+    }
+
+    /// The health of every payload as OpenMetrics.
+    pub fn metrics(&self, now: Instant) -> String {
+        let told = self.payloads.iter().filter_map(|(payload, p)| {
+            let health = p.health_told.as_ref()?;
+            let age_s = Some(p.clock.age(host_time(health.timestamp.as_ref()), now).s());
+            Some(Told { payload, health, age_s, link: p.linked })
+        });
+        openmetrics::render(&told.collect::<Vec<_>>())
     }
 
     /// One line a payload, for a terminal.
@@ -336,6 +375,7 @@ impl Payload {
             .into();
         if self.own.as_ref().is_none_or(|(last, _)| *last <= t.ns()) {
             self.own = Some((t.ns(), Arc::clone(&text)));
+            self.own_state = Some(own.clone());
         }
         Some(text)
     }
@@ -377,6 +417,7 @@ impl Payload {
         .into();
         if self.health.as_ref().is_none_or(|(last, _)| *last <= t.ns()) {
             self.health = Some((t.ns(), Arc::clone(&text)));
+            self.health_told = Some(health.clone());
         }
         Some(text)
     }

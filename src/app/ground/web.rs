@@ -21,6 +21,7 @@ use tokio::time::Instant;
 use super::door::Door;
 use super::feeds;
 use super::view::View;
+use crate::app::openmetrics;
 
 const INDEX: &str = include_str!("page/index.html");
 const STYLE: &str = include_str!("page/style.css");
@@ -66,6 +67,7 @@ impl Web {
             .route("/vehicles.geojson", get(geojson))
             .route("/vehicles.kml", get(kml))
             .route("/network.kml", get(network_link))
+            .route("/metrics", get(metrics))
             .route("/tiles/{z}/{x}/{y}", get(tile))
             .layer(axum::middleware::from_fn_with_state(self.clone(), guard))
             .with_state(self)
@@ -192,6 +194,10 @@ async fn thumbnail(State(web): State<Web>, Path(payload): Path<String>) -> Respo
 
 async fn geojson(State(web): State<Web>) -> Response {
     text("application/geo+json", feeds::geojson(&web.view().vehicles(Instant::now())))
+}
+
+async fn metrics(State(web): State<Web>) -> Response {
+    text(openmetrics::CONTENT_TYPE, web.view().metrics(Instant::now()))
 }
 
 async fn kml(State(web): State<Web>) -> Response {

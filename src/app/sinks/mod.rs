@@ -4,8 +4,10 @@ mod card;
 mod flight_file;
 mod ground_link;
 mod mavlink;
+mod metrics;
 
 pub use card::CardSink;
 pub use flight_file::FlightFile;
 pub use ground_link::LinkSink;
 pub use mavlink::MavlinkSink;
+pub use metrics::{LatestHealth, MetricsSink};

@@ -1,0 +1,206 @@
+//! Health as OpenMetrics, for Prometheus and its kin (<https://github.com/prometheus/OpenMetrics>, version 1.0).
+
+use std::fmt::Write as _;
+
+use crate::io::proto::windhover::{Health, TrackStatus};
+
+/// What answers name as their kind.
+pub const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+
+/// What is told of one payload.
+#[derive(Clone, Debug)]
+pub struct Told<'a> {
+    /// Its name; empty where it tells of itself.
+    pub payload: &'a str,
+    /// Its latest health.
+    pub health: &'a Health,
+    /// How old that is, where somebody else tells it.
+    pub age_s: Option<f64>,
+    /// Whether it is connected, and the round trip, where there is a link.
+    pub link: Option<(bool, f64)>,
+}
+
+/// Labels and a figure.
+type Sample = (Vec<(&'static str, String)>, f64);
+
+/// One kind of figure: name, gauge or counter, what it is, where it comes from.
+struct Family {
+    name: &'static str,
+    kind: &'static str,
+    help: &'static str,
+    samples: fn(&Told<'_>) -> Vec<Sample>,
+}
+
+const FAMILIES: &[Family] = &[
+    gauge("windhover_health_age_seconds", "Age of all that follows.", |t| one(t.age_s)),
+    gauge("windhover_link_up", "Whether the payload is connected.", |t| {
+        one(t.link.map(|(up, _)| f64::from(u8::from(up))))
+    }),
+    gauge("windhover_link_round_trip_seconds", "Round trip to the payload.", |t| {
+        one(t.link.map(|(_, ms)| ms * 1e-3))
+    }),
+    gauge("windhover_source_rate_hertz", "Messages of a source in the last second.", |t| {
+        sources(t, |s| Some(s.rate_hz))
+    }),
+    gauge("windhover_source_age_seconds", "Age of a source's last message; absent before the first.", |t| {
+        sources(t, |s| (s.age_ms >= 0.0).then_some(s.age_ms * 1e-3))
+    }),
+    counter("windhover_source_messages", "Messages of a source.", |t| sources(t, |s| Some(s.total as f64))),
+    counter("windhover_source_refused", "Messages of a source that were refused.", |t| {
+        sources(t, |s| Some(s.refused as f64))
+    }),
+    counter("windhover_source_dropped", "Messages of a source lost before they were recorded.", |t| {
+        sources(t, |s| Some(s.dropped as f64))
+    }),
+    counter("windhover_measurements", "Measurements by what became of them in the filter.", |t| {
+        let of = |(what, count): (&String, &u64)| (vec![("disposition", what.clone())], *count as f64);
+        t.health.dispositions.iter().map(of).collect()
+    }),
+    gauge("windhover_gps_fix_dimensions", "0 no fix, 2 or 3 dimensions.", |t| one(Some(t.health.fix.into()))),
+    gauge("windhover_gps_satellites", "Satellites used.", |t| one(Some(t.health.sats.into()))),
+    gauge("windhover_clock_sigma_seconds", "One sigma of the fit from UTC to host time.", |t| {
+        one(Some(t.health.clock_sigma_ms).filter(|ms| *ms >= 0.0).map(|ms| ms * 1e-3))
+    }),
+    gauge("windhover_target_status", "1 for the status that holds.", |t| {
+        let all = [
+            (TrackStatus::Lost, "lost"),
+            (TrackStatus::Acquiring, "acquiring"),
+            (TrackStatus::Tracking, "tracking"),
+            (TrackStatus::Coasting, "coasting"),
+        ];
+        let of = |(target, (status, word)): (&crate::io::proto::windhover::TargetHealth, _)| {
+            let holds = f64::from(u8::from(target.status() == status));
+            (vec![("target", target.name.clone()), ("status", String::from(word))], holds)
+        };
+        t.health.targets.iter().flat_map(|target| all.map(|status| (target, status))).map(of).collect()
+    }),
+    gauge(
+        "windhover_target_frames_seen",
+        "Frames of the last second in which a marker of it was seen.",
+        |t| {
+            let of = |target: &crate::io::proto::windhover::TargetHealth| {
+                (vec![("target", target.name.clone())], f64::from(target.frames_seen))
+            };
+            t.health.targets.iter().map(of).collect()
+        },
+    ),
+    gauge("windhover_target_sigma", "One sigma of a target's state, in metres, radians and seconds.", sigmas),
+    gauge("windhover_misfits", "What does not fit the configuration now.", |t| {
+        one(Some(t.health.misfits.len() as f64))
+    }),
+    gauge(
+        "windhover_figure",
+        "Figures of the daemon: card, link, temperature, latency; the name tells the unit.",
+        |t| {
+            let of = |(name, figure): (&String, &f64)| (vec![("name", name.clone())], *figure);
+            let mut all: Vec<Sample> = t.health.figures.iter().map(of).collect();
+            all.sort_by(|a, b| a.0.cmp(&b.0));
+            all
+        },
+    ),
+];
+
+const fn gauge(name: &'static str, help: &'static str, samples: fn(&Told<'_>) -> Vec<Sample>) -> Family {
+    Family { name, kind: "gauge", help, samples }
+}
+
+const fn counter(name: &'static str, help: &'static str, samples: fn(&Told<'_>) -> Vec<Sample>) -> Family {
+    Family { name, kind: "counter", help, samples }
+}
+
+fn one(figure: Option<f64>) -> Vec<Sample> {
+    figure.into_iter().map(|figure| (Vec::new(), figure)).collect()
+}
+
+fn sources(
+    told: &Told<'_>,
+    of: fn(&crate::io::proto::windhover::SourceHealth) -> Option<f64>,
+) -> Vec<Sample> {
+    let sample = |s| {
+        let s: &crate::io::proto::windhover::SourceHealth = s;
+        Some((vec![("source", s.name.clone())], of(s)?))
+    };
+    told.health.sources.iter().filter_map(sample).collect()
+}
+
+/// Of the covariance's diagonal.
+fn sigmas(told: &Told<'_>) -> Vec<Sample> {
+    const DIAGONAL: [(usize, &str); 5] =
+        [(0, "north_m"), (5, "east_m"), (9, "heading_rad"), (12, "speed_mps"), (14, "yaw_rate_radps")];
+    let mut all = Vec::new();
+    for target in &told.health.targets {
+        let covariance = target.state.as_ref().map_or(&[][..], |state| &state.covariance);
+        for (at, figure) in DIAGONAL {
+            if let Some(variance) = covariance.get(at).filter(|variance| **variance >= 0.0) {
+                let labels = vec![("target", target.name.clone()), ("figure", figure.to_owned())];
+                all.push((labels, variance.sqrt()));
+            }
+        }
+    }
+    all
+}
+
+/// The text of all payloads.
+pub fn render(payloads: &[Told<'_>]) -> String {
+    let mut text = String::new();
+    for Family { name, kind, help, samples } in FAMILIES {
+        let mut head = false;
+        for told in payloads {
+            for (mut labels, figure) in samples(told) {
+                if !figure.is_finite() {
+                    continue;
+                }
+                if !std::mem::replace(&mut head, true) {
+                    // Writing into a String cannot fail.
+                    let _ = write!(text, "# TYPE {name} {kind}\n# HELP {name} {help}\n");
+                }
+                if !told.payload.is_empty() {
+                    labels.insert(0, ("payload", told.payload.to_owned()));
+                }
+                let suffix = if *kind == "counter" { "_total" } else { "" };
+                let _ = writeln!(text, "{name}{suffix}{} {figure}", braced(&labels));
+            }
+        }
+    }
+    text + "# EOF\n"
+}
+
+fn braced(labels: &[(&str, String)]) -> String {
+    if labels.is_empty() {
+        return String::new();
+    }
+    let escaped = |value: &str| value.replace('\\', "\\\\").replace('"', "\\\"").replace('\n', "\\n");
+    let all: Vec<String> =
+        labels.iter().map(|(name, value)| format!("{name}=\"{}\"", escaped(value))).collect();
+    format!("{{{}}}", all.join(","))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::io::proto::windhover::SourceHealth;
+
+    #[test]
+    fn families_are_whole_and_labels_escaped() {
+        let source = |name: &str, age_ms| SourceHealth {
+            name: name.into(),
+            rate_hz: 5.0,
+            age_ms,
+            total: 7,
+            ..Default::default()
+        };
+        let health =
+            Health { sources: vec![source("gps", 120.0), source("a\"b\n", -1.0)], ..Default::default() };
+        let told = |payload| Told { payload, health: &health, age_s: None, link: None };
+        let text = render(&[told("one"), told("two")]);
+        assert_eq!(text.matches("# TYPE windhover_source_rate_hertz gauge\n").count(), 1);
+        assert!(
+            text.contains("windhover_source_messages_total{payload=\"two\",source=\"gps\"} 7\n"),
+            "{text}"
+        );
+        assert!(text.contains("{payload=\"one\",source=\"a\\\"b\\n\"} 5\n"), "{text}");
+        assert_eq!(text.matches("windhover_source_age_seconds{").count(), 2, "{text}");
+        assert!(text.ends_with("# EOF\n") && !text.contains("link_up"));
+        assert!(render(&[Told { payload: "", ..told("one") }]).contains("windhover_gps_satellites 0\n"));
+    }
+}
