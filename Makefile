@@ -66,7 +66,7 @@ test-web: setup-python debug
 
 # Other people's programs against a flying payload and its station.
 test-clients: setup debug
-	@sh tests/setup/packages.sh python3 python3-venv gpsd gpsd-clients gdal-bin ffmpeg
+	@sh tests/setup/packages.sh python3 python3-venv gpsd gpsd-clients gdal-bin ffmpeg prometheus
 	@sh tests/setup/venv.sh $(VENV)-clients tests/clients/requirements.txt
 	$(VENV)-clients/bin/python -m unittest discover -s tests/clients -p 'test_*.py' -v
 
