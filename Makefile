@@ -6,7 +6,7 @@ VENV  ?= target/venv
 DEMO  ?= demo
 
 .PHONY: help setup setup-python build debug demo test test-python test-web test-real test-zenoh test-clients fuzz soak proofs check lint docs configs \
-        licences oldest aarch64 bench load misfit-table clean deb hil hil-long hil-short hil-tools
+        licences oldest aarch64 bench load misfit-table clean deb sbom hil hil-long hil-short hil-tools
 
 help:
 	@echo "make demo     build, simulate a flight, replay it, compare with the truth, write a report page"
@@ -24,6 +24,7 @@ help:
 	@echo "make load     five minutes of raw frames at full pace: latency, processor time, memory, losses"
 	@echo "make misfit-table  flights that their configuration does not fit, against nominal twins (an hour)"
 	@echo "make deb      a Debian package in target/debian"
+	@echo "make sbom     what is built in, as CycloneDX, in target/windhover.cdx.json"
 	@echo "make hil      the virtual payload computer: install, boot, fly, compare (as root)"
 	@echo "make hil-long the same with every scenario"
 	@echo "make hil-short the same with cold boot, unplugged devices and landing; skips where it cannot run (a check)"
@@ -147,6 +148,11 @@ deb: build
 	target/release/windhover generate completions target/generated/completions
 	test -x target/tools/bin/cargo-deb || $(CARGO) install cargo-deb --version 3.8.0 --locked --root target/tools
 	target/tools/bin/cargo-deb --no-build --locked --strip
+
+# Every crate that is built into the program, with licence, place and checksum. The same sources give the same bytes.
+sbom:
+	@mkdir -p target
+	python3 .ci/sbom > target/windhover.cdx.json
 
 hil hil-long: PARTS = --bin windhover --example hil_feed --example hil_frames --example hil_stream
 hil hil-long: deb hil-tools

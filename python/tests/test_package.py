@@ -66,6 +66,20 @@ class Package(unittest.TestCase):
         np.testing.assert_allclose(self.flight.datum, self.table("datum").iloc[0], atol=1e-4)
         self.assertEqual(self.flight.config["target"][0]["name"], "ugv")
 
+    def test_refined_states_are_those_of_the_csv(self):
+        rig.windhover("refine", self.path, "--out", self.at / "refined.mcap")
+        rig.windhover("export", self.at / "refined.mcap", "--format", "csv", "--out", self.at / "refined")
+        flight, told = Flight(self.at / "refined.mcap"), pd.read_csv(self.at / "refined/refined.csv")
+        states = flight.states("ugv", "refined")
+        self.assertGreater(len(states), 50)
+        np.testing.assert_array_equal(states.index, told.time_ns)
+        np.testing.assert_allclose(states[["north_m", "heading_rad", "lat_deg"]], told[["north_m", "heading_rad", "lat_deg"]], atol=1e-6, rtol=0)
+        upper = told[[c for c in told if c.startswith("p_")]].to_numpy()
+        rows, columns = np.triu_indices(5)
+        np.testing.assert_allclose(flight.covariance("ugv", "refined")[:, rows, columns], upper, rtol=1e-9)
+        self.assertGreater(len(flight.ownship_refined), 50)
+        self.assertEqual(flight.ownship_refined_covariance.shape, (len(flight.ownship_refined), 9, 9))
+
     def test_frames_are_the_recordings(self):
         frames = list(self.flight.frames())
         np.testing.assert_array_equal([f.number for f in frames], self.table("estimates").frame)

@@ -112,9 +112,22 @@ class Flight:
         variances = np.diagonal(self.covariance(target, kind), axis1=1, axis2=2)
         return pd.DataFrame(np.sqrt(variances), columns=tables.FIGURES, index=self.states(target, kind).index)
 
+    def _own_states(self, topic):
+        return sorted((m for _, m in self._messages.get(topic, [])), key=lambda m: tables.nanoseconds(m.timestamp))
+
     @functools.cached_property
     def _own(self):
-        return sorted((m for _, m in self._messages.get("/ownship/state", [])), key=lambda m: tables.nanoseconds(m.timestamp))
+        return self._own_states("/ownship/state")
+
+    @functools.cached_property
+    def ownship_refined(self):
+        """The same as `windhover refine` found it from the whole flight."""
+        return tables.ownship(self._own_states("/ownship/refined"))
+
+    @functools.cached_property
+    def ownship_refined_covariance(self):
+        """n×9×9, rows as in `ownship_refined`."""
+        return tables.symmetric([m.covariance for m in self._own_states("/ownship/refined")], 9)
 
     @functools.cached_property
     def ownship(self):
