@@ -91,7 +91,7 @@ fn main() {
     ]);
     pieces.push(ubx_framed(1, 0x3C, &[1; 64]));
     pieces.push([0x55, 0x53, 1, 2, 3, 4, 5, 6, 7, 8, 0xCC].repeat(4));
-    pieces.push(vec![0x00, 0x05, 0x01, 0xEF, 0xD4].repeat(6));
+    pieces.push([0x00, 0x05, 0x01, 0xEF, 0xD4].repeat(6));
     let bytes = mixed(&pieces, SECONDS * PACE);
     for format in CompassFormat::ALL {
         let (mut decoder, mut out) = (CompassDecoder::new(format), Vec::new());
