@@ -16,14 +16,14 @@ fn sharp(scenario: &mut Scenario) {
     (scenario.camera.marker_noise_px, scenario.camera.feature_noise_px) = (0.1, 0.1);
 }
 
-/// Something that goes about with features upon it, at an instant.
-struct Mover {
+/// Something that goes about, or stands, with features upon it, at an instant.
+pub(super) struct Mover {
     /// North, east, m.
-    at: [f64; 2],
+    pub(super) at: [f64; 2],
     /// Metres over the ground, and apart from each other.
-    height_m: f64,
-    spread_m: f64,
-    features: u32,
+    pub(super) height_m: f64,
+    pub(super) spread_m: f64,
+    pub(super) features: u32,
 }
 
 impl Mover {
@@ -36,7 +36,11 @@ impl Mover {
 
 /// The flight with movers' features in the place of the first of the ground's; or, where they are not `followed`, without
 /// those of the ground. Tracks end at the frame's border.
-fn with_movers(mut flight: Flight, movers: impl Fn(&World, f64) -> Vec<Mover>, followed: bool) -> Flight {
+pub(super) fn with_movers(
+    mut flight: Flight,
+    movers: impl Fn(&World, f64) -> Vec<Mover>,
+    followed: bool,
+) -> Flight {
     let world = flight.world.clone();
     let camera = world.scenario().rig.camera.clone();
     let mut noise = Stream::new(77, 0);
