@@ -13,7 +13,7 @@ help:
 	@echo "make test     every test"
 	@echo "make test-web the station's page in headless Chromium (half a minute)"
 	@echo "make test-real DATA=FOLDER  real recordings, photographs and flights against bars (tests/real)"
-	@echo "make test-clients  gpsd, GDAL and MAVProxy against a flying payload and its station"
+	@echo "make test-clients  gpsd, GDAL, MAVProxy, readers of ROS bags against a payload, its station, its flights"
 	@echo "make fuzz     every parser of strangers' bytes under a fuzzer, a minute each (FUZZ_S=600: ten)"
 	@echo "make soak     an hour with hostile peers, slow readers, flapping devices, a card that comes and goes"
 	@echo "make test-zenoh the station on Zenoh, met by the Python client (builds the feature zenoh: minutes)"
@@ -57,6 +57,7 @@ test: setup-python
 # The flight file opened by readers that know nothing of us.
 test-python: setup-python debug
 	$(VENV)/bin/python -m unittest discover -s tests/python -p 'test_*.py' -v
+	$(VENV)/bin/python -m unittest discover -s python/tests -p 'test_*.py' -v
 
 # The station's page in headless Chromium, fed by a running payload; pictures in target/web.
 test-web: setup-python debug

@@ -80,6 +80,7 @@ fn io_names_no_stage() {
         "windhover_detect",
         "windhover_estimate",
         "windhover_calibrate",
+        "windhover_refine",
         "windhover_simulate",
         "GnssDecoder",
         "CompassDecoder",

@@ -24,6 +24,8 @@ pub struct Track {
     pub smoothed: Vec<wh::TargetState>,
     /// By the paper's method.
     pub paper: Vec<wh::TargetState>,
+    /// From the whole flight at once.
+    pub refined: Vec<wh::TargetState>,
 }
 
 /// A frame's arrival.
@@ -63,6 +65,10 @@ pub struct Flight {
     pub targets: BTreeMap<String, Track>,
     /// The helicopter's own state, at frames and between them, in order of time.
     pub ownship: Vec<wh::Ownship>,
+    /// The same from the whole flight at once.
+    pub ownship_refined: Vec<wh::Ownship>,
+    /// What a refinement says of the configuration.
+    pub refined: Option<wh::Refined>,
     /// GPS epochs.
     pub epochs: Vec<wh::GnssEpoch>,
     /// Compass samples.
@@ -119,6 +125,11 @@ impl Flight {
                 keep(&mut self.ownship, raw);
                 self.ownship.pop_if(|own| !own.is_sound());
             }
+            topic::OWNSHIP_REFINED => {
+                keep(&mut self.ownship_refined, raw);
+                self.ownship_refined.pop_if(|own| !own.is_sound());
+            }
+            topic::REFINED => self.refined = wh::Refined::decode(&raw.data[..]).ok().or(self.refined.take()),
             topic::GPS_EPOCH => keep(&mut self.epochs, raw),
             topic::COMPASS_ATTITUDE => keep(&mut self.attitudes, raw),
             topic::CAMERA_DETECTIONS => keep(&mut self.detections, raw),
@@ -140,7 +151,7 @@ impl Flight {
         let Some((name, what)) = topic.strip_prefix("/target/").and_then(|rest| rest.rsplit_once('/')) else {
             return;
         };
-        let wanted = matches!(what, "state" | "smoothed" | "paper");
+        let wanted = matches!(what, "state" | "smoothed" | "paper" | "refined");
         if !wanted {
             return;
         }
@@ -155,6 +166,7 @@ impl Flight {
         let states = match what {
             "state" => &mut track.filtered,
             "smoothed" => &mut track.smoothed,
+            "refined" => &mut track.refined,
             _ => &mut track.paper,
         };
         keep(states, raw);

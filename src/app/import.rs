@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 
 use crate::io::capture::CaptureWriter;
 use crate::io::import::{
-    Frames, ImportError, Samples, VideoSource, open_video, read_attitude, read_inertial, read_serial_log,
+    Frames, ImportError, ImportedLog, Samples, VideoSource, open_video, read_attitude, read_bag,
+    read_inertial, read_log, read_serial_log,
 };
 use crate::io::mcap_write::WriteError;
 use crate::text::counted;
@@ -23,6 +24,12 @@ pub struct Sources {
     pub imu: Option<PathBuf>,
     /// Table of a second source of attitude.
     pub attitude: Option<PathBuf>,
+    /// Log of an autopilot, or subtitles of a camera.
+    pub log: Option<PathBuf>,
+    /// Bag of ROS 1 or ROS 2.
+    pub bag: Option<PathBuf>,
+    /// Topics of the bag to use where there are several of a kind.
+    pub topics: Vec<String>,
     /// Video file, or folder of images.
     pub video: Option<PathBuf>,
     /// When the video's first frame was taken; with the first line of the logs where absent.
@@ -39,8 +46,13 @@ pub enum ImportFailure {
     #[error(transparent)]
     Write(#[from] WriteError),
     /// Nothing was asked for.
-    #[error("nothing to import: give at least one of --gps, --compass, --imu, --attitude, --video")]
+    #[error(
+        "nothing to import: give at least one of --gps, --compass, --imu, --attitude, --log, --bag, --video"
+    )]
     Nothing,
+    /// Two sources tell the same.
+    #[error("--log and --bag both tell of the helicopter: give one of them, or a bag of images alone")]
+    Twice,
 }
 
 /// What was imported.
@@ -54,6 +66,10 @@ pub struct Imported {
     pub imu_samples: usize,
     /// Samples of the second source of attitude.
     pub attitude_samples: usize,
+    /// Packets of the autopilot.
+    pub packets: usize,
+    /// Fixes, attitudes and inertial samples of which packets were made.
+    pub measured: [usize; 3],
     /// Frames.
     pub frames: u32,
     /// How the video was read.
@@ -96,19 +112,57 @@ pub fn import(sources: &Sources, config_toml: &str, out: &Path) -> Result<Import
         let event = |(t, sample)| (t, EventBody::Attitude { source: Source::Attitude, sample });
         serial.extend(samples.into_iter().map(event));
     }
+    let bag = sources.bag.as_deref().map(|path| read_bag(path, &sources.topics)).transpose()?;
+    let log = sources.log.as_deref().map(|path| read_log(path, sources.video_start)).transpose()?;
+    let mut start = sources.video_start;
+    let mut made_of = String::new();
+    let mut bag_frames = None;
+    if let Some(log) = log {
+        start = start.or(log.video_start);
+        made_of = packets(log, &mut serial, &mut imported);
+    }
+    if let Some(bag) = bag {
+        bag_frames = bag.frames()?;
+        if imported.packets > 0 && !bag.log.packets.is_empty() {
+            return Err(ImportFailure::Twice);
+        }
+        let of_bag = packets(bag.log, &mut serial, &mut imported);
+        made_of = if made_of.is_empty() { of_bag } else { made_of };
+    }
     serial.sort_by_key(|(t, _)| *t);
-    let start = sources.video_start.or_else(|| serial.first().map(|(t, _)| *t)).unwrap_or_default();
-    let frames: Frames = match &sources.video {
-        Some(path) => {
+    let start = start.or_else(|| serial.first().map(|(t, _)| *t)).unwrap_or_default();
+    let frames: Frames = match (&sources.video, bag_frames) {
+        (Some(path), _) => {
             let (how, frames) = open_video(path, start)?;
             imported.video = Some(how);
             frames
         }
-        None if serial.is_empty() => return Err(ImportFailure::Nothing),
-        None => Box::new(std::iter::empty()),
+        (None, Some(frames)) => frames,
+        (None, None) if serial.is_empty() => return Err(ImportFailure::Nothing),
+        (None, None) => Box::new(std::iter::empty()),
     };
-    write(serial, frames.peekable(), config_toml, out, &mut imported)?;
+    let merged = Merged { serial, frames: frames.peekable(), made_of };
+    write(merged, config_toml, out, &mut imported)?;
     Ok(imported)
+}
+
+/// Takes a log's packets over; gives what they were made of.
+fn packets(log: ImportedLog, serial: &mut Vec<(MonoTime, EventBody)>, imported: &mut Imported) -> String {
+    imported.packets += log.packets.len();
+    imported.measured = std::array::from_fn(|k| imported.measured[k] + log.counts[k]);
+    imported.warnings.extend(log.warnings);
+    let event = |(t, data)| (t, EventBody::Bytes { source: Source::Autopilot, data });
+    serial.extend(log.packets.into_iter().map(event));
+    log.made_of
+}
+
+/// What goes into a capture.
+struct Merged {
+    /// In order of time.
+    serial: Vec<(MonoTime, EventBody)>,
+    frames: Peekable<Frames>,
+    /// Of what the autopilot's packets were made; empty where they are its own.
+    made_of: String,
 }
 
 fn serial_lines(path: &Path, warnings: &mut Vec<String>) -> Result<Vec<(MonoTime, Vec<u8>)>, ImportError> {
@@ -138,12 +192,12 @@ fn rows<T>(path: &Path, table: Samples<T>, warnings: &mut Vec<String>) -> Vec<(M
 }
 
 fn write(
-    serial: Vec<(MonoTime, EventBody)>,
-    mut frames: Peekable<Frames>,
+    merged: Merged,
     config_toml: &str,
     out: &Path,
     imported: &mut Imported,
 ) -> Result<(), ImportFailure> {
+    let Merged { serial, mut frames, made_of } = merged;
     let mut serial = serial.into_iter().peekable();
     let mut writer: Option<CaptureWriter> = None;
     let (mut first, mut seq) = (None, 0);
@@ -172,7 +226,13 @@ fn write(
         imported.length = t_recv - began;
         let writer = match &mut writer {
             Some(writer) => writer,
-            empty => empty.insert(CaptureWriter::create(out, config_toml, began)?),
+            empty => {
+                let created = empty.insert(CaptureWriter::create(out, config_toml, began)?);
+                if !made_of.is_empty() {
+                    created.made_of(Source::Autopilot.topic(), &made_of);
+                }
+                created
+            }
         };
         writer.write(&Event { t_recv, seq, body })?;
         seq += 1;

@@ -1,4 +1,6 @@
-//! A flight's messages as the measurements that calibration works on.
+//! A flight's messages as the measurements that calibration and refinement work on.
+
+use std::collections::BTreeMap;
 
 use nalgebra::{Matrix2, Vector2, Vector3};
 use prost_types::Timestamp;
@@ -7,8 +9,10 @@ use super::flight::Flight;
 use crate::io::proto::{host_time, windhover as wh};
 use crate::io::records::to_attitude;
 use windhover_base::msg::TagFamily;
-use windhover_base::msg::{FixKind, GnssEpoch, MarkerDetection, MarkerId, Stamped};
-use windhover_base::time::UtcTime;
+use windhover_base::msg::{
+    FeatureTrack, FixKind, FrameObservations, GnssEpoch, MarkerDetection, MarkerId, Stamped,
+};
+use windhover_base::time::{MonoTime, Span, UtcTime};
 use windhover_calibrate::boresight::Recording;
 
 /// The raw measurements of a flight, stamped with their times of validity.
@@ -23,6 +27,36 @@ pub fn recording(flight: &Flight) -> Recording {
             .collect(),
     }
 }
+
+/// Everything that a refinement of the whole flight takes.
+pub fn whole(flight: &Flight) -> windhover_refine::Recording {
+    let mut heard: BTreeMap<u32, MonoTime> = BTreeMap::new();
+    for (number, arrival) in flight.frames.iter().enumerate() {
+        heard.insert(number as u32, arrival.t_recv);
+    }
+    let frame = |d: &wh::Detections| {
+        let t_valid = host_time(d.timestamp.as_ref());
+        let features = d.features.iter().map(|f| FeatureTrack {
+            id: f.id,
+            px: Vector2::new(f.u, f.v),
+            sigma_px: f.sigma_px,
+        });
+        let markers = d.markers.iter().filter_map(marker).collect();
+        // Where the frame itself was not kept it was looked at about then.
+        let t_recv = heard.get(&d.frame).copied().filter(|t| *t >= t_valid).unwrap_or(t_valid + LOOKED_AT);
+        let value = FrameObservations { frame: d.frame, markers, features: features.collect() };
+        Stamped { t_valid, t_recv, seq: 0, value }
+    };
+    let Recording { gnss, attitude, .. } = recording(flight);
+    windhover_refine::Recording {
+        epochs: gnss,
+        readings: attitude,
+        frames: flight.detections.iter().map(frame).collect(),
+    }
+}
+
+/// From a frame's exposure until it is looked at, where that is not recorded.
+const LOOKED_AT: Span = Span::from_ns(60_000_000);
 
 fn stamped<T>(t: &Option<Timestamp>, heard: &Option<Timestamp>, value: T) -> Stamped<T> {
     Stamped { t_valid: host_time(t.as_ref()), t_recv: host_time(heard.as_ref()), seq: 0, value }
@@ -52,10 +86,16 @@ fn epoch(e: &wh::GnssEpoch) -> GnssEpoch {
         vel_has_down: e.vel_ned_mps.len() == 3,
         hpe_m: e.hpe_m,
         vpe_m: e.vpe_m,
+        position_sigma_m: three(&e.position_sigma_m),
+        velocity_sigma_mps: three(&e.velocity_sigma_mps),
         sats: e.sats,
         hdop: e.hdop,
         ..GnssEpoch::default()
     }
+}
+
+fn three(values: &[f64]) -> Option<Vector3<f64>> {
+    <[f64; 3]>::try_from(values).ok().map(Vector3::from)
 }
 
 /// `None` for kinds and families this version does not know.

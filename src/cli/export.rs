@@ -1,4 +1,4 @@
-//! `windhover export FLIGHT --format csv|geojson|kml [--out DIR]`
+//! `windhover export FLIGHT --format csv|geojson|kml|rosbag2 [--out DIR]`
 
 use std::path::{Path, PathBuf};
 
@@ -8,11 +8,12 @@ use crate::cli::out::note;
 use crate::io::new_file::Inputs;
 use crate::text::one_line;
 
-/// Write the outputs of a flight for other tools: tables, GIS, Google Earth.
+/// Write the outputs of a flight for other tools: tables, GIS, Google Earth, ROS 2.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
   windhover export flight.mcap --format csv             # estimates.csv and more, into ./flight/
-  windhover export FLIGHTS/20261118T150405Z --format kml --out /tmp/earth")]
+  windhover export FLIGHTS/20261118T150405Z --format kml --out /tmp/earth
+  windhover export flight.mcap --format rosbag2 --out bag  # ros2 bag play bag")]
 pub(super) struct Args {
     /// Flight: an .mcap file, or the directory of its segments
     flight: PathBuf,

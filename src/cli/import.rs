@@ -1,4 +1,4 @@
-//! `windhover import --gps FILE --compass FILE --imu FILE --attitude FILE --video FILE|FOLDER --out CAPTURE.mcap`
+//! `windhover import --gps FILE --compass FILE --imu FILE --attitude FILE --log FILE --bag FILE --video FILE|FOLDER --out CAPTURE.mcap`
 
 use std::path::PathBuf;
 
@@ -11,18 +11,21 @@ use crate::io::new_file::Inputs;
 use crate::text::{counted, one_line};
 use windhover_base::time::MonoTime;
 
-/// Make a capture of recordings you already have: serial logs with a time a line, and a video.
+/// Make a capture of recordings you already have: serial logs with a time a line, autopilots' logs, bags of ROS, a video.
 #[derive(clap::Args, Debug)]
 #[command(
     after_help = "Serial logs: each line starts with a time (seconds since any epoch, ISO 8601 with T or a blank, or
 as gpspipe -t writes it) and a blank or tab, then what came over the line. Tables: comma-separated, with a header; the
 sections [imu] and [attitude] of the configuration say how the sensors are mounted and how good they are. Video: a folder
 of images with times.csv (time_s,file), Motion
-JPEG in AVI, Y4M, or whatever an installed ffmpeg reads. All times are on one clock.
+JPEG in AVI, Y4M, or whatever an installed ffmpeg reads. All times are on one clock. Logs and bags become what the
+autopilot would have sent over MAVLink: the section [autopilot] of the configuration says what of it is used.
 
 Example:
   windhover import --gps gps.log --compass compass.log --video frames/ \\
-                   --config windhover.toml --out capture.mcap"
+                   --config windhover.toml --out capture.mcap
+  windhover import --log flight.ulg --video flight.mp4 --video-start 2026-11-18T15:04:05.2Z --out capture.mcap
+  windhover import --bag flight.bag --out capture.mcap"
 )]
 pub(super) struct Args {
     /// Log of the GPS receiver's line
@@ -37,10 +40,19 @@ pub(super) struct Args {
     /// Table of a second source of attitude: time_s, heading_deg (true), pitch_deg, roll_deg
     #[arg(long, value_name = "FILE")]
     attitude: Option<PathBuf>,
+    /// Log of an autopilot: PX4's ULog, ArduPilot's .bin, a ground station's .tlog; or DJI's .SRT of the video
+    #[arg(long, value_name = "FILE")]
+    log: Option<PathBuf>,
+    /// Bag of ROS 1, or of ROS 2 (MCAP or SQLite; a file or the bag's folder): images, NavSatFix, Imu, MagneticField
+    #[arg(long, value_name = "FILE|FOLDER")]
+    bag: Option<PathBuf>,
+    /// Topic of the bag to use; may be given several times [default: of each kind the one with the shortest name]
+    #[arg(long, value_name = "NAME", requires = "bag")]
+    topic: Vec<String>,
     /// Video file, or folder of images with times.csv
     #[arg(long, value_name = "FILE|FOLDER")]
     video: Option<PathBuf>,
-    /// When a video file's first frame was taken [default: with the first line of the logs]
+    /// When a video file's first frame was taken [default: as its .SRT says, else with the first line of the logs]
     #[arg(long, value_name = "TIME", value_parser = time)]
     video_start: Option<MonoTime>,
     /// Configuration to attach, so that the capture replays by itself
@@ -62,7 +74,16 @@ pub(super) fn run(args: &Args) -> CliResult {
         }
         None => String::new(),
     };
-    let read = [&args.gps, &args.compass, &args.imu, &args.attitude, &args.video, &args.config];
+    let read = [
+        &args.gps,
+        &args.compass,
+        &args.imu,
+        &args.attitude,
+        &args.log,
+        &args.bag,
+        &args.video,
+        &args.config,
+    ];
     let inputs = Inputs::of(read.into_iter().filter_map(|path| path.as_deref()));
     place::check(&args.out, &inputs, &Maker::Capture.marks())?;
     let sources = import::Sources {
@@ -70,20 +91,30 @@ pub(super) fn run(args: &Args) -> CliResult {
         compass: args.compass.clone(),
         imu: args.imu.clone(),
         attitude: args.attitude.clone(),
+        log: args.log.clone(),
+        bag: args.bag.clone(),
+        topics: args.topic.clone(),
         video: args.video.clone(),
         video_start: args.video_start,
     };
     let imported = import::import(&sources, &config, &args.out).map_err(|error| match error {
-        import::ImportFailure::Nothing => CliError::usage(error),
+        import::ImportFailure::Nothing | import::ImportFailure::Twice => CliError::usage(error),
         other => CliError::failed(other),
     })?;
     for warning in &imported.warnings {
         note!("windhover: {}", one_line(warning));
     }
-    let samples = [(imported.imu_samples, "IMU"), (imported.attitude_samples, "attitude")];
+    let samples = [
+        (imported.imu_samples, "IMU sample"),
+        (imported.attitude_samples, "attitude sample"),
+        (imported.packets, "MAVLink packet"),
+    ];
     let samples = samples.into_iter().filter(|(count, _)| *count > 0);
-    let samples: String =
-        samples.map(|(count, name)| format!(", {}", counted(count, &format!("{name} sample")))).collect();
+    let mut samples: String = samples.map(|(count, name)| format!(", {}", counted(count, name))).collect();
+    let [fixes, attitudes, inertial] = imported.measured;
+    if imported.measured != [0; 3] {
+        samples += &format!(" ({fixes} fixes, {attitudes} attitudes, {inertial} inertial samples)");
+    }
     note!(
         "imported {}, {}{samples} and {} over {:.1} s",
         counted(imported.gps_lines, "GPS line"),

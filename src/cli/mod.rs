@@ -14,6 +14,7 @@ mod live;
 mod montecarlo;
 mod out;
 mod place;
+mod refine;
 mod replay;
 mod report;
 mod run;
@@ -63,6 +64,7 @@ enum Command {
     Ground(Box<ground::Args>),
     Keys(keys::Args),
     Montecarlo(montecarlo::Args),
+    Refine(refine::Args),
     Report(report::Args),
     Store(store::Args),
     Detect(detect::Args),
@@ -95,6 +97,7 @@ pub fn main() -> ExitCode {
         Command::Ground(args) => ground::run(&args),
         Command::Keys(args) => keys::run(&args),
         Command::Montecarlo(args) => montecarlo::run(&args),
+        Command::Refine(args) => refine::run(&args),
         Command::Report(args) => report::run(&args),
         Command::Store(args) => store::run(&args),
         Command::Detect(args) => detect::run(&args),

@@ -161,6 +161,11 @@ impl CaptureWriter {
         Ok(Self { path: path.to_owned(), writer })
     }
 
+    /// Says what the messages of a topic were made of, before the first of them.
+    pub fn made_of(&mut self, topic: &str, text: &str) {
+        self.writer.made_of(topic, text);
+    }
+
     /// Writes an event; ticks are not recorded.
     pub fn write(&mut self, event: &Event) -> Result<(), WriteError> {
         records::of_event(event).map_or(Ok(()), |record| self.writer.write(&record))

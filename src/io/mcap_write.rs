@@ -16,6 +16,9 @@ use windhover_base::time::{MonoTime, Span};
 /// Name of the configuration's attachment.
 pub const CONFIG_ATTACHMENT: &str = "config.toml";
 
+/// Channel metadata key that says what messages were made of, where they are not what a device sent.
+pub const MADE_OF_KEY: &str = "windhover.made_of";
+
 /// Why a recording could not be written.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
@@ -39,6 +42,8 @@ pub enum Maker {
     Capture,
     /// `replay`.
     Replay,
+    /// `refine`.
+    Refine,
 }
 
 impl Maker {
@@ -46,6 +51,7 @@ impl Maker {
         match self {
             Self::Capture => concat!("windhover ", env!("CARGO_PKG_VERSION"), " capture"),
             Self::Replay => concat!("windhover ", env!("CARGO_PKG_VERSION"), " replay"),
+            Self::Refine => concat!("windhover ", env!("CARGO_PKG_VERSION"), " refine"),
         }
     }
 
@@ -54,6 +60,7 @@ impl Maker {
         match self {
             Self::Capture => ["windhover ", " capture"],
             Self::Replay => ["windhover ", " replay"],
+            Self::Refine => ["windhover ", " refine"],
         }
     }
 }
@@ -64,6 +71,7 @@ pub struct McapWriter<W: Write + Seek> {
     channels: HashMap<(String, String), u16>,
     sequence: u32,
     chunk_began: Option<MonoTime>,
+    made_of: HashMap<String, String>,
 }
 
 /// A recording in the making, which comes to its place when it is whole.
@@ -109,12 +117,20 @@ impl<W: Write + Seek> McapWriter<W> {
         versions.insert("version".to_owned(), env!("CARGO_PKG_VERSION").to_owned());
         versions.insert("magnetic_model".to_owned(), "WMM2025".to_owned());
         writer.write_metadata(&mcap::records::Metadata { name: "windhover".into(), metadata: versions })?;
-        Ok(Self { writer, channels: HashMap::new(), sequence: 0, chunk_began: None })
+        Ok(Self { writer, channels: HashMap::new(), sequence: 0, chunk_began: None, made_of: HashMap::new() })
+    }
+
+    /// Says in a topic's channel what its messages were made of, where they are not what a device sent. To be said before the
+    /// first of them.
+    pub fn made_of(&mut self, topic: &str, text: &str) {
+        self.made_of.insert(topic.to_owned(), text.to_owned());
     }
 
     /// Writes a record; closes the chunk when its log time is a second past the chunk's first.
     pub fn write(&mut self, record: &Record) -> Result<(), WriteError> {
         let key = (record.topic.as_ref(), record.schema.name());
+        let made_of =
+            self.made_of.get(record.topic.as_ref()).map(|text| (MADE_OF_KEY.to_owned(), text.clone()));
         let channel = self.channel(key, || ChannelInfo {
             topic: record.topic.to_string(),
             message_encoding: "protobuf".into(),
@@ -123,7 +139,7 @@ impl<W: Write + Seek> McapWriter<W> {
                 encoding: "protobuf".into(),
                 data: record.schema.descriptor(),
             }),
-            metadata: BTreeMap::new(),
+            metadata: made_of.into_iter().collect(),
         })?;
         let sequence = self.sequence;
         self.sequence = sequence.wrapping_add(1);

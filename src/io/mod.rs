@@ -20,6 +20,7 @@ pub mod process;
 pub mod proto;
 pub mod records;
 pub mod regular;
+pub mod ros;
 pub mod segment_files;
 pub mod serial;
 pub mod store;

@@ -82,6 +82,22 @@ pub(super) struct SettledSite {
     pub(super) ground_notice: Option<String>,
 }
 
+/// Where a recorded flight took place: its datum as it was told, ground and declination by the fixes that settled it.
+pub fn site_of<'a>(
+    settings: &PipelineSettings,
+    terrain: Option<Arc<Tile>>,
+    datum: Geodetic,
+    epochs: impl IntoIterator<Item = &'a GnssEpoch>,
+) -> Option<Site> {
+    let Geodetic { lat_deg, lon_deg, height_m } = datum;
+    let settings = PipelineSettings { datum: Some(Datum { lat_deg, lon_deg, height_m }), ..settings.clone() };
+    let mut finder = SiteFinder::new(&settings, terrain);
+    let here = |epoch: &&GnssEpoch| {
+        position(epoch).and_then(Result::ok).is_some_and(|at| distance_m(datum, at).0 < ELSEWHERE_M)
+    };
+    epochs.into_iter().filter(here).find_map(|epoch| finder.offer(epoch)).map(|settled| settled.site)
+}
+
 impl SiteFinder {
     pub(super) fn new(settings: &PipelineSettings, terrain: Option<Arc<Tile>>) -> Self {
         let compass = &settings.rig.compass;

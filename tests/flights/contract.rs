@@ -5,12 +5,13 @@ use std::process::{Command, Output};
 
 use serde_json::Value;
 
-const COMMANDS: [&[&str]; 26] = [
+const COMMANDS: [&[&str]; 27] = [
     &[],
     &["run"],
     &["replay"],
     &["import"],
     &["export"],
+    &["refine"],
     &["report"],
     &["simulate"],
     &["detect"],
@@ -72,7 +73,7 @@ fn failures_say_what_and_exit_as_agreed() {
     let (capture, in_dir) = (capture(), |name: &str| dir.path().join(name));
     std::fs::write(in_dir("wrong.toml"), "[gps]\ndevice = \"/dev/ttyS0\"\nbawd = 4800\n").expect("writable");
     std::fs::write(in_dir("photo.png"), "no picture").expect("writable");
-    let cases: [(&[&str], i32, &[&str]); 16] = [
+    let cases: [(&[&str], i32, &[&str]); 18] = [
         (&["fly"], 2, &["fly"]),
         (&["replay"], 2, &["CAPTURE"]),
         (&["replay", "none.mcap"], 1, &["none.mcap"]),
@@ -85,6 +86,8 @@ fn failures_say_what_and_exit_as_agreed() {
         (&["montecarlo", "--samples", "0"], 2, &["--samples"]),
         (&["export", &capture, "--format", "csv", "--out", "tables"], 1, &["windhover replay"]),
         (&["report", "none.mcap"], 1, &["none.mcap"]),
+        (&["refine", "none.mcap"], 1, &["none.mcap"]),
+        (&["refine", &capture, "--out", "refined.mcap"], 1, &["windhover replay"]),
         (&["detect", "photo.png"], 1, &["photo.png"]),
         (&["calibrate", "intrinsics", "photo.png", "--board", "9x6"], 2, &["--square-m"]),
         (&["calibrate", "boresight", &capture], 1, &["replay"]),

@@ -7,6 +7,7 @@ mod compass_conventions;
 mod contract;
 mod import;
 mod no_camera;
+mod refine;
 mod samples;
 mod silent_camera;
 mod simulated_lines;

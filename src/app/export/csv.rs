@@ -14,10 +14,11 @@ use crate::io::records::topic;
 use crate::text::{csv_field, csv_figure, finite};
 
 /// The tables and their columns.
-pub(super) const TABLES: [(&str, &str); 6] = [
+pub(super) const TABLES: [(&str, &str); 7] = [
     ("estimates.csv", ESTIMATE_COLUMNS),
     ("smoothed.csv", ESTIMATE_COLUMNS),
     ("paper.csv", ESTIMATE_COLUMNS),
+    ("refined.csv", ESTIMATE_COLUMNS),
     ("detections.csv", DETECTION_COLUMNS),
     ("ownship.csv", OWNSHIP_COLUMNS),
     ("datum.csv", DATUM_COLUMNS),
@@ -68,6 +69,7 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
     let with_covariance = format!("{ESTIMATE_COLUMNS}{COVARIANCE_COLUMNS}");
     let mut estimates = CsvTable::create(out, "estimates.csv", &with_covariance)?;
     let mut smoothed = CsvTable::create(out, "smoothed.csv", &with_covariance)?;
+    let mut refined = CsvTable::create(out, "refined.csv", &with_covariance)?;
     let mut paper = CsvTable::create(out, "paper.csv", ESTIMATE_COLUMNS)?;
     let mut detections = CsvTable::create(out, "detections.csv", DETECTION_COLUMNS)?;
     let mut ownship = CsvTable::create(out, "ownship.csv", OWNSHIP_COLUMNS)?;
@@ -89,6 +91,7 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
             let (table, covariance) = match kind {
                 "state" => (&mut estimates, true),
                 "smoothed" => (&mut smoothed, true),
+                "refined" => (&mut refined, true),
                 "paper" => (&mut paper, false),
                 _ => continue,
             };
@@ -104,6 +107,10 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
     warnings.extend(damaged);
     let mut exported = Exported { files: Vec::new(), warnings };
     let mut tables = vec![estimates, smoothed, paper, detections, ownship];
+    // Few flights are refined, and a table of nothing would look like one that was.
+    if refined.rows > 0 {
+        tables.push(refined);
+    }
     if let Some(datum) = datum {
         let mut table = CsvTable::create(out, "datum.csv", DATUM_COLUMNS)?;
         table.row(&figures(&[(datum.lat_deg, 10), (datum.lon_deg, 10), (datum.height_m, 4)])[1..])?;

@@ -1,13 +1,15 @@
-//! The outputs of a flight for other tools: CSV, GeoJSON, KML.
+//! The outputs of a flight for other tools: CSV, GeoJSON, KML, bags of ROS 2.
 
 mod csv;
 mod geojson;
 mod kml;
+mod rosbag2;
 mod tracks;
 
 use std::path::{Path, PathBuf};
 
 use crate::io::mcap_read::{McapReader, ReadError};
+use crate::io::mcap_write::WriteError;
 
 /// A format of `windhover export`.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, clap::ValueEnum)]
@@ -18,6 +20,8 @@ pub enum Format {
     Geojson,
     /// Moving tracks for Google Earth
     Kml,
+    /// A bag for ROS 2 (MCAP): odometry, fixes, images, transforms, detections, diagnostics
+    Rosbag2,
 }
 
 /// Why a flight could not be exported.
@@ -26,6 +30,9 @@ pub enum ExportError {
     /// The flight could not be read.
     #[error(transparent)]
     Read(#[from] ReadError),
+    /// A recording could not be written.
+    #[error(transparent)]
+    Record(#[from] WriteError),
     /// A file could not be written.
     #[error("cannot write {}: {source}", path.display())]
     Write {
@@ -58,6 +65,7 @@ impl Format {
             Self::Csv => &csv::TABLES,
             Self::Geojson => &[geojson::FILE],
             Self::Kml => &[kml::FILE],
+            Self::Rosbag2 => &rosbag2::FILES,
         }
     }
 }
@@ -71,6 +79,7 @@ pub fn export(flight: &Path, format: Format, out: &Path) -> Result<Exported, Exp
         Format::Csv => csv::export(reader, out)?,
         Format::Geojson => geojson::export(reader, out)?,
         Format::Kml => kml::export(reader, out)?,
+        Format::Rosbag2 => rosbag2::export(flight, out)?,
     };
     if exported.files.is_empty() {
         if is_new {

@@ -200,12 +200,13 @@ pub fn error_text(flight: &Flight, truth: &Truth) -> Option<String> {
 }
 
 /// Errors of each estimator, with its ink.
-fn estimators_of(flight: &Flight, track: &Track, truth: &Truth) -> Option<[(&'static str, Errors, Ink); 3]> {
+fn estimators_of(flight: &Flight, track: &Track, truth: &Truth) -> Option<[(&'static str, Errors, Ink); 4]> {
     let frame = LocalFrame::new(flight.datum?);
     let at = |s: &wh::TargetState| flight.at(s.timestamp.as_ref());
     Some([
         ("real time", errors_of(&track.filtered, truth, &frame, at), Ink::Blue),
         ("smoothed", errors_of(&track.smoothed, truth, &frame, at), Ink::Green),
+        ("refined", errors_of(&track.refined, truth, &frame, at), Ink::Violet),
         ("paper", errors_of(&track.paper, truth, &frame, at), Ink::Orange),
     ])
 }

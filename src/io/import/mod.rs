@@ -1,13 +1,23 @@
 //! Recordings people already have, made into the events of a capture.
 
 mod avi;
+mod bag;
+mod dataflash;
 mod folder;
+mod log;
+mod measured;
 mod samples;
 mod serial_log;
+mod srt;
 mod stamp;
+mod tlog;
+mod ulog;
 mod video;
 mod y4m;
 
+pub use bag::{ImportedBag, read_bag};
+pub use log::read_log;
+pub use measured::ImportedLog;
 pub use samples::{Samples, read_attitude, read_inertial};
 pub use serial_log::read_serial_log;
 pub use stamp::parse_time;
@@ -36,6 +46,22 @@ pub enum ImportError {
         /// Line, from 1.
         line: usize,
         /// What is wrong and what is expected.
+        reason: String,
+    },
+    /// A bag that cannot be read here.
+    #[error("{}: {reason}", path.display())]
+    Bag {
+        /// The bag.
+        path: PathBuf,
+        /// What is wrong and what to do.
+        reason: String,
+    },
+    /// A log that cannot be read here.
+    #[error("{} {reason}", path.display())]
+    Log {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
         reason: String,
     },
     /// A video that cannot be read here.

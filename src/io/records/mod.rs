@@ -8,7 +8,7 @@ pub mod topic;
 pub mod warm_message;
 
 pub use event_codec::{EventDecoder, KeptMessage, is_event, of_event, to_attitude, topic_of_event};
-pub use output_messages::{detections, health, ownship, target_state};
+pub use output_messages::{detections, health, location, ownship, target_state, transform};
 pub use outputs::{DaemonFigures, OutputEncoder, opening};
 pub use schema::Schema;
 

@@ -6,7 +6,7 @@ use prost_types::Timestamp;
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
 use windhover_base::msg::{
     AttitudeSample, FeatureTrack, FixKind, Health, InertialSample, MarkerDetection, MarkerId, MisfitWords,
-    Notice, NoticeKind, Ownship, SourceHealth, TargetEstimate, TrackStatus,
+    Notice, NoticeKind, Ownship, SourceHealth, TargetEstimate, TargetState, TrackStatus,
 };
 use windhover_base::time::MonoTime;
 
@@ -14,7 +14,8 @@ pub(super) fn stamp(t: MonoTime) -> Option<Timestamp> {
     Some(timestamp(t))
 }
 
-pub(super) fn transform(
+/// A transform between frames.
+pub fn transform(
     t: MonoTime,
     parent: &str,
     child: &str,
@@ -159,6 +160,29 @@ pub(super) fn inertial(t: MonoTime, sample: &InertialSample) -> wh::Inertial {
         timestamp: stamp(t),
         rate_rps: figures(sample.rate_rps),
         force_mps2: figures(sample.force_mps2),
+    }
+}
+
+/// A target's place for maps; `frame_id` is its own frame.
+pub fn location(t: MonoTime, frame_id: &str, state: &TargetState) -> fox::LocationFix {
+    let covariance = state.covariance.map_or(Vec::new(), |p| {
+        // LocationFix wants east, north, up.
+        vec![p[(1, 1)], p[(0, 1)], 0.0, p[(0, 1)], p[(0, 0)], 0.0, 0.0, 0.0, 0.0]
+    });
+    let known = if covariance.is_empty() {
+        fox::location_fix::PositionCovarianceType::Unknown
+    } else {
+        fox::location_fix::PositionCovarianceType::Approximated
+    };
+    fox::LocationFix {
+        timestamp: stamp(t),
+        frame_id: frame_id.into(),
+        latitude: state.lat_deg,
+        longitude: state.lon_deg,
+        altitude: state.height_m,
+        position_covariance: covariance,
+        position_covariance_type: known.into(),
+        ..Default::default()
     }
 }
 

@@ -6,8 +6,8 @@ use nalgebra::{UnitQuaternion, Vector3};
 use prost::Message;
 
 use super::output_messages::{
-    annotations, attitude, detections, fix_number, health, log_message, ownship, rtk, stamp, target_state,
-    transform,
+    annotations, attitude, detections, fix_number, health, location, log_message, ownship, rtk, stamp,
+    target_state, transform,
 };
 use super::{Record, Schema, topic};
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
@@ -141,25 +141,7 @@ impl OutputEncoder {
         let Some(state) = &estimate.state else { return };
         let name = self.name(estimate);
         let t = estimate.t_valid;
-        let covariance = state.covariance.map_or(Vec::new(), |p| {
-            // LocationFix wants east, north, up.
-            vec![p[(1, 1)], p[(0, 1)], 0.0, p[(0, 1)], p[(0, 0)], 0.0, 0.0, 0.0, 0.0]
-        });
-        let known = if covariance.is_empty() {
-            fox::location_fix::PositionCovarianceType::Unknown
-        } else {
-            fox::location_fix::PositionCovarianceType::Approximated
-        };
-        let location = fox::LocationFix {
-            timestamp: Some(timestamp(t)),
-            frame_id: format!("target/{name}"),
-            latitude: state.lat_deg,
-            longitude: state.lon_deg,
-            altitude: state.height_m,
-            position_covariance: covariance,
-            position_covariance_type: known.into(),
-            ..Default::default()
-        };
+        let location = location(t, &format!("target/{name}"), state);
         out.push(record(topic::target_location(name), Schema::LocationFix, log, t, &location));
         let at = Vector3::new(state.north_m, state.east_m, 0.0);
         let turned = UnitQuaternion::from_rotation_matrix(&rot_z(state.heading_rad));
@@ -196,6 +178,8 @@ fn fix(epoch: &Stamped<GnssEpoch>, log: MonoTime, out: &mut Vec<Record>) {
         hdop: e.hdop,
         heard: stamp(epoch.t_recv),
         rtk: rtk(e.fix).into(),
+        position_sigma_m: e.position_sigma_m.map_or(Vec::new(), |v| v.iter().copied().collect()),
+        velocity_sigma_mps: e.velocity_sigma_mps.map_or(Vec::new(), |v| v.iter().copied().collect()),
     };
     out.push(record(topic::GPS_EPOCH.into(), Schema::GnssEpoch, log, t, &message));
     let (Some(latitude), Some(longitude)) = (e.lat_deg, e.lon_deg) else { return };

@@ -43,6 +43,8 @@ pub enum Schema {
     Health,
     /// `windhover.WarmState`
     WarmState,
+    /// `windhover.Refined`
+    Refined,
 }
 
 impl Schema {
@@ -68,12 +70,13 @@ impl Schema {
             Self::Fusion => "windhover.Fusion",
             Self::Health => "windhover.Health",
             Self::WarmState => "windhover.WarmState",
+            Self::Refined => "windhover.Refined",
         }
     }
 
     /// The schema of that full name.
     pub fn named(name: &str) -> Option<Self> {
-        const ALL: [Schema; 19] = [
+        const ALL: [Schema; 20] = [
             Schema::SerialBytes,
             Schema::SourceEvent,
             Schema::CompressedImage,
@@ -93,6 +96,7 @@ impl Schema {
             Schema::Fusion,
             Schema::Health,
             Schema::WarmState,
+            Schema::Refined,
         ];
         ALL.into_iter().find(|schema| schema.name() == name)
     }

@@ -26,6 +26,10 @@ pub const OWNSHIP: &str = "/ownship/state";
 pub const FUSION: &str = "/fusion";
 /// Operator's notices.
 pub const LOG: &str = "/log";
+/// The helicopter as a refinement of the whole flight has it.
+pub const OWNSHIP_REFINED: &str = "/ownship/refined";
+/// What a refined flight says of its configuration.
+pub const REFINED: &str = "/refined";
 /// Health, once a second.
 pub const HEALTH: &str = "/health";
 
@@ -59,9 +63,26 @@ pub fn target_paper(name: &str) -> String {
     format!("/target/{name}/paper")
 }
 
+/// `/target/NAME/refined`: from the whole flight at once.
+pub fn target_refined(name: &str) -> String {
+    format!("/target/{name}/refined")
+}
+
+/// `/target/NAME/refined_location`: the same for maps.
+pub fn target_refined_location(name: &str) -> String {
+    format!("/target/{name}/refined_location")
+}
+
+/// Whether a topic is written by a refinement.
+pub fn is_refined(topic: &str) -> bool {
+    let of_target =
+        || topic.rsplit('/').next().is_some_and(|what| what == "refined" || what == "refined_location");
+    topic == OWNSHIP_REFINED || topic == REFINED || (topic.starts_with("/target/") && of_target())
+}
+
 /// Whether a topic is written by the pipeline itself, and so is made anew by a replay.
 pub fn is_output(topic: &str) -> bool {
-    const OUTPUTS: [&str; 12] = [
+    const OUTPUTS: [&str; 14] = [
         GPS_FIX,
         GPS_EPOCH,
         COMPASS_ATTITUDE,
@@ -71,6 +92,8 @@ pub fn is_output(topic: &str) -> bool {
         CAMERA_DETECTIONS,
         DATUM,
         OWNSHIP,
+        OWNSHIP_REFINED,
+        REFINED,
         FUSION,
         LOG,
         HEALTH,

@@ -1,0 +1,98 @@
+//! First values: what the filter makes of the flight.
+
+use nalgebra::{UnitQuaternion, Vector3};
+
+use windhover_base::msg::{EstimatorOutput, FeltTilt, Ownship, TargetEstimate, TrackStatus};
+use windhover_base::settings::{EstimatorConfig, Rig};
+use windhover_base::time::{MonoTime, Span};
+use windhover_estimate::{Estimator, Site};
+
+use crate::recording::{Heard, Recording};
+use crate::unknowns::knot;
+use crate::values::Knot;
+
+/// The filter's own state is asked for so often, s.
+const STEP_S: f64 = 0.1;
+/// And so long before what was heard last: by then late measurements are in.
+const BEHIND: Span = Span::from_ns(300_000_000);
+
+/// What the filter made of one flight.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct First {
+    /// In order of time, each instant once.
+    pub(crate) own: Vec<Ownship>,
+    /// Of each target, where it was tracked, in order of time.
+    pub(crate) targets: Vec<Vec<TargetEstimate>>,
+    pub(crate) felt: Option<FeltTilt>,
+    /// Why the filter began again, and when.
+    pub(crate) resets: Vec<(MonoTime, String)>,
+}
+
+/// Runs the filter over a recording.
+pub(crate) fn filtered(rig: &Rig, estimator: &EstimatorConfig, site: &Site, recording: &Recording) -> First {
+    let mut filter = Estimator::new(rig, estimator, site);
+    let mut first = First { targets: vec![Vec::new(); rig.target.len()], ..First::default() };
+    let (mut out, mut asked) = (Vec::new(), None);
+    for heard in recording.in_order() {
+        match heard {
+            Heard::Epoch(epoch) => filter.gnss(epoch, &mut out),
+            Heard::Reading(sample) => filter.attitude(sample, &mut out),
+            Heard::Frame(frame) => filter.frame(frame, &mut out),
+        }
+        let t = heard.t_recv();
+        filter.tick(t, &mut out);
+        if asked.is_none_or(|asked| t - asked >= Span::from_s(STEP_S)) {
+            asked = Some(t);
+            first.own.extend(filter.ownship(t - BEHIND));
+        }
+        first.take(&mut out, t);
+    }
+    filter.finish(&mut out);
+    first.take(&mut out, MonoTime::default());
+    first.own.sort_by_key(|own| own.t_valid);
+    first.own.dedup_by_key(|own| own.t_valid);
+    first.targets.iter_mut().for_each(|track| track.sort_by_key(|e| e.t_valid));
+    first
+}
+
+impl First {
+    fn take(&mut self, out: &mut Vec<EstimatorOutput>, t: MonoTime) {
+        for said in out.drain(..) {
+            match said {
+                EstimatorOutput::Ownship(own) => self.own.push(own),
+                EstimatorOutput::Smoothed(e)
+                    if e.state.is_some()
+                        && matches!(e.status, TrackStatus::Tracking | TrackStatus::Acquiring) =>
+                {
+                    self.targets[e.target].push(e);
+                }
+                EstimatorOutput::TiltFelt { felt, .. } => self.felt = Some(felt),
+                EstimatorOutput::Reset { reason } => self.resets.push((t, reason.to_owned())),
+                _ => {}
+            }
+        }
+    }
+
+    /// From when to when the helicopter is known.
+    pub(crate) fn span(&self) -> Option<(MonoTime, MonoTime)> {
+        Some((self.own.first()?.t_valid, self.own.last()?.t_valid))
+    }
+
+    /// The helicopter at a time between two of its states; targets are left at zero.
+    pub(crate) fn knot_at(&self, t: MonoTime, targets: usize) -> Knot {
+        let after = self.own.partition_point(|own| own.t_valid < t).min(self.own.len() - 1);
+        let (a, b) = (&self.own[after.saturating_sub(1)], &self.own[after]);
+        let whole = (b.t_valid - a.t_valid).s();
+        let share = if whole > 0.0 { ((t - a.t_valid).s() / whole).clamp(0.0, 1.0) } else { 1.0 };
+        let mix = |a: &Vector3<f64>, b: &Vector3<f64>| a + (b - a) * share;
+        let attitude: UnitQuaternion<f64> = a.ned_from_body.nlerp(&b.ned_from_body, share);
+        let mut x = vec![0.0; knot::target(targets)];
+        x[knot::POSITION..][..3].copy_from_slice(mix(&a.position_ned_m, &b.position_ned_m).as_slice());
+        x[knot::VELOCITY..][..3].copy_from_slice(mix(&a.velocity_ned_mps, &b.velocity_ned_mps).as_slice());
+        if whole > 0.0 {
+            let turn = (a.ned_from_body.inverse() * b.ned_from_body).scaled_axis() / whole;
+            x[knot::RATE..][..3].copy_from_slice(turn.as_slice());
+        }
+        Knot { attitude: attitude.to_rotation_matrix(), x }
+    }
+}

@@ -1,0 +1,381 @@
+//! Normal equations along time: each unknown is eliminated as soon as nothing that comes later touches it.
+//!
+//! The unknowns are ordered as they pass: knot 0, the landmarks last seen there, knot 1, …, and the constants at the end. At
+//! any moment only a *front* of them is open: two neighbouring knots, the landmarks in view, the constants. Its normal
+//! equations are one dense matrix, whatever the length of the flight:
+//!
+//! `H = [H_ee H_er; H_re H_rr]`, `L Lᵀ = H_ee`, `W = L⁻¹ H_er`, `y = L⁻¹ g_e`; then `H_rr −= Wᵀ W`, `g_r −= Wᵀ y`.
+//!
+//! Backward, `x_e = L⁻ᵀ (y − W x_r)`, and of the inverse of the whole matrix only the part over each front is ever made
+//! (selected inversion; Takahashi 1973): `G = −L⁻ᵀ W`, `P_er = G P_rr`, `P_ee = (L Lᵀ)⁻¹ + P_er Gᵀ`.
+
+/// Where the unknowns of a front stand: two knots, then landmarks of two components each, then the constants.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) struct Shape {
+    pub(crate) knot: usize,
+    /// Landmarks that may be open at once.
+    pub(crate) landmarks: usize,
+    pub(crate) constants: usize,
+}
+
+impl Shape {
+    /// Unknowns of the front.
+    pub(crate) const fn len(self) -> usize {
+        2 * self.knot + 2 * self.landmarks + self.constants
+    }
+
+    /// The first unknown of knot `k`: neighbours take turns.
+    pub(crate) const fn knot_at(self, k: usize) -> usize {
+        (k % 2) * self.knot
+    }
+
+    /// The first unknown of the landmark in a place.
+    pub(crate) const fn landmark_at(self, place: usize) -> usize {
+        2 * self.knot + 2 * place
+    }
+
+    /// The first constant.
+    pub(crate) const fn constants_at(self) -> usize {
+        2 * self.knot + 2 * self.landmarks
+    }
+}
+
+/// The open normal equations `H x = g`: the lower triangle of H, row by row.
+#[derive(Clone, Debug)]
+pub(crate) struct Front {
+    n: usize,
+    h: Vec<f64>,
+    g: Vec<f64>,
+}
+
+/// What is kept of unknowns that were eliminated.
+#[derive(Clone, Debug)]
+pub(crate) struct Eliminated {
+    first: usize,
+    len: usize,
+    /// Lower Cholesky factor, `len` × `len`.
+    l: Vec<f64>,
+    /// Unknowns that it was tied to.
+    rest: Vec<u16>,
+    /// `L⁻¹ H_er`, `len` × `rest`.
+    w: Vec<f64>,
+    y: Vec<f64>,
+}
+
+impl Eliminated {
+    /// By how much the sum of squares falls by its solution.
+    pub(crate) fn gain(&self) -> f64 {
+        self.y.iter().map(|y| y * y).sum()
+    }
+
+    /// Where its unknowns stand in the front.
+    pub(crate) fn range(&self) -> std::ops::Range<usize> {
+        self.first..self.first + self.len
+    }
+}
+
+/// The normal equations are singular, or no numbers.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) struct Singular;
+
+impl Front {
+    pub(crate) fn new(shape: Shape) -> Self {
+        let n = shape.len();
+        Self { n, h: vec![0.0; n * n], g: vec![0.0; n] }
+    }
+
+    /// Adds rows `J x ≈ r` of unit variance with a weight; `rows` holds them one behind the other, a figure a column of
+    /// `columns`.
+    pub(crate) fn add(&mut self, columns: &[usize], rows: &[f64], right: &[f64], weight: f64) {
+        let width = columns.len();
+        for (row, right) in rows.chunks_exact(width).zip(right) {
+            for (a, &i) in row.iter().zip(columns) {
+                if *a == 0.0 {
+                    continue;
+                }
+                let a = weight * a;
+                self.g[i] += a * right;
+                for (b, &j) in row.iter().zip(columns) {
+                    if j <= i {
+                        self.h[i * self.n + j] += a * b;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Adds `x ≈ value` of this information to one unknown.
+    pub(crate) fn add_prior(&mut self, column: usize, information: f64, value: f64) {
+        self.h[column * self.n + column] += information;
+        self.g[column] += information * value;
+    }
+
+    /// Adds information about an unknown that pulls it nowhere.
+    pub(crate) fn hold(&mut self, column: usize, information: f64) {
+        self.add_prior(column, information, 0.0);
+    }
+
+    /// Eliminates `len` unknowns from `first` on, their diagonal raised by a share (Marquardt 1963).
+    pub(crate) fn eliminate(
+        &mut self,
+        first: usize,
+        len: usize,
+        raised: f64,
+    ) -> Result<Eliminated, Singular> {
+        let (n, last) = (self.n, first + len);
+        let mut l = vec![0.0; len * len];
+        for i in 0..len {
+            l[i * len..=i * len + i].copy_from_slice(&self.h[(first + i) * n + first..][..=i]);
+            l[i * len + i] *= 1.0 + raised;
+        }
+        cholesky(&mut l, len)?;
+        let at = |i: usize, j: usize| self.h[i.max(j) * n + i.min(j)];
+        let tied = |j: &usize| (first..last).any(|i| at(i, *j) != 0.0);
+        let rest: Vec<usize> = (0..first).chain(last..n).filter(tied).collect();
+        let width = rest.len();
+        let mut w = vec![0.0; len * width];
+        for i in 0..len {
+            rest.iter().enumerate().for_each(|(j, column)| w[i * width + j] = at(first + i, *column));
+        }
+        forward(&l, len, &mut w, width);
+        let mut y = self.g[first..last].to_vec();
+        forward(&l, len, &mut y, 1);
+        self.take_off(&rest, &w, &y);
+        self.clear(first, last);
+        let rest = rest.into_iter().map(|column| column as u16).collect();
+        Ok(Eliminated { first, len, l, rest, w, y })
+    }
+
+    /// `H_rr −= Wᵀ W`, `g_r −= Wᵀ y`.
+    fn take_off(&mut self, rest: &[usize], w: &[f64], y: &[f64]) {
+        let width = rest.len();
+        let mut square = vec![0.0; width];
+        for (i, &column) in rest.iter().enumerate() {
+            square[..=i].fill(0.0);
+            for row in w.chunks_exact(width) {
+                axpy(&mut square[..=i], row[i], &row[..=i]);
+            }
+            let h = &mut self.h[column * self.n..][..=column];
+            rest[..=i].iter().zip(&square).for_each(|(j, square)| h[*j] -= square);
+            self.g[column] -= w.chunks_exact(width).zip(y).map(|(row, y)| row[i] * y).sum::<f64>();
+        }
+    }
+
+    fn clear(&mut self, first: usize, last: usize) {
+        for i in first..self.n {
+            let columns = if i < last { 0..i + 1 } else { first..last };
+            self.h[i * self.n..][columns].fill(0.0);
+        }
+        self.g[first..last].fill(0.0);
+    }
+}
+
+/// The solution, and the inverse of the normal equations, over the front as it opens again.
+#[derive(Clone, Debug)]
+pub(crate) struct Back {
+    n: usize,
+    pub(crate) x: Vec<f64>,
+    /// Covariance, row by row; what is not open means nothing.
+    p: Vec<f64>,
+}
+
+impl Back {
+    pub(crate) fn new(shape: Shape) -> Self {
+        let n = shape.len();
+        Self { n, x: vec![0.0; n], p: vec![0.0; n * n] }
+    }
+
+    /// Covariance of two unknowns of the front.
+    pub(crate) fn covariance(&self, i: usize, j: usize) -> f64 {
+        self.p[i * self.n + j]
+    }
+
+    /// `a P bᵀ` of two rows over the same columns.
+    pub(crate) fn product(&self, columns: &[usize], a: &[f64], b: &[f64]) -> f64 {
+        let terms = columns.iter().zip(a).filter(|(_, a)| **a != 0.0).map(|(i, a)| {
+            let row = &self.p[i * self.n..][..self.n];
+            a * columns.iter().zip(b).map(|(j, b)| row[*j] * b).sum::<f64>()
+        });
+        terms.sum()
+    }
+
+    /// Opens what was eliminated: its solution.
+    pub(crate) fn solve(&mut self, e: &Eliminated) {
+        let width = e.rest.len();
+        let mut x = e.y.clone();
+        for (i, x) in x.iter_mut().enumerate() {
+            let row = &e.w[i * width..][..width];
+            *x -= e.rest.iter().zip(row).map(|(j, w)| self.x[usize::from(*j)] * w).sum::<f64>();
+        }
+        backward(&e.l, e.len, &mut x, 1);
+        self.x[e.first..e.first + e.len].copy_from_slice(&x);
+    }
+
+    /// Opens what was eliminated: its solution, and its covariance with all that is open.
+    pub(crate) fn solve_with_covariance(&mut self, e: &Eliminated) {
+        self.solve(e);
+        let (n, width) = (self.n, e.rest.len());
+        // G, and L⁻ᵀ L⁻¹.
+        let mut gain: Vec<f64> = e.w.iter().map(|w| -w).collect();
+        backward(&e.l, e.len, &mut gain, width);
+        let mut inverse = vec![0.0; e.len * e.len];
+        (0..e.len).for_each(|i| inverse[i * e.len + i] = 1.0);
+        forward(&e.l, e.len, &mut inverse, e.len);
+        backward(&e.l, e.len, &mut inverse, e.len);
+        for i in 0..e.len {
+            let mut row = vec![0.0; n];
+            for (j, gain) in e.rest.iter().zip(&gain[i * width..][..width]) {
+                axpy(&mut row, *gain, &self.p[usize::from(*j) * n..][..n]);
+            }
+            for j in 0..e.len {
+                let tied = e.rest.iter().zip(&gain[j * width..][..width]);
+                row[e.first + j] =
+                    inverse[i * e.len + j] + tied.map(|(c, g)| row[usize::from(*c)] * g).sum::<f64>();
+            }
+            self.p[(e.first + i) * n..][..n].copy_from_slice(&row);
+        }
+        for i in e.first..e.first + e.len {
+            for j in (0..e.first).chain(e.first + e.len..n) {
+                self.p[j * n + i] = self.p[i * n + j];
+            }
+        }
+    }
+}
+
+fn axpy(y: &mut [f64], a: f64, x: &[f64]) {
+    if a != 0.0 {
+        y.iter_mut().zip(x).for_each(|(y, x)| *y += a * x);
+    }
+}
+
+/// Lower Cholesky factor in place of a lower triangle.
+pub(crate) fn cholesky(l: &mut [f64], n: usize) -> Result<(), Singular> {
+    for i in 0..n {
+        for j in 0..=i {
+            let dot: f64 = l[i * n..][..j].iter().zip(&l[j * n..][..j]).map(|(a, b)| a * b).sum();
+            let left = l[i * n + j] - dot;
+            if i == j {
+                if !(left > 0.0 && left.is_finite()) {
+                    return Err(Singular);
+                }
+                l[i * n + i] = left.sqrt();
+            } else {
+                l[i * n + j] = left / l[j * n + j];
+            }
+        }
+    }
+    Ok(())
+}
+
+/// `B ← L⁻¹ B` of `width` columns.
+pub(crate) fn forward(l: &[f64], n: usize, b: &mut [f64], width: usize) {
+    for i in 0..n {
+        let (done, open) = b.split_at_mut(i * width);
+        let row = &mut open[..width];
+        for (k, done) in done.chunks_exact(width.max(1)).enumerate() {
+            axpy(row, -l[i * n + k], done);
+        }
+        row.iter_mut().for_each(|x| *x /= l[i * n + i]);
+    }
+}
+
+/// `B ← L⁻ᵀ B` of `width` columns.
+fn backward(l: &[f64], n: usize, b: &mut [f64], width: usize) {
+    for i in (0..n).rev() {
+        let (open, done) = b.split_at_mut((i + 1) * width);
+        let row = &mut open[i * width..];
+        for (k, done) in done.chunks_exact(width.max(1)).enumerate() {
+            axpy(row, -l[(i + 1 + k) * n + i], done);
+        }
+        row.iter_mut().for_each(|x| *x /= l[i * n + i]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{DMatrix, DVector};
+
+    use super::*;
+
+    /// Twelve knots of three unknowns, landmarks that come and go, two constants: the same as the dense equations.
+    #[test]
+    fn solution_and_covariances_are_those_of_the_dense_equations() {
+        let shape = Shape { knot: 3, landmarks: 2, constants: 2 };
+        let knots = 12;
+        let spans = [(0, 4, 0), (2, 9, 1), (5, 11, 0)];
+        let total = 3 * knots + 2 * spans.len() + 2;
+        let of_landmark = |i: usize| 3 * knots + 2 * i;
+        let constants = total - 2;
+        let mut seed = 1u64;
+        let mut random = move || {
+            seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (seed >> 33) as f64 / f64::from(1u32 << 31) - 0.5
+        };
+        let mut h = DMatrix::<f64>::zeros(total, total);
+        let mut g = DVector::<f64>::zeros(total);
+        let (mut front, mut done) = (Front::new(shape), Vec::new());
+        for k in 0..knots {
+            let mut add = |front: &mut Front, here: Vec<usize>, whole: Vec<usize>| {
+                let row: Vec<f64> = here.iter().map(|_| random()).collect();
+                let right = random();
+                front.add(&here, &row, &[right], 1.0);
+                for (a, i) in row.iter().zip(&whole) {
+                    g[*i] += a * right;
+                    row.iter().zip(&whole).for_each(|(b, j)| h[(*i, *j)] += a * b);
+                }
+            };
+            let knot = |k: usize| (0..3).map(move |i| (shape.knot_at(k) + i, 3 * k + i));
+            let constant = (0..2).map(|i| (shape.constants_at() + i, constants + i));
+            for _ in 0..4 {
+                let (here, whole) = knot(k).chain(constant.clone()).unzip();
+                add(&mut front, here, whole);
+                if k + 1 < knots {
+                    let (here, whole) = knot(k).chain(knot(k + 1)).unzip();
+                    add(&mut front, here, whole);
+                }
+                for (i, (from, to, place)) in spans.into_iter().enumerate() {
+                    if (from..=to).contains(&k) {
+                        let landmark = (0..2).map(|c| (shape.landmark_at(place) + c, of_landmark(i) + c));
+                        let (here, whole) = knot(k).chain(landmark).chain(constant.clone()).unzip();
+                        add(&mut front, here, whole);
+                    }
+                }
+            }
+            done.push((front.eliminate(shape.knot_at(k), 3, 0.0).expect("regular"), 3 * k));
+            for (i, (_, to, place)) in spans.into_iter().enumerate() {
+                if to == k {
+                    let gone = front.eliminate(shape.landmark_at(place), 2, 0.0).expect("regular");
+                    done.push((gone, of_landmark(i)));
+                }
+            }
+        }
+        done.push((front.eliminate(shape.constants_at(), 2, 0.0).expect("regular"), constants));
+        let inverse = h.clone().try_inverse().expect("regular");
+        let x = &inverse * g;
+        let mut back = Back::new(shape);
+        for (e, whole) in done.iter().rev() {
+            back.solve_with_covariance(e);
+            for i in 0..e.len {
+                assert!((back.x[e.first + i] - x[whole + i]).abs() < 1e-8, "{whole}");
+                for j in 0..e.len {
+                    let (got, want) =
+                        (back.covariance(e.first + i, e.first + j), inverse[(whole + i, whole + j)]);
+                    assert!((got - want).abs() < 1e-8 * (1.0 + want.abs()), "{whole}: {got} for {want}");
+                }
+                for c in 0..2 {
+                    let got = back.covariance(e.first + i, shape.constants_at() + c);
+                    let want = inverse[(whole + i, constants + c)];
+                    assert!((got - want).abs() < 1e-8 * (1.0 + want.abs()), "{whole} constant");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_nothing_ties_down_is_singular() {
+        let shape = Shape { knot: 2, landmarks: 0, constants: 0 };
+        let mut front = Front::new(shape);
+        front.add(&[0, 1], &[1.0, 1.0], &[0.5], 1.0);
+        assert_eq!(front.eliminate(0, 2, 0.0).err(), Some(Singular));
+    }
+}

@@ -1,0 +1,171 @@
+//! A pass with covariances: the whole problem opened backward, what is left over of each measurement, and the estimates.
+
+use nalgebra::{SMatrix, UnitQuaternion};
+
+use windhover_base::msg::{Ownship, TargetEstimate, TrackStatus};
+use windhover_estimate::Site;
+
+use crate::block::{Block, Noise, Source};
+use crate::front::Back;
+use crate::noise::Components;
+use crate::problem::{Origin, Pass, Problem};
+use crate::recording::Recording;
+use crate::solve::{Factors, What};
+use crate::told::{Constant, Outlier, Refined, Tally};
+use crate::unknowns::{Prior, knot};
+use crate::values::Values;
+
+/// What a pass with covariances finds.
+pub(crate) struct Looked {
+    pub(crate) components: Components,
+    pub(crate) refined: Refined,
+    /// Of each landmark: sightings, and those outside the gate.
+    pub(crate) landmarks: Vec<(usize, usize)>,
+}
+
+/// Opens the whole problem backward: covariances, what is left over of each measurement, and the estimates.
+pub(crate) fn look(
+    pass: &mut Pass<'_>,
+    factors: &Factors,
+    values: &Values,
+    noise: &Noise,
+    site: &Site,
+    recordings: &[Recording],
+) -> Looked {
+    let problem = pass.problem;
+    let mut looked = Looked {
+        components: Components::new(problem.targets),
+        refined: Refined::default(),
+        landmarks: vec![(0, 0); problem.plan.landmarks],
+    };
+    let mut counts = vec![(0usize, 0usize); Source::count(problem.targets)];
+    let mut back = Back::new(problem.shape);
+    for (what, e) in factors.steps.iter().rev() {
+        back.solve_with_covariance(e);
+        match what {
+            What::Constants => looked.refined.constants = constants(problem, values, &back),
+            What::Landmark(_) => {}
+            What::Knot(k) => {
+                let stop = &problem.plan.stops[*k];
+                pass.blocks(*k, values, noise, &mut |origin: Origin, block: &Block| {
+                    looked.take(origin, block, &back, problem, *k, &mut counts);
+                });
+                let own = ownship(problem, values, &back, *k, site, recordings);
+                looked.refined.own.push((stop.flight, own));
+                if stop.frame.is_some() {
+                    for target in 0..problem.targets {
+                        let estimate = target_estimate(pass, values, &back, *k, target, recordings);
+                        looked.refined.targets.push((stop.flight, estimate));
+                    }
+                }
+            }
+        }
+    }
+    looked.refined.own.reverse();
+    looked.refined.targets.reverse();
+    looked.refined.tallies = tallies(problem.targets, &counts, noise);
+    looked
+}
+
+impl Looked {
+    fn take(
+        &mut self,
+        origin: Origin,
+        block: &Block,
+        back: &Back,
+        problem: &Problem<'_>,
+        k: usize,
+        counts: &mut [(usize, usize)],
+    ) {
+        let measured = origin.source.is_measured();
+        let ratio = block.square() / problem.gates[block.len()];
+        let outside = measured && ratio > 1.0;
+        let count = &mut counts[origin.source.index()];
+        (count.0, count.1) = (count.0 + 1, count.1 + usize::from(outside));
+        if let Some(landmark) = origin.landmark {
+            let seen = &mut self.landmarks[landmark];
+            (seen.0, seen.1) = (seen.0 + 1, seen.1 + usize::from(outside));
+        }
+        if outside {
+            let stop = &problem.plan.stops[k];
+            let Origin { source, marker, .. } = origin;
+            self.refined.outliers.push(Outlier { flight: stop.flight, t: stop.t, source, marker, ratio });
+        } else {
+            self.components.take(origin.source, block, back);
+        }
+    }
+}
+
+fn tallies(targets: usize, counts: &[(usize, usize)], noise: &Noise) -> Vec<Tally> {
+    use Source as S;
+    let own = [S::GpsPosition, S::GpsVelocity, S::Heading, S::Tilt, S::Feature];
+    let motion = [S::TiltMotion, S::YawMotion, S::Gust, S::Thrust];
+    let of_targets = (0..targets).flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t)]);
+    let all = own.into_iter().chain(motion).chain(of_targets);
+    let tally = |source: Source| {
+        let (taken, outliers) = counts[source.index()];
+        Tally { source, taken, outliers, figure: noise.of(source) }
+    };
+    all.map(tally).filter(|tally| tally.taken > 0).collect()
+}
+
+fn constants(problem: &Problem<'_>, values: &Values, back: &Back) -> Vec<Constant> {
+    let at = problem.shape.constants_at();
+    let constant = |(i, (prior, value)): (usize, (&Prior, &f64))| {
+        let sigma = if prior.sigma > 0.0 { back.covariance(at + i, at + i).max(0.0).sqrt() } else { 0.0 };
+        Constant { kind: prior.kind, value: *value, sigma, prior: prior.mean, prior_sigma: prior.sigma }
+    };
+    problem.priors.iter().zip(&values.constants).enumerate().map(constant).collect()
+}
+
+fn ownship(
+    problem: &Problem<'_>,
+    values: &Values,
+    back: &Back,
+    k: usize,
+    site: &Site,
+    recordings: &[Recording],
+) -> Ownship {
+    let (stop, state) = (&problem.plan.stops[k], &values.knots[k]);
+    let at = problem.shape.knot_at(k);
+    let position = state.three(knot::POSITION);
+    let place = site.frame.geodetic(&position);
+    Ownship {
+        t_valid: stop.t,
+        frame: stop.frame.map(|frame| recordings[stop.flight].frames[frame].value.frame),
+        position_ned_m: position,
+        velocity_ned_mps: state.three(knot::VELOCITY),
+        ned_from_body: UnitQuaternion::from_rotation_matrix(&state.attitude),
+        lat_deg: place.lat_deg,
+        lon_deg: place.lon_deg,
+        height_m: place.height_m,
+        covariance: SMatrix::from_fn(|i, j| back.covariance(at + i, at + j)),
+    }
+}
+
+fn target_estimate(
+    pass: &Pass<'_>,
+    values: &Values,
+    back: &Back,
+    k: usize,
+    target: usize,
+    recordings: &[Recording],
+) -> TargetEstimate {
+    let problem = pass.problem;
+    let stop = &problem.plan.stops[k];
+    let at = problem.shape.knot_at(k) + knot::target(target);
+    let frame = stop.frame.map(|frame| &recordings[stop.flight].frames[frame].value);
+    let shown = frame.is_some_and(|frame| {
+        let of = |marker| pass.predictor.find(marker).is_some_and(|(t, _)| t == target);
+        frame.markers.iter().any(|seen| of(seen.marker))
+    });
+    let status = match (stop.held[target], shown) {
+        (false, _) => TrackStatus::Lost,
+        (true, true) => TrackStatus::Tracking,
+        (true, false) => TrackStatus::Coasting,
+    };
+    let covariance = SMatrix::<f64, 5, 5>::from_fn(|i, j| back.covariance(at + i, at + j));
+    let mean = &values.knots[k].target(target)[..5];
+    let state = stop.held[target].then(|| pass.predictor.target_state(target, mean, &covariance));
+    TargetEstimate { t_valid: stop.t, frame: frame.map_or(0, |frame| frame.frame), target, status, state }
+}

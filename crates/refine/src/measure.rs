@@ -1,0 +1,264 @@
+//! Rows of a knot's measurements: the filter's own models at the knot's state, carried to the instant of the measurement, with
+//! the columns that only a whole flight can tell: delays, mount, places, focal length, read-out, iron.
+
+use nalgebra::{Vector2, Vector3};
+
+use windhover_estimate::batch::{Linear, columns};
+
+use crate::block::Block;
+use crate::front::Shape;
+use crate::motion::Pushed;
+use crate::unknowns::{Place, constant, knot};
+use crate::values::Knot;
+
+/// A knot's state a moment `dt` after it, where a measurement is predicted.
+pub(crate) struct Instant<'a> {
+    /// The state then.
+    pub(crate) state: &'a Knot,
+    /// Acceleration at the knot.
+    pub(crate) pushed: &'a Pushed,
+    pub(crate) dt: f64,
+    /// First column of the knot, and of the landmark.
+    pub(crate) at: usize,
+    pub(crate) landmark_at: usize,
+    pub(crate) shape: Shape,
+    pub(crate) places: &'a [Place],
+    pub(crate) estimated: &'a [bool],
+}
+
+/// Rows over every column of the front, of which few are not zero.
+#[derive(Clone, Debug)]
+pub(crate) struct Rows {
+    width: usize,
+    rows: Vec<f64>,
+    touched: Vec<bool>,
+}
+
+impl Rows {
+    pub(crate) fn new(shape: Shape) -> Self {
+        Self { width: shape.len(), rows: Vec::new(), touched: vec![false; shape.len()] }
+    }
+
+    fn begin(&mut self, m: usize) {
+        self.rows.clear();
+        self.rows.resize(m * self.width, 0.0);
+        self.touched.fill(false);
+    }
+
+    fn add(&mut self, row: usize, column: usize, value: f64) {
+        self.rows[row * self.width + column] += value;
+        self.touched[column] = true;
+    }
+
+    fn write_block(&self, block: &mut Block, m: usize) {
+        block.begin(m);
+        block.over(self.touched.iter().enumerate().filter(|(_, touched)| **touched).map(|(i, _)| i));
+        for row in 0..m {
+            for place in 0..block.columns.len() {
+                let column = block.columns[place];
+                *block.at(row, place) = self.rows[row * self.width + column];
+            }
+        }
+    }
+}
+
+/// One component's derivatives by the state at the instant.
+struct ByState {
+    position: Vector3<f64>,
+    velocity: Vector3<f64>,
+    attitude: Vector3<f64>,
+    rate: Vector3<f64>,
+}
+
+impl ByState {
+    fn of(linear: &Linear<'_>, row: usize) -> Self {
+        let mut all = [[0.0; 3]; 4];
+        let ranges = [columns::POSITION, columns::VELOCITY, columns::ATTITUDE, columns::RATE];
+        for (column, value) in linear.columns().iter().zip(linear.row(row)) {
+            for (range, three) in ranges.iter().zip(&mut all) {
+                if range.contains(column) {
+                    three[column - range.start] += value;
+                }
+            }
+        }
+        let [position, velocity, attitude, rate] = all.map(Vector3::from);
+        Self { position, velocity, attitude, rate }
+    }
+}
+
+impl Instant<'_> {
+    /// Writes rows of a linearised measurement; gives, of each component, how it changes with time.
+    pub(crate) fn write(&self, linear: &Linear<'_>, rows: &mut Rows) -> Vec<f64> {
+        rows.begin(linear.len());
+        (0..linear.len()).map(|row| self.write_row(linear, row, rows)).collect()
+    }
+
+    fn write_row(&self, linear: &Linear<'_>, row: usize, rows: &mut Rows) -> f64 {
+        for (column, value) in linear.columns().iter().zip(linear.row(row)) {
+            match self.places[*column] {
+                Place::Knot(i) => rows.add(row, self.at + i, *value),
+                Place::Constant(i) => rows.add(row, self.shape.constants_at() + i, *value),
+                Place::Landmark(i) => rows.add(row, self.landmark_at + i, *value),
+                Place::Known(_) | Place::Nowhere => {}
+            }
+        }
+        let by = ByState::of(linear, row);
+        let turned = self.state.attitude.matrix().transpose() * by.attitude;
+        let (v, rate, spin) =
+            (self.state.three(knot::VELOCITY), self.state.three(knot::RATE), self.state.three(knot::SPIN));
+        let dt = self.dt;
+        if dt != 0.0 {
+            for i in 0..3 {
+                rows.add(row, self.at + knot::VELOCITY + i, by.position[i] * dt);
+                rows.add(row, self.at + knot::RATE + i, turned[i] * dt);
+                rows.add(row, self.at + knot::SPIN + i, 0.5 * turned[i] * dt * dt + by.rate[i] * dt);
+            }
+            for (column, d) in &self.pushed.1 {
+                let moved = by.velocity.dot(d) * dt;
+                match self.places[*column] {
+                    Place::Knot(i) => rows.add(row, self.at + i, moved),
+                    Place::Constant(i) => rows.add(row, self.shape.constants_at() + i, moved),
+                    Place::Landmark(_) | Place::Known(_) | Place::Nowhere => {}
+                }
+            }
+        }
+        by.position.dot(&v) + by.velocity.dot(&self.pushed.0) + turned.dot(&rate) + by.rate.dot(&spin)
+    }
+
+    /// Adds what a target's motion makes of a component until the instant; gives how it changes with time by it.
+    pub(crate) fn target(&self, linear: &Linear<'_>, row: usize, target: usize, rows: &mut Rows) -> f64 {
+        let mut by = [0.0; 5];
+        for (column, value) in linear.columns().iter().zip(linear.row(row)) {
+            if let Place::Knot(i) = self.places[*column]
+                && (knot::target(target)..knot::target(target) + 5).contains(&i)
+            {
+                by[i - knot::target(target)] += value;
+            }
+        }
+        let (t, flow) = (self.state.target(target), self.state.target_flow(target));
+        let (s, c) = t[knot::HEADING].sin_cos();
+        let speed = t[knot::SPEED];
+        let (at, dt) = (self.at + knot::target(target), self.dt);
+        if dt != 0.0 {
+            rows.add(row, at + knot::HEADING, (by[1] * c - by[0] * s) * speed * dt);
+            rows.add(row, at + knot::SPEED, (by[0] * c + by[1] * s) * dt);
+            rows.add(row, at + knot::YAW_RATE, by[2] * dt);
+            rows.add(row, at + knot::ACCELERATION, by[3] * dt);
+            rows.add(row, at + knot::YAW_ACCELERATION, by[4] * dt);
+        }
+        by.iter().zip(flow).map(|(by, flow)| by * flow).sum()
+    }
+
+    /// Adds a constant's derivative to a component, where it is estimated.
+    pub(crate) fn constant(&self, row: usize, which: usize, value: f64, rows: &mut Rows) {
+        if self.estimated[which] {
+            rows.add(row, self.shape.constants_at() + which, value);
+        }
+    }
+
+    /// Adds what the camera is beside its configuration to the two components of a pixel that begin at `row`; `flow` is how
+    /// they change with time, `seen` and `left` where they were seen and what is left over of that.
+    pub(crate) fn camera(
+        &self,
+        linear: &Linear<'_>,
+        row: usize,
+        flow: [f64; 2],
+        (seen, left): (&Vector2<f64>, &Vector2<f64>),
+        lens: &Lens,
+        rows: &mut Rows,
+    ) {
+        let r = self.state.attitude.matrix();
+        let share = lens.share(seen.y);
+        let from_principal = seen - left - lens.principal_px;
+        for k in 0..2 {
+            let by = ByState::of(linear, row + k);
+            // The position's column is −∂px/∂point; of the camera's place in the body the same, turned.
+            let at = r.transpose() * by.position;
+            let mount = r.transpose() * by.attitude + at.cross(&lens.camera_at);
+            for i in 0..3 {
+                self.constant(row + k, constant::CAMERA_AT + i, at[i], rows);
+                self.constant(row + k, constant::MOUNT + i, mount[i], rows);
+            }
+            self.constant(row + k, constant::FOCAL, from_principal[k], rows);
+            self.constant(row + k, constant::READOUT, share * flow[k], rows);
+            self.constant(row + k, constant::CAMERA_DELAY, -flow[k], rows);
+        }
+    }
+
+    /// Adds where the antenna is beside its configuration: `R l` to a position, `R (ω × l)` to a velocity.
+    pub(crate) fn antenna(&self, linear: &Linear<'_>, rows: &mut Rows) {
+        let r = self.state.attitude.matrix();
+        let rate = self.state.three(knot::RATE);
+        for row in 0..linear.len() {
+            let by = ByState::of(linear, row);
+            let at = r.transpose() * by.position;
+            let swung = (r.transpose() * by.velocity).cross(&rate);
+            for i in 0..3 {
+                self.constant(row, constant::ANTENNA_AT + i, at[i] + swung[i], rows);
+            }
+        }
+    }
+}
+
+/// What of the camera its own constants depend on.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Lens {
+    pub(crate) principal_px: Vector2<f64>,
+    pub(crate) height_px: f64,
+    /// Where it is in the body, m.
+    pub(crate) camera_at: Vector3<f64>,
+}
+
+impl Lens {
+    /// The share of the frame's height at which a row lies, −½ at the top.
+    fn share(&self, v_px: f64) -> f64 {
+        v_px / (self.height_px - 1.0) - 0.5
+    }
+}
+
+/// Iron's heading error and its derivatives: sine and cosine of the heading, and of twice the heading.
+pub(crate) fn iron(heading: f64) -> [f64; 4] {
+    let ((s, c), (s2, c2)) = (heading.sin_cos(), (2.0 * heading).sin_cos());
+    [s, c, s2, c2]
+}
+
+/// A block of pixels, two components each: of a marker on a target, or of a ground feature. `seen` gives where each is.
+pub(crate) fn pixels(
+    instant: &Instant<'_>,
+    linear: &Linear<'_>,
+    target: Option<usize>,
+    seen: &dyn Fn(usize) -> Vector2<f64>,
+    lens: &Lens,
+    factor: f64,
+    (rows, block): (&mut Rows, &mut Block),
+) -> bool {
+    let mut flows = instant.write(linear, rows);
+    if let Some(target) = target {
+        for (row, flow) in flows.iter_mut().enumerate() {
+            *flow += instant.target(linear, row, target, rows);
+        }
+    }
+    let residual: Vec<f64> = (0..linear.len()).map(|i| linear.residual(i)).collect();
+    for i in 0..linear.len() / 2 {
+        let row = 2 * i;
+        let left = Vector2::new(residual[row], residual[row + 1]);
+        instant.camera(linear, row, [flows[row], flows[row + 1]], (&seen(i), &left), lens, rows);
+    }
+    finish(rows, |a, b| linear.noise(a, b), &residual, factor, block)
+}
+
+/// Turns rows and residuals into a block of unit variance, `factor` on the variance of the noise; `false` where the
+/// noise is none.
+pub(crate) fn finish(
+    rows: &Rows,
+    linear_noise: impl Fn(usize, usize) -> f64,
+    residual: &[f64],
+    factor: f64,
+    block: &mut Block,
+) -> bool {
+    let m = residual.len();
+    rows.write_block(block, m);
+    block.right.copy_from_slice(residual);
+    let mut covariance: Vec<f64> = (0..m * m).map(|k| linear_noise(k / m, k % m) * factor).collect();
+    block.whiten(&mut covariance)
+}

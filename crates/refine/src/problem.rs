@@ -1,0 +1,321 @@
+//! The least-squares problem: every block of a knot at the present values.
+
+use windhover_base::geo::wrap_angle;
+use windhover_base::msg::MarkerId;
+use windhover_estimate::batch::Predictor;
+
+use crate::block::{Block, Noise, Source};
+use crate::front::{Front, Shape};
+use crate::measure::{self, Instant, Lens, Rows};
+use crate::motion::{Link, Processes, Pushed};
+use crate::plan::Plan;
+use crate::recording::Recording;
+use crate::unknowns::{Place, Prior, constant, knot, rig_offsets};
+use crate::values::{Knot, Values};
+
+/// What was measured, and what is known beforehand. Nothing here changes while it is solved.
+pub(crate) struct Problem<'a> {
+    pub(crate) recordings: &'a [Recording],
+    pub(crate) plan: Plan,
+    pub(crate) shape: Shape,
+    pub(crate) priors: Vec<Prior>,
+    pub(crate) places: Vec<Place>,
+    pub(crate) targets: usize,
+    /// Whether each target moves.
+    pub(crate) moves: Vec<bool>,
+    pub(crate) processes: Processes,
+    /// Landmarks that turned out not to be ground.
+    pub(crate) dropped: Vec<bool>,
+    /// Where the camera is configured to be in the body, m.
+    pub(crate) camera_at: nalgebra::Vector3<f64>,
+    pub(crate) gates: [f64; 9],
+}
+
+impl Problem<'_> {
+    /// A knot's state at a measurement's time, `dt` after it.
+    fn instant<'b>(
+        &'b self,
+        k: usize,
+        state: &'b Knot,
+        pushed: &'b Pushed,
+        dt: f64,
+        estimated: &'b [bool],
+    ) -> Instant<'b> {
+        let (shape, places) = (self.shape, &self.places[..]);
+        Instant { state, pushed, dt, at: shape.knot_at(k), landmark_at: 0, shape, places, estimated }
+    }
+}
+
+/// Which measurement a block is of.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(crate) struct Origin {
+    pub(crate) source: Source,
+    pub(crate) marker: Option<MarkerId>,
+    pub(crate) landmark: Option<usize>,
+}
+
+impl Origin {
+    const fn of(source: Source) -> Self {
+        Self { source, marker: None, landmark: None }
+    }
+}
+
+/// Room for the arithmetic of one pass.
+pub(crate) struct Pass<'a> {
+    pub(crate) problem: &'a Problem<'a>,
+    pub(crate) predictor: Predictor,
+    rows: Rows,
+    block: Block,
+    means: Vec<f64>,
+    estimated: Vec<bool>,
+    pushed: Vec<Pushed>,
+    lens: Lens,
+}
+
+/// Weak knowledge of a trajectory's first knot, one sigma: position m, velocity m/s, attitude rad, rate rad/s, angular
+/// acceleration rad/s², wind m/s².
+const FIRST: [f64; 6] = [1e4, 100.0, 1.0, 2.0, 10.0, 1.5];
+/// Of a target where it is taken up: place m, heading rad, speed m/s, yaw rate rad/s, acceleration m/s², yaw acceleration
+/// rad/s².
+const TAKEN_UP: [f64; knot::TARGET] = [1e4, 1e4, 10.0, 30.0, 5.0, 3.0, 3.0];
+
+impl<'a> Pass<'a> {
+    pub(crate) fn new(problem: &'a Problem<'a>, predictor: Predictor) -> Self {
+        let estimated = problem.priors.iter().map(|prior| prior.sigma > 0.0).collect();
+        let lens = Lens {
+            principal_px: predictor.principal_point(),
+            height_px: predictor.image_height_px(),
+            camera_at: problem.camera_at,
+        };
+        Self {
+            rows: Rows::new(problem.shape),
+            block: Block::default(),
+            means: vec![0.0; predictor.len()],
+            estimated,
+            pushed: Vec::with_capacity(problem.plan.stops.len()),
+            lens,
+            predictor,
+            problem,
+        }
+    }
+
+    /// Prepares a pass at these values.
+    pub(crate) fn begin(&mut self, values: &Values) {
+        let offsets = rig_offsets(&values.constants);
+        self.predictor.put_rig(&offsets);
+        self.lens.camera_at = self.problem.camera_at + offsets.camera_at;
+        self.pushed.clear();
+        for state in &values.knots {
+            values.put(state, [0.0; 2], &self.problem.places, &mut self.means, &mut self.predictor);
+            self.pushed.push(self.predictor.acceleration());
+        }
+    }
+
+    /// Adds what is known of the constants beforehand.
+    pub(crate) fn constants(&self, values: &Values, front: &mut Front) -> f64 {
+        let mut cost = 0.0;
+        for (i, (prior, value)) in self.problem.priors.iter().zip(&values.constants).enumerate() {
+            let column = self.problem.shape.constants_at() + i;
+            if prior.sigma > 0.0 {
+                let information = prior.sigma.powi(-2);
+                front.add_prior(column, information, prior.mean - value);
+                cost += (prior.mean - value).powi(2) * information;
+            } else {
+                front.add_prior(column, 1.0, 0.0);
+            }
+        }
+        cost
+    }
+
+    /// Adds what is known of a knot without any measurement: where a trajectory begins, and what is not estimated there.
+    pub(crate) fn beginnings(&self, k: usize, values: &Values, noise: &Noise, front: &mut Front) -> f64 {
+        let (stop, state) = (&self.problem.plan.stops[k], &values.knots[k]);
+        let (at, p) = (self.problem.shape.knot_at(k), &self.problem.processes);
+        let mut cost = 0.0;
+        if stop.begins {
+            let vague = [knot::POSITION, knot::VELOCITY, knot::ATTITUDE];
+            for (first, sigma) in vague.into_iter().zip(FIRST) {
+                (0..3).for_each(|i| front.add_prior(at + first + i, sigma.powi(-2), 0.0));
+            }
+            let mut about_zero = |first: usize, sigmas: &[f64]| {
+                for (i, sigma) in sigmas.iter().enumerate() {
+                    let (information, value) = (sigma.powi(-2), state.x[first + i]);
+                    front.add_prior(at + first + i, information, -value);
+                    cost += value * value * information;
+                }
+            };
+            about_zero(knot::RATE, &[FIRST[3]; 3]);
+            about_zero(knot::SPIN, &[FIRST[4]; 3]);
+            about_zero(knot::GUST, &[noise.of(Source::Gust).sqrt(); 2]);
+            about_zero(knot::THRUST, &[noise.of(Source::Thrust).sqrt()]);
+            about_zero(knot::TILT_ERROR, &[p.tilt_error.0.sqrt(); 2]);
+            about_zero(knot::WIND, &[FIRST[5]; 2]);
+            about_zero(knot::GPS_BIAS, &p.gps_bias.0.map(f64::sqrt));
+        }
+        for target in 0..self.problem.targets {
+            let first = at + knot::target(target);
+            if !stop.held[target] {
+                (0..knot::TARGET).for_each(|i| front.add_prior(first + i, 1.0, 0.0));
+            } else if stop.taken_up[target] {
+                for (i, sigma) in TAKEN_UP.iter().enumerate() {
+                    let (information, value) = (sigma.powi(-2), values.knots[k].target(target)[i]);
+                    let pull = if i < 3 { 0.0 } else { value };
+                    front.add_prior(first + i, information, -pull);
+                    cost += pull * pull * information;
+                }
+            }
+        }
+        cost
+    }
+
+    /// Gives every block of knot `k`: its measurements, and the step to the next knot.
+    pub(crate) fn blocks(
+        &mut self,
+        k: usize,
+        values: &Values,
+        noise: &Noise,
+        take: &mut dyn FnMut(Origin, &Block),
+    ) {
+        self.epochs(k, values, noise, take);
+        self.readings(k, values, noise, take);
+        self.frame(k, values, noise, take);
+        self.link(k, values, noise, take);
+    }
+
+    fn link(&mut self, k: usize, values: &Values, noise: &Noise, take: &mut dyn FnMut(Origin, &Block)) {
+        let problem = self.problem;
+        let Some(next) = problem.plan.stops.get(k + 1).filter(|next| !next.begins) else { return };
+        let stop = &problem.plan.stops[k];
+        let link = Link {
+            from: &values.knots[k],
+            to: &values.knots[k + 1],
+            pushed: (&self.pushed[k], &self.pushed[k + 1]),
+            h: (next.t - stop.t).s(),
+            at: (problem.shape.knot_at(k), problem.shape.knot_at(k + 1)),
+            shape: problem.shape,
+            places: &problem.places,
+            noise,
+            processes: &problem.processes,
+        };
+        let mut take = |source: Source, block: &Block| take(Origin::of(source), block);
+        link.blocks(&mut self.block, &mut take);
+        for target in 0..problem.targets {
+            if stop.held[target] && next.held[target] && !next.taken_up[target] {
+                link.target(target, problem.moves[target], &mut self.block, &mut take);
+            }
+        }
+    }
+
+    /// The knot's state `dt` later.
+    fn state_at(&self, k: usize, values: &Values, dt: f64) -> Knot {
+        let state = &values.knots[k];
+        if dt == 0.0 { state.clone() } else { state.after(dt, &self.pushed[k].0) }
+    }
+
+    fn epochs(&mut self, k: usize, values: &Values, noise: &Noise, take: &mut dyn FnMut(Origin, &Block)) {
+        let problem = self.problem;
+        let stop = &problem.plan.stops[k];
+        for &index in &stop.epochs {
+            let epoch = &problem.recordings[stop.flight].epochs[index];
+            let dt = (epoch.t_valid - stop.t).s();
+            let state = self.state_at(k, values, dt);
+            for source in [Source::GpsVelocity, Source::GpsPosition] {
+                values.put(&state, [0.0; 2], &problem.places, &mut self.means, &mut self.predictor);
+                let linear = match source {
+                    Source::GpsVelocity => self.predictor.gps_velocity(&epoch.value),
+                    _ => self.predictor.gps_position(&epoch.value),
+                };
+                let Some(linear) = linear.filter(|linear| linear.is_finite()) else { continue };
+                let instant = problem.instant(k, &state, &self.pushed[k], dt, &self.estimated);
+                instant.write(&linear, &mut self.rows);
+                instant.antenna(&linear, &mut self.rows);
+                let residual: Vec<f64> = (0..linear.len()).map(|i| linear.residual(i)).collect();
+                let (noise, factor) = (|a, b| linear.noise(a, b), noise.of(source));
+                if measure::finish(&self.rows, noise, &residual, factor, &mut self.block) {
+                    take(Origin::of(source), &self.block);
+                }
+            }
+        }
+    }
+
+    fn readings(&mut self, k: usize, values: &Values, noise: &Noise, take: &mut dyn FnMut(Origin, &Block)) {
+        let problem = self.problem;
+        let stop = &problem.plan.stops[k];
+        let late_s = values.constants[constant::COMPASS_DELAY];
+        for &index in &stop.readings {
+            let reading = &problem.recordings[stop.flight].readings[index];
+            let dt = (reading.t_valid - stop.t).s() - late_s;
+            let state = self.state_at(k, values, dt);
+            let forward = state.attitude.matrix().column(0).into_owned();
+            let iron = measure::iron(forward.y.atan2(forward.x));
+            for source in [Source::Heading, Source::Tilt] {
+                values.put(&state, [0.0; 2], &problem.places, &mut self.means, &mut self.predictor);
+                let linear = match source {
+                    Source::Heading => self.predictor.heading(&reading.value),
+                    _ => self.predictor.tilt(&reading.value),
+                };
+                let Some(linear) = linear.filter(|linear| linear.is_finite()) else { continue };
+                let instant = problem.instant(k, &state, &self.pushed[k], dt, &self.estimated);
+                let flows = instant.write(&linear, &mut self.rows);
+                let mut residual: Vec<f64> = (0..linear.len()).map(|i| linear.residual(i)).collect();
+                for (row, flow) in flows.iter().enumerate() {
+                    instant.constant(row, constant::COMPASS_DELAY, -flow, &mut self.rows);
+                }
+                if source == Source::Heading {
+                    for (i, by) in iron.iter().enumerate() {
+                        residual[0] -= by * values.constants[constant::IRON + i];
+                        instant.constant(0, constant::IRON + i, *by, &mut self.rows);
+                    }
+                    residual[0] = wrap_angle(residual[0]);
+                }
+                let (noise, factor) = (|a, b| linear.noise(a, b), noise.of(source));
+                if measure::finish(&self.rows, noise, &residual, factor, &mut self.block) {
+                    take(Origin::of(source), &self.block);
+                }
+            }
+        }
+    }
+
+    fn frame(&mut self, k: usize, values: &Values, noise: &Noise, take: &mut dyn FnMut(Origin, &Block)) {
+        let problem = self.problem;
+        let stop = &problem.plan.stops[k];
+        let Some(index) = stop.frame else { return };
+        let seen = &problem.recordings[stop.flight].frames[index].value;
+        let dt = -values.constants[constant::CAMERA_DELAY];
+        let state = self.state_at(k, values, dt);
+        for marker in &seen.markers {
+            let Some((target, _)) = self.predictor.find(marker.marker) else { continue };
+            if !stop.held[target] {
+                continue;
+            }
+            values.put(&state, [0.0; 2], &problem.places, &mut self.means, &mut self.predictor);
+            let Some(linear) = self.predictor.marker(marker).filter(|l| l.is_finite()) else { continue };
+            let instant = problem.instant(k, &state, &self.pushed[k], dt, &self.estimated);
+            let pixel = |i: usize| marker.corners_px.map_or(marker.center_px, |corners| corners[i]);
+            let origin = Origin { marker: Some(marker.marker), ..Origin::of(Source::Marker(target)) };
+            let work = (&mut self.rows, &mut self.block);
+            let factor = noise.of(origin.source);
+            if measure::pixels(&instant, &linear, Some(target), &pixel, &self.lens, factor, work) {
+                take(origin, &self.block);
+            }
+        }
+        for followed in &stop.features {
+            if problem.dropped[followed.landmark] {
+                continue;
+            }
+            let feature = &seen.features[followed.index];
+            let landmark = values.landmarks[followed.landmark];
+            values.put(&state, landmark, &problem.places, &mut self.means, &mut self.predictor);
+            let linear = self.predictor.feature(&feature.px, feature.sigma_px);
+            let Some(linear) = linear.filter(|linear| linear.is_finite()) else { continue };
+            let mut instant = problem.instant(k, &state, &self.pushed[k], dt, &self.estimated);
+            instant.landmark_at = problem.shape.landmark_at(followed.place);
+            let origin = Origin { landmark: Some(followed.landmark), ..Origin::of(Source::Feature) };
+            let work = (&mut self.rows, &mut self.block);
+            let factor = noise.of(Source::Feature);
+            if measure::pixels(&instant, &linear, None, &|_| feature.px, &self.lens, factor, work) {
+                take(origin, &self.block);
+            }
+        }
+    }
+}

@@ -1,0 +1,270 @@
+//! From recordings to a refined flight.
+
+use nalgebra::{Rotation3, Vector3};
+
+use windhover_base::geo::{locate, wrap_angle};
+use windhover_base::msg::{FeltTilt, FixKind, TargetEstimate};
+use windhover_base::settings::{EstimatorConfig, Rig};
+use windhover_base::time::MonoTime;
+use windhover_estimate::Site;
+use windhover_estimate::batch::Predictor;
+
+use crate::first::{First, filtered};
+use crate::front::Shape;
+use crate::look::{Looked, look};
+use crate::motion::Processes;
+use crate::noise::first as first_noise;
+use crate::plan::Plan;
+use crate::problem::{Pass, Problem};
+use crate::recording::Recording;
+use crate::solve::{Unsolved, solve};
+use crate::told::Refined;
+use crate::unknowns::{knot, places, priors};
+use crate::values::{Knot, Values};
+
+/// Why a flight could not be refined.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, thiserror::Error)]
+pub enum RefineError {
+    /// There is no position.
+    #[error("the receiver never told a position: there is nothing to begin from")]
+    NoFix,
+    /// There is no heading.
+    #[error("there are no readings of a compass: heading and tilt have nothing to begin from")]
+    NoCompass,
+    /// The filter never started.
+    #[error(
+        "positions and compass readings never came within three seconds of each other: the filter does not start"
+    )]
+    NotStarted,
+    /// The normal equations cannot be solved.
+    #[error("the measurements do not determine the flight (the normal equations are singular)")]
+    Singular,
+    /// Who waited does not want it any more.
+    #[error("stopped")]
+    Stopped,
+}
+
+impl From<Unsolved> for RefineError {
+    fn from(unsolved: Unsolved) -> Self {
+        match unsolved {
+            Unsolved::Singular => Self::Singular,
+            Unsolved::Stopped => Self::Stopped,
+        }
+    }
+}
+
+/// Rounds of fitting noise and motion at most, and the change of a figure's logarithm that ends them.
+const ROUNDS: usize = 8;
+const SETTLED: f64 = 0.05;
+/// A ground feature of whose sightings more than this share lies outside the gate is none.
+const MOVING: f64 = 0.25;
+/// Chi-square values that good measurements stay below but for one in a thousand, by number of components.
+const GATES: [f64; 9] = [f64::INFINITY, 10.83, 13.82, 16.27, 18.47, 20.52, 22.46, 24.32, 26.12];
+/// Outliers that are named.
+const NAMED: usize = 200;
+/// Correlation time of the thrust beyond the weight, s.
+const THRUST_TAU_S: f64 = 2.0;
+
+/// Estimates the trajectories of helicopter and targets over whole recordings at once, with the constants they share.
+///
+/// `watch` is called often with the share that is done, about; `false` stops.
+///
+/// # Errors
+/// The recordings do not determine a flight, or it was stopped.
+pub fn refine(
+    rig: &Rig,
+    estimator: &EstimatorConfig,
+    site: &Site,
+    recordings: &[Recording],
+    watch: &mut dyn FnMut(f64) -> bool,
+) -> Result<Refined, RefineError> {
+    let firsts: Vec<First> =
+        recordings.iter().map(|recording| filtered(rig, estimator, site, recording)).collect();
+    let felt = firsts.iter().find_map(|first| first.felt);
+    let mut predictor = Predictor::new(rig, estimator, site);
+    predictor.set_felt(felt);
+    let plan = planned(&predictor, recordings, &firsts, rig.target.len(), estimator.lost_after_s);
+    if plan.stops.is_empty() {
+        return Err(why_not_started(recordings));
+    }
+    let mut problem = stated(rig, estimator, recordings, plan, &mut predictor, felt);
+    let mut values = first_values(&problem, &firsts, &predictor, rig, site);
+    let mut noise = first_noise(problem.targets, estimator.side_force_mps2, estimator.thrust_mps2);
+    let total = (problem.plan.stops.len() * (ROUNDS + 1) * 3) as f64;
+    let mut done = 0usize;
+    let mut step = |_: usize| {
+        done += 1;
+        watch((done as f64 / total).min(1.0))
+    };
+    for round in 0.. {
+        let looked = {
+            let mut pass = Pass::new(&problem, predictor.clone());
+            let factors = solve(&mut pass, &mut values, &noise, &mut step)?;
+            look(&mut pass, &factors, &values, &noise, site, recordings)
+        };
+        let dropped = drop_movers(&mut problem, &looked);
+        let moved = looked.components.fit(problem.targets, &mut noise);
+        if round >= ROUNDS || (moved < SETTLED && dropped == 0) {
+            let mut refined = looked.refined;
+            refined.finish(&problem, &firsts, felt);
+            return Ok(refined);
+        }
+    }
+    unreachable!("the loop ends by its rounds")
+}
+
+fn why_not_started(recordings: &[Recording]) -> RefineError {
+    let fixes = |r: &Recording| r.epochs.iter().any(|e| e.value.fix.has_position());
+    let headings = |r: &Recording| r.readings.iter().any(|s| s.value.heading.is_some());
+    match (recordings.iter().any(fixes), recordings.iter().any(headings)) {
+        (false, _) => RefineError::NoFix,
+        (_, false) => RefineError::NoCompass,
+        _ => RefineError::NotStarted,
+    }
+}
+
+pub(crate) fn planned(
+    predictor: &Predictor,
+    recordings: &[Recording],
+    firsts: &[First],
+    targets: usize,
+    lost_after_s: f64,
+) -> Plan {
+    let mut plan = Plan::default();
+    let find = |marker| predictor.find(marker).map(|(target, _)| target);
+    for (flight, (recording, first)) in recordings.iter().zip(firsts).enumerate() {
+        plan.add(flight, recording, first, &find, targets, lost_after_s);
+    }
+    plan
+}
+
+pub(crate) fn stated<'a>(
+    rig: &Rig,
+    estimator: &EstimatorConfig,
+    recordings: &'a [Recording],
+    plan: Plan,
+    predictor: &mut Predictor,
+    felt: Option<FeltTilt>,
+) -> Problem<'a> {
+    let targets = rig.target.len();
+    let share = match felt {
+        Some(FeltTilt::Share(share)) => Some(share),
+        _ => None,
+    };
+    let priors = priors(rig, predictor, share);
+    let places = places(predictor, targets, &priors);
+    let best_fix = recordings.iter().flat_map(|r| &r.epochs).map(|e| e.value.fix).max();
+    let shape = Shape { knot: knot::target(targets), landmarks: plan.places, constants: priors.len() };
+    Problem {
+        recordings,
+        dropped: vec![false; plan.landmarks],
+        plan,
+        shape,
+        places,
+        priors,
+        targets,
+        moves: (0..targets).map(|target| predictor.moves(target)).collect(),
+        processes: Processes {
+            gust_tau_s: estimator.force_tau_s,
+            thrust_tau_s: THRUST_TAU_S,
+            tilt_error: predictor.tilt_error(),
+            gps_bias: predictor.gps_bias(best_fix.unwrap_or(FixKind::ThreeD)),
+            slip_q: predictor.slip_q(),
+        },
+        camera_at: rig.camera.mount.position(),
+        gates: GATES,
+    }
+}
+
+pub(crate) fn first_values(
+    problem: &Problem<'_>,
+    firsts: &[First],
+    predictor: &Predictor,
+    rig: &Rig,
+    site: &Site,
+) -> Values {
+    let stops = &problem.plan.stops;
+    let mut knots: Vec<Knot> =
+        stops.iter().map(|stop| firsts[stop.flight].knot_at(stop.t, problem.targets)).collect();
+    for target in 0..problem.targets {
+        for (stop, knot) in stops.iter().zip(&mut knots).filter(|(stop, _)| stop.held[target]) {
+            let at = knot::target(target);
+            let mean = target_at(&firsts[stop.flight].targets[target], stop.t, predictor.reference_m(target));
+            match mean {
+                Some(mean) => knot.x[at..at + 5].copy_from_slice(&mean),
+                // Never settled: below the helicopter.
+                None => knot.x.copy_within(0..2, at),
+            }
+        }
+    }
+    let mut values = Values {
+        knots,
+        landmarks: vec![[0.0; 2]; problem.plan.landmarks],
+        constants: problem.priors.iter().map(|prior| prior.mean).collect(),
+    };
+    place_landmarks(problem, rig, site, &mut values);
+    values
+}
+
+/// A target's mean at a time, between its estimates.
+fn target_at(track: &[TargetEstimate], t: MonoTime, reference_m: f64) -> Option<[f64; 5]> {
+    let mean = |e: &TargetEstimate| {
+        e.state.map(|s| {
+            let (sin, cos) = s.heading_rad.sin_cos();
+            let (north, east) = (s.north_m - reference_m * cos, s.east_m - reference_m * sin);
+            [north, east, s.heading_rad, s.speed_mps, s.yaw_rate_radps]
+        })
+    };
+    let after = track.partition_point(|e| e.t_valid < t).min(track.len().checked_sub(1)?);
+    let (a, b) = (&track[after.saturating_sub(1)], &track[after]);
+    let (from, mut to) = (mean(a)?, mean(b)?);
+    to[2] = from[2] + wrap_angle(to[2] - from[2]);
+    let whole = (b.t_valid - a.t_valid).s();
+    let share = if whole > 0.0 { ((t - a.t_valid).s() / whole).clamp(0.0, 1.0) } else { 1.0 };
+    Some(std::array::from_fn(|i| from[i] + (to[i] - from[i]) * share))
+}
+
+/// Landmarks where the sighting in the middle of their life shows them.
+fn place_landmarks(problem: &Problem<'_>, rig: &Rig, site: &Site, values: &mut Values) {
+    let mut sightings: Vec<Vec<(usize, usize)>> = vec![Vec::new(); problem.plan.landmarks];
+    for (k, stop) in problem.plan.stops.iter().enumerate() {
+        stop.features.iter().for_each(|seen| sightings[seen.landmark].push((k, seen.index)));
+    }
+    let body_from_camera = rig.camera.mount.body_from_camera();
+    for (landmark, seen) in sightings.iter().enumerate() {
+        let Some(&(k, index)) = seen.get(seen.len() / 2) else { continue };
+        let (stop, state) = (&problem.plan.stops[k], &values.knots[k]);
+        let Some(frame) = stop.frame else { continue };
+        let px = problem.recordings[stop.flight].frames[frame].value.features[index].px;
+        let attitude: Rotation3<f64> = state.attitude;
+        let camera: Vector3<f64> = state.three(knot::POSITION) + attitude * problem.camera_at;
+        let turned = attitude * body_from_camera;
+        let found = locate(&rig.camera.intrinsics, &camera, &turned, px, &site.ground, 0.0, 1e4);
+        let place = found.map_or(state.three(knot::POSITION), |point| point.ned_m);
+        values.landmarks[landmark] = [place.x, place.y];
+    }
+}
+
+/// Drops landmarks that are not where they were too often; how many.
+fn drop_movers(problem: &mut Problem<'_>, looked: &Looked) -> usize {
+    let mut more = 0;
+    for (dropped, (seen, outside)) in problem.dropped.iter_mut().zip(&looked.landmarks) {
+        let moves = *outside as f64 > MOVING * *seen as f64;
+        more += usize::from(moves && !*dropped);
+        *dropped |= moves;
+    }
+    more
+}
+
+impl Refined {
+    fn finish(&mut self, problem: &Problem<'_>, firsts: &[First], felt: Option<FeltTilt>) {
+        self.outliers.sort_by(|a, b| b.ratio.total_cmp(&a.ratio));
+        self.outliers.truncate(NAMED);
+        self.felt = felt;
+        let dropped = problem.dropped.iter().filter(|dropped| **dropped).count();
+        self.features = (problem.dropped.len() - dropped, dropped);
+        let begins = problem.plan.stops.iter().filter(|stop| stop.begins).map(|stop| (stop.flight, stop.t));
+        self.begins = begins.collect();
+        self.resets = firsts.iter().flat_map(|first| first.resets.clone()).collect();
+    }
+}

@@ -1,0 +1,139 @@
+//! The values that fit everything best: Gauss–Newton steps, raised (Marquardt 1963) where the model bends too much.
+
+use crate::block::{Block, Loss, Noise};
+use crate::front::{Back, Eliminated, Front, Singular};
+use crate::problem::{Origin, Pass};
+use crate::values::Values;
+
+/// A step that promises less of the sum of squares than this changes nothing by a sigma.
+const CONVERGED: f64 = 0.05;
+/// Steps tried at most, and how the diagonal is raised where one made it worse.
+const STEPS: usize = 25;
+const RAISED: (f64, f64, f64) = (1e-4, 10.0, 1e6);
+/// Information about a landmark before it is seen, 1/m².
+const LANDMARK: f64 = 1e-8;
+
+/// What was eliminated.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) enum What {
+    Knot(usize),
+    Landmark(usize),
+    Constants,
+}
+
+/// The factorised normal equations at some values.
+pub(crate) struct Factors {
+    pub(crate) steps: Vec<(What, Eliminated)>,
+    pub(crate) cost: f64,
+}
+
+impl Factors {
+    fn gain(&self) -> f64 {
+        self.steps.iter().map(|(_, e)| e.gain()).sum()
+    }
+}
+
+/// Whoever waits: gets the share that is done; says whether to go on.
+pub(crate) type Watch<'a> = &'a mut dyn FnMut(usize) -> bool;
+
+/// Why there is no solution.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) enum Unsolved {
+    Singular,
+    Stopped,
+}
+
+impl From<Singular> for Unsolved {
+    fn from(_: Singular) -> Self {
+        Self::Singular
+    }
+}
+
+/// Makes the normal equations at the values, and eliminates all unknowns.
+pub(crate) fn factorise(
+    pass: &mut Pass<'_>,
+    values: &Values,
+    noise: &Noise,
+    raised: f64,
+    watch: Watch<'_>,
+) -> Result<Factors, Unsolved> {
+    let problem = pass.problem;
+    let (shape, gates) = (problem.shape, problem.gates);
+    pass.begin(values);
+    let mut front = Front::new(shape);
+    let mut cost = pass.constants(values, &mut front);
+    let mut steps = Vec::with_capacity(values.knots.len() + values.landmarks.len() + 1);
+    for (k, stop) in problem.plan.stops.iter().enumerate() {
+        cost += pass.beginnings(k, values, noise, &mut front);
+        pass.blocks(k, values, noise, &mut |origin: Origin, block: &Block| {
+            let square = block.square();
+            let loss = match origin.source.is_measured() {
+                true => Loss::of(square, gates[block.len()]),
+                false => Loss { weight: 1.0, cost: square },
+            };
+            cost += loss.cost;
+            front.add(&block.columns, &block.rows, &block.right, loss.weight);
+        });
+        steps.push((What::Knot(k), front.eliminate(shape.knot_at(k), shape.knot, raised)?));
+        for (place, landmark) in &stop.closes {
+            let first = shape.landmark_at(*place);
+            (0..2).for_each(|i| front.hold(first + i, LANDMARK));
+            steps.push((What::Landmark(*landmark), front.eliminate(first, 2, raised)?));
+        }
+        if !watch(k) {
+            return Err(Unsolved::Stopped);
+        }
+    }
+    steps.push((What::Constants, front.eliminate(shape.constants_at(), shape.constants, raised)?));
+    Ok(Factors { steps, cost })
+}
+
+/// Moves the values until they fit best.
+pub(crate) fn solve(
+    pass: &mut Pass<'_>,
+    values: &mut Values,
+    noise: &Noise,
+    watch: Watch<'_>,
+) -> Result<Factors, Unsolved> {
+    let mut raised = 0.0;
+    let mut best: Option<(Values, f64)> = None;
+    for step in 0.. {
+        let factors = factorise(pass, values, noise, raised, watch)?;
+        let worse = best.as_ref().is_some_and(|(_, cost)| !(factors.cost <= cost * (1.0 + 1e-9)));
+        if worse && let Some((before, _)) = &best {
+            raised = f64::max(RAISED.0, raised * RAISED.1);
+            values.clone_from(before);
+            if raised <= RAISED.2 && step < STEPS {
+                best = None;
+                continue;
+            }
+            return factorise(pass, values, noise, 0.0, watch);
+        }
+        if factors.gain() < CONVERGED || step >= STEPS {
+            return if raised == 0.0 { Ok(factors) } else { factorise(pass, values, noise, 0.0, watch) };
+        }
+        raised = if raised > RAISED.0 { raised / RAISED.1 } else { 0.0 };
+        best = Some((values.clone(), factors.cost));
+        apply(pass, &factors, values);
+    }
+    unreachable!("the loop ends by its steps")
+}
+
+/// Moves the values by the solution.
+fn apply(pass: &Pass<'_>, factors: &Factors, values: &mut Values) {
+    let mut back = Back::new(pass.problem.shape);
+    for (what, e) in factors.steps.iter().rev() {
+        back.solve(e);
+        values.step(*what, &back.x[e.range()]);
+    }
+}
+
+impl Values {
+    fn step(&mut self, what: What, dx: &[f64]) {
+        match what {
+            What::Knot(k) => self.knots[k].step(dx),
+            What::Landmark(l) => self.landmarks[l].iter_mut().zip(dx).for_each(|(x, d)| *x += d),
+            What::Constants => self.constants.iter_mut().zip(dx).for_each(|(x, d)| *x += d),
+        }
+    }
+}

@@ -1,0 +1,92 @@
+//! The present values of all unknowns, and a knot's state a moment before or after it.
+
+use nalgebra::{Rotation3, Vector3};
+
+use windhover_estimate::batch::Predictor;
+
+use crate::unknowns::{Place, knot};
+
+/// Helicopter and targets at one instant.
+#[derive(Clone, Debug)]
+pub(crate) struct Knot {
+    pub(crate) attitude: Rotation3<f64>,
+    /// By the places of [`knot`]; those of the attitude are zero.
+    pub(crate) x: Vec<f64>,
+}
+
+impl Knot {
+    pub(crate) fn three(&self, at: usize) -> Vector3<f64> {
+        Vector3::from_column_slice(&self.x[at..at + 3])
+    }
+
+    pub(crate) fn target(&self, i: usize) -> &[f64] {
+        &self.x[knot::target(i)..][..knot::TARGET]
+    }
+
+    /// Moves it by a step.
+    pub(crate) fn step(&mut self, dx: &[f64]) {
+        let turn = Vector3::from_column_slice(&dx[knot::ATTITUDE..knot::ATTITUDE + 3]);
+        self.attitude = Rotation3::new(turn) * self.attitude;
+        self.attitude.renormalize();
+        self.x.iter_mut().zip(dx).for_each(|(x, d)| *x += d);
+        self.x[knot::ATTITUDE..knot::ATTITUDE + 3].fill(0.0);
+    }
+
+    /// A moment later, while it accelerates so.
+    pub(crate) fn after(&self, dt: f64, acceleration: &Vector3<f64>) -> Self {
+        let mut next = self.clone();
+        let (v, rate, spin) = (self.three(knot::VELOCITY), self.three(knot::RATE), self.three(knot::SPIN));
+        for i in 0..3 {
+            next.x[knot::POSITION + i] += v[i] * dt + 0.5 * acceleration[i] * dt * dt;
+            next.x[knot::VELOCITY + i] += acceleration[i] * dt;
+            next.x[knot::RATE + i] += spin[i] * dt;
+        }
+        next.attitude *= Rotation3::new(rate * dt + spin * (0.5 * dt * dt));
+        let targets = (self.x.len() - knot::TARGETS) / knot::TARGET;
+        for i in 0..targets {
+            let flow = self.target_flow(i);
+            let at = knot::target(i);
+            next.x[at..at + 5].iter_mut().zip(flow).for_each(|(x, rate)| *x += rate * dt);
+        }
+        next
+    }
+
+    /// How a target's north, east, heading, speed and yaw rate change.
+    pub(crate) fn target_flow(&self, i: usize) -> [f64; 5] {
+        let t = self.target(i);
+        let (s, c) = t[knot::HEADING].sin_cos();
+        let speed = t[knot::SPEED];
+        [speed * c, speed * s, t[knot::YAW_RATE], t[knot::ACCELERATION], t[knot::YAW_ACCELERATION]]
+    }
+}
+
+/// All unknowns.
+#[derive(Clone, Debug)]
+pub(crate) struct Values {
+    pub(crate) knots: Vec<Knot>,
+    /// North and east of each ground feature.
+    pub(crate) landmarks: Vec<[f64; 2]>,
+    pub(crate) constants: Vec<f64>,
+}
+
+impl Values {
+    /// Puts a knot's state into the models, with a landmark.
+    pub(crate) fn put(
+        &self,
+        state: &Knot,
+        landmark: [f64; 2],
+        places: &[Place],
+        means: &mut [f64],
+        predictor: &mut Predictor,
+    ) {
+        for (mean, place) in means.iter_mut().zip(places) {
+            *mean = match *place {
+                Place::Knot(i) => state.x[i],
+                Place::Constant(i) | Place::Known(i) => self.constants[i],
+                Place::Landmark(i) => landmark[i],
+                Place::Nowhere => 0.0,
+            };
+        }
+        predictor.put(&state.attitude, means);
+    }
+}

@@ -1,0 +1,158 @@
+//! What a refined flight has settled, as configuration to paste.
+
+use std::fmt::Write as _;
+
+use nalgebra::{Rotation3, Vector3};
+
+use crate::config::Config;
+use windhover_base::geo::{euler_321, ned_from_body_321};
+use windhover_base::settings::MarkerConfig;
+use windhover_refine::{Constant, ConstantKind, Refined};
+
+/// The settled constants as TOML; empty where the flight settles none that the configuration has a key for.
+///
+/// Settled is what the flight tells, beyond three sigmas, to be other than configured.
+pub fn adopted(refined: &Refined, config: &Config) -> String {
+    let found = Found(&refined.constants);
+    let sections = [
+        ("[gps]", gps(&found, config)),
+        ("[compass]", compass(&found, config)),
+        ("[camera]", camera(&found, config)),
+        ("[camera.intrinsics]", intrinsics(&found, config)),
+        ("[camera.mount]", mount(&found, config)),
+    ];
+    let mut text = String::new();
+    for (name, keys) in sections.into_iter().filter(|(_, keys)| !keys.is_empty()) {
+        let gap = if text.is_empty() { "" } else { "\n" };
+        let _ = write!(text, "{gap}{name}\n{keys}");
+    }
+    text + &markers(&found, config)
+}
+
+struct Found<'a>(&'a [Constant]);
+
+impl Found<'_> {
+    fn settled(&self, kind: ConstantKind) -> Option<&Constant> {
+        self.0.iter().find(|constant| constant.kind == kind).filter(|constant| constant.is_settled())
+    }
+
+    fn value(&self, kind: ConstantKind) -> f64 {
+        self.0.iter().find(|constant| constant.kind == kind).map_or(0.0, |constant| constant.value)
+    }
+
+    /// A vector of which a component is settled.
+    fn vector(&self, of: fn(usize) -> ConstantKind) -> Option<Vector3<f64>> {
+        let any = (0..3).any(|i| self.settled(of(i)).is_some());
+        any.then(|| Vector3::from_fn(|i, _| self.value(of(i))))
+    }
+}
+
+fn key(text: &mut String, name: &str, value: f64, decimals: usize, constant: &Constant, scale: f64) {
+    let sigma = constant.sigma / scale;
+    let _ = writeln!(text, "{name} = {value:.decimals$}    # ± {sigma:.decimals$}");
+}
+
+fn place(text: &mut String, name: &str, configured: [f64; 3], by: &Vector3<f64>) {
+    let [x, y, z] = std::array::from_fn(|i| configured[i] + by[i]);
+    let _ = writeln!(text, "{name} = [{x:.3}, {y:.3}, {z:.3}]");
+}
+
+fn gps(found: &Found<'_>, config: &Config) -> String {
+    let mut text = String::new();
+    if let Some(delay) = found.settled(ConstantKind::GpsDelay) {
+        key(&mut text, "latency_ms", config.gps.latency_ms + delay.value * 1e3, 1, delay, 1e-3);
+    }
+    if let Some(by) = found.vector(ConstantKind::AntennaAt) {
+        place(&mut text, "antenna_position_m", config.gps.antenna_position_m, &by);
+    }
+    text
+}
+
+fn compass(found: &Found<'_>, config: &Config) -> String {
+    let (mut text, compass, deg) = (String::new(), &config.compass, 1f64.to_radians());
+    if let Some(bias) = found.settled(ConstantKind::HeadingBias) {
+        key(&mut text, "yaw_offset_deg", compass.yaw_offset_deg - bias.value / deg, 2, bias, deg);
+    }
+    let offsets = [compass.pitch_offset_deg, compass.roll_offset_deg];
+    for (i, (name, offset)) in ["pitch_offset_deg", "roll_offset_deg"].into_iter().zip(offsets).enumerate() {
+        if let Some(bias) = found.settled(ConstantKind::TiltBias(i)) {
+            key(&mut text, name, offset + bias.value / deg, 2, bias, deg);
+        }
+    }
+    if let Some(delay) = found.settled(ConstantKind::CompassDelay) {
+        key(&mut text, "latency_ms", compass.latency_ms + delay.value * 1e3, 1, delay, 1e-3);
+    }
+    text
+}
+
+fn camera(found: &Found<'_>, config: &Config) -> String {
+    let mut text = String::new();
+    if let Some(delay) = found.settled(ConstantKind::CameraDelay) {
+        let offset_ms = config.camera.exposure_offset_ms - delay.value * 1e3;
+        key(&mut text, "exposure_offset_ms", offset_ms, 1, delay, 1e-3);
+    }
+    if let Some(readout) = found.settled(ConstantKind::Readout) {
+        let readout_ms = (config.camera.readout_ms + readout.value * 1e3).max(0.0);
+        key(&mut text, "readout_ms", readout_ms, 1, readout, 1e-3);
+    }
+    text
+}
+
+fn intrinsics(found: &Found<'_>, config: &Config) -> String {
+    let Some(focal) = found.settled(ConstantKind::Focal) else { return String::new() };
+    let (factor, lens) = (focal.value.exp(), &config.camera.intrinsics);
+    let mut text = String::new();
+    for (name, configured) in [("fx", lens.fx), ("fy", lens.fy)] {
+        let _ = writeln!(text, "{name} = {:.3}    # ± {:.3}", configured * factor, configured * focal.sigma);
+    }
+    text
+}
+
+fn mount(found: &Found<'_>, config: &Config) -> String {
+    let (mut text, mount) = (String::new(), &config.camera.mount);
+    if let Some(by) = found.vector(ConstantKind::CameraAt) {
+        place(&mut text, "position_m", mount.position_m, &by);
+    }
+    if let Some(by) = found.vector(ConstantKind::Mount) {
+        let configured = [mount.yaw_deg, mount.pitch_deg, mount.roll_deg].map(f64::to_radians);
+        let [yaw, pitch, roll] = configured;
+        // body_from_camera = Rz(yaw) Ry(pitch) Rx(roll) · base, turned in the body.
+        let (yaw, pitch, roll) = euler_321(&(Rotation3::new(by) * ned_from_body_321(yaw, pitch, roll)));
+        for (name, angle) in [("yaw_deg", yaw), ("pitch_deg", pitch), ("roll_deg", roll)] {
+            let _ = writeln!(text, "{name} = {:.3}", angle.to_degrees());
+        }
+    }
+    text
+}
+
+/// Markers that are otherwise than configured, whole: a block each in place of the one there.
+fn markers(found: &Found<'_>, config: &Config) -> String {
+    let mut text = String::new();
+    for (target, of) in config.target.iter().enumerate() {
+        for (marker, configured) in of.marker.iter().enumerate() {
+            let kind = |part| ConstantKind::Tag { target, marker, part };
+            if (0..4).any(|part| found.settled(kind(part)).is_some()) {
+                let [size, forward, right, turn] = std::array::from_fn(|part| found.value(kind(part)));
+                let [x, y, z] = configured.position_m;
+                let adopted = MarkerConfig {
+                    size_m: configured.size_m.map(|edge| rounded(edge * size.exp(), 5)),
+                    position_m: [rounded(x + forward, 4), rounded(y + right, 4), z],
+                    yaw_deg: rounded(configured.yaw_deg + turn.to_degrees(), 3),
+                    ..configured.clone()
+                };
+                let block = toml::to_string(&adopted).unwrap_or_default();
+                let _ = write!(
+                    text,
+                    "\n# of {}, in place of the marker there\n[[target.marker]]\n{block}",
+                    of.name
+                );
+            }
+        }
+    }
+    text
+}
+
+fn rounded(value: f64, decimals: i32) -> f64 {
+    let scale = 10f64.powi(decimals);
+    (value * scale).round() / scale
+}

@@ -1,0 +1,220 @@
+//! What a flight holds as messages of ROS 2: its outputs, frames and samples, in REP-103's axes and REP-105's frames.
+//!
+//! | frame | axes | origin |
+//! |---|---|---|
+//! | `earth` | ECEF | the Earth's centre |
+//! | `map` | east, north, up | the datum |
+//! | `base_link` | forward, left, up | the helicopter's body frame |
+//! | `NAME/base_link` | forward, left, up | the reference point of target NAME, on the ground |
+//! | `camera_optical_frame` | right, down, along the optical axis | the camera |
+//! | `imu_link`, `gps_link` | the sensor's own; as `base_link` | the body frame; the antenna |
+
+mod camera;
+mod health;
+mod motion;
+mod sensors;
+
+use std::collections::BTreeMap;
+
+use nalgebra::{UnitQuaternion, Vector3};
+use prost::{DecodeError, Message as _};
+
+use crate::config::Config;
+use crate::io::proto::windhover as wh;
+use crate::io::proto::{foxglove as fox, host_time};
+use crate::io::records::topic;
+use crate::io::ros::{CameraInfo, Header, RosRecord, TfMessage, Transform};
+use windhover_base::geo::{Geodetic, LocalFrame};
+use windhover_base::msg::{Event, EventBody};
+use windhover_base::settings::ImuConfig;
+use windhover_base::time::MonoTime;
+
+/// East, north, up at the datum.
+const MAP: &str = "map";
+/// The helicopter.
+const BASE_LINK: &str = "base_link";
+const CAMERA: &str = "camera_optical_frame";
+const IMU: &str = "imu_link";
+const GPS: &str = "gps_link";
+
+/// Targets of a flight: a configuration has half as many at most.
+const TARGETS: usize = 64;
+
+/// Variance of what is not estimated, as mobile robots' drivers put it: finite, so that covariances stay invertible.
+const NOT_ESTIMATED: f64 = 1e6;
+
+/// Turns what is kept into messages of ROS 2, in the order in which it is kept.
+pub struct RosTranslator {
+    imu: Option<ImuConfig>,
+    antenna_m: [f64; 3],
+    references_m: BTreeMap<String, f64>,
+    names: BTreeMap<String, String>,
+    datum: Option<LocalFrame>,
+    lens: Option<CameraInfo>,
+    statics: BTreeMap<String, Transform>,
+}
+
+impl RosTranslator {
+    /// For a flight of this configuration.
+    pub fn new(config: Option<&Config>) -> Self {
+        let reference =
+            |target: &windhover_base::settings::TargetConfig| (target.name.clone(), target.reference_m);
+        Self {
+            imu: config.and_then(|config| config.imu),
+            antenna_m: config.map_or([0.0; 3], |config| config.gps.antenna_position_m),
+            references_m: config
+                .map_or(BTreeMap::new(), |config| config.target.iter().map(reference).collect()),
+            names: BTreeMap::new(),
+            datum: None,
+            lens: None,
+            statics: BTreeMap::new(),
+        }
+    }
+
+    /// Appends the messages of an event: frames, and samples of rates and forces.
+    pub fn event(&mut self, event: &Event, out: &mut Vec<RosRecord>) {
+        match &event.body {
+            EventBody::Frame(frame) => camera::frame(frame, event.t_recv, self.lens.as_ref(), out),
+            EventBody::Inertial { sample, .. } => self.inertial(sample, event.t_recv, out),
+            _ => {}
+        }
+    }
+
+    /// Appends the messages of an output, by its topic. What is no output, or holds no figures, makes none.
+    ///
+    /// # Errors
+    /// The data is not a message of the topic's schema.
+    pub fn output(
+        &mut self,
+        name: &str,
+        log: MonoTime,
+        data: &[u8],
+        out: &mut Vec<RosRecord>,
+    ) -> Result<(), DecodeError> {
+        match name {
+            topic::DATUM => self.datum(&wh::Datum::decode(data)?, log, out),
+            topic::OWNSHIP => self.ownship(&wh::Ownship::decode(data)?, log, out),
+            topic::GPS_EPOCH => self.fix(&wh::GnssEpoch::decode(data)?, log, out),
+            topic::CAMERA_CALIBRATION => {
+                self.lens = Some(camera::lens(fox::CameraCalibration::decode(data)?))
+            }
+            topic::TF => self.mount(&fox::FrameTransform::decode(data)?, log, out),
+            topic::CAMERA_DETECTIONS => out.push(camera::detections(&wh::Detections::decode(data)?, log)),
+            topic::HEALTH => out.push(health::diagnostics(&wh::Health::decode(data)?, log)),
+            topic::LOG => out.push(health::log(fox::Log::decode(data)?, log)),
+            _ => {
+                if let Some((_, what)) = name.strip_prefix("/target/").and_then(|rest| rest.rsplit_once('/'))
+                {
+                    match what {
+                        "state" | "coasting" => self.target(&wh::TargetState::decode(data)?, "", log, out),
+                        "smoothed" => self.target(&wh::TargetState::decode(data)?, "_smoothed", log, out),
+                        "refined" => self.target(&wh::TargetState::decode(data)?, "_refined", log, out),
+                        _ => {}
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn datum(&mut self, datum: &wh::Datum, log: MonoTime, out: &mut Vec<RosRecord>) {
+        if !datum.is_sound() {
+            return;
+        }
+        let origin = Geodetic { lat_deg: datum.lat_deg, lon_deg: datum.lon_deg, height_m: datum.height_m };
+        let frame = LocalFrame::new(origin);
+        let at = origin.to_ecef();
+        // The columns of earth_from_map are where steps of a metre east, north and up lead.
+        let step = |ned: Vector3<f64>| frame.geodetic(&ned).to_ecef() - at;
+        let axes = [Vector3::y(), Vector3::x(), -Vector3::z()].map(step);
+        let matrix = nalgebra::Rotation3::from_basis_unchecked(&axes);
+        let earth_from_map = Transform {
+            header: Header::new(host_time(datum.timestamp.as_ref()), "earth"),
+            child_frame_id: MAP.into(),
+            translation: at,
+            rotation: UnitQuaternion::from_rotation_matrix(&matrix),
+        };
+        self.datum = Some(frame);
+        self.constant(earth_from_map, log, out);
+    }
+
+    /// The camera's mount; where helicopter and targets are is told from their states.
+    fn mount(&mut self, tf: &fox::FrameTransform, log: MonoTime, out: &mut Vec<RosRecord>) {
+        if (tf.parent_frame_id.as_str(), tf.child_frame_id.as_str()) != ("body", "camera") {
+            return;
+        }
+        let (at, q) = (tf.translation.unwrap_or_default(), tf.rotation.unwrap_or_default());
+        let body_from_camera = nalgebra::Quaternion::new(q.w, q.x, q.y, q.z);
+        let Some(body_from_camera) = UnitQuaternion::try_new(body_from_camera, 1e-6) else { return };
+        let mount = Transform {
+            header: Header::new(host_time(tf.timestamp.as_ref()), BASE_LINK),
+            child_frame_id: CAMERA.into(),
+            translation: motion::flu(&Vector3::new(at.x, at.y, at.z)),
+            rotation: motion::flu_from_frd() * body_from_camera,
+        };
+        self.constant(mount, log, out);
+    }
+
+    /// A transform that does not change. Every message has all so far: who comes late gets the last one only.
+    fn constant(&mut self, transform: Transform, log: MonoTime, out: &mut Vec<RosRecord>) {
+        let stamp = transform.header.stamp;
+        self.statics.insert(transform.child_frame_id.clone(), transform);
+        let all = TfMessage(self.statics.values().cloned().collect());
+        out.push(RosRecord::new("/tf_static", log, stamp, &all));
+    }
+
+    /// A target's name as ROS allows it in topics: letters, digits and `_`, no digit first, no two alike. `None` for more
+    /// targets than a flight has.
+    fn ros_name(&mut self, target: &str) -> Option<String> {
+        if let Some(known) = self.names.get(target) {
+            return Some(known.clone());
+        }
+        if self.names.len() >= TARGETS {
+            return None;
+        }
+        let allowed = |c: char| if c.is_ascii_alphanumeric() { c } else { '_' };
+        let mut name: String = target.chars().map(allowed).collect();
+        if !name.starts_with(|c: char| c.is_ascii_alphabetic()) {
+            name.insert_str(0, "target_");
+        }
+        while name.contains("__") {
+            name = name.replace("__", "_");
+        }
+        while self.names.values().any(|taken| *taken == name) {
+            name += "x";
+        }
+        self.names.insert(target.to_owned(), name.clone());
+        Some(name)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_targets_are_names_of_ros() {
+        let mut ros = RosTranslator::new(None);
+        let named = ["ugv", "my-ugv", "my_ugv", "2nd", "a--b"].map(|name| ros.ros_name(name));
+        assert_eq!(
+            named,
+            ["ugv", "my_ugv", "my_ugvx", "target_2nd", "a_b"].map(|name| Some(name.to_owned()))
+        );
+        assert_eq!(ros.ros_name("my_ugv").as_deref(), Some("my_ugvx"));
+        let many = (0..2 * TARGETS).filter_map(|n| ros.ros_name(&format!("t{n}"))).count();
+        assert_eq!(many, TARGETS - 5);
+    }
+
+    #[test]
+    fn the_map_stands_upright_on_the_earth() {
+        let mut out = Vec::new();
+        let mut ros = RosTranslator::new(None);
+        let datum = wh::Datum { lat_deg: 0.0, lon_deg: 90.0, height_m: 10.0, ..Default::default() };
+        ros.datum(&datum, MonoTime::from_ns(5), &mut out);
+        let map = &ros.statics[MAP];
+        assert!((map.translation - Vector3::new(0.0, 6_378_147.0, 0.0)).norm() < 1e-6);
+        let up = map.rotation * Vector3::z() - Vector3::y();
+        let east = map.rotation * Vector3::x() + Vector3::x();
+        assert!(up.norm() < 1e-6 && east.norm() < 1e-6, "{up} {east}");
+    }
+}

@@ -1,0 +1,127 @@
+//! `windhover refine FLIGHT [--out FILE] [--adopt] [--truth TRUTH.csv]`
+
+use std::path::PathBuf;
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::{CliError, CliResult, place};
+use crate::app::flight::Flight;
+use crate::app::refine::{
+    RefineFlightError, RefinedFlight, adopted, beside, constant_words, refine_flight, source_name,
+};
+use crate::app::replay::ReplayError;
+use crate::app::report;
+use crate::app::truth::Truth;
+use crate::cli::out::{note, out, outln};
+use crate::io::mcap_write::Maker;
+use crate::io::new_file::Inputs;
+use crate::text::one_line;
+
+/// Estimate a whole flight at once, afterwards: the paths of helicopter and vehicles as well as they can be known, and what
+/// the flight says of its own configuration.
+///
+/// The flight must hold what the pipeline saw: replay a bare capture first. What is written holds the flight without its
+/// pictures, and beside the real-time estimates the refined ones: `windhover report` and `windhover export` show both.
+#[derive(clap::Args, Debug)]
+#[command(after_help = "Examples:
+  windhover refine flight.mcap                              # flight.refined.mcap
+  windhover refine flight.mcap --adopt                      # and TOML of what the flight settles
+  windhover refine flight.mcap --truth flight.truth.csv --out refined.mcap
+  windhover export refined.mcap --format csv                # refined.csv among the tables")]
+pub(super) struct Args {
+    /// Flight: an .mcap file, or a directory of segments
+    flight: PathBuf,
+    /// What is written [default: FLIGHT.refined.mcap beside the flight]
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Print, as TOML to paste, what the flight settles of its configuration (beyond three sigmas)
+    #[arg(long)]
+    adopt: bool,
+    /// Compare with true positions: CSV as `windhover report` takes it
+    #[arg(long, value_name = "TRUTH.csv")]
+    truth: Option<PathBuf>,
+}
+
+pub(super) fn run(args: &Args) -> CliResult {
+    let to = args.out.clone().unwrap_or_else(|| beside(&args.flight));
+    let inputs = Inputs::of([Some(args.flight.as_path()), args.truth.as_deref()].into_iter().flatten());
+    place::check(&to, &inputs, &Maker::Refine.marks())?;
+    let truth = args.truth.as_deref().map(Truth::read).transpose()?;
+    let bar = progress_bar();
+    let done = refine_flight(&args.flight, &mut |share| {
+        bar.set_position((share * STEPS as f64) as u64);
+        true
+    });
+    bar.finish_and_clear();
+    let done = done.map_err(|error| match error {
+        RefineFlightError::Config(wrong @ (ReplayError::NoConfig { .. } | ReplayError::BadConfig { .. })) => {
+            CliError::config(wrong)
+        }
+        other => CliError::failed(other),
+    })?;
+    done.write(&args.flight, &to)?;
+    for warning in done.flight.warnings.iter().chain(&done.remarks) {
+        note!("windhover: {}", one_line(warning));
+    }
+    if args.adopt {
+        print_adopted(&done)?;
+    } else {
+        print_found(&done)?;
+    }
+    if let Some(truth) = &truth {
+        let table = report::error_text(&Flight::read(&to)?, truth);
+        out!("\n{}", table.unwrap_or_else(|| "nothing to compare with the truth\n".to_owned()))?;
+    }
+    note!("wrote {}", to.display());
+    Ok(())
+}
+
+fn print_adopted(done: &RefinedFlight) -> CliResult {
+    let toml = adopted(&done.refined, &done.config);
+    if toml.is_empty() {
+        note!("the flight settles nothing that is otherwise than configured");
+    }
+    out!("{toml}")
+}
+
+fn print_found(done: &RefinedFlight) -> CliResult {
+    let targets = &done.config.target[..];
+    let estimated = || done.refined.constants.iter().filter(|constant| constant.prior_sigma > 0.0);
+    outln!("what the flight tells of its configuration      value  one sigma  expected")?;
+    for constant in estimated().filter(|constant| constant.is_told()) {
+        let words = constant_words(constant.kind, targets);
+        let [value, sigma, prior, prior_sigma] =
+            [constant.value, constant.sigma, constant.prior, constant.prior_sigma].map(|x| x / words.scale);
+        let mark = if constant.is_settled() { "  settled" } else { "" };
+        outln!(
+            "{:<42} {value:>10.3} {sigma:>10.3}  {prior:.3} ± {prior_sigma:.3} {}{mark}",
+            words.name,
+            words.unit
+        )?;
+    }
+    let silent: Vec<String> = estimated()
+        .filter(|constant| !constant.is_told())
+        .map(|constant| constant_words(constant.kind, targets).name)
+        .collect();
+    if !silent.is_empty() {
+        outln!("\nnot told by this flight, at what was expected: {}", silent.join(", "))?;
+    }
+    for tally in done.refined.tallies.iter().filter(|tally| tally.outliers > 0) {
+        let name = source_name(tally.source, targets);
+        outln!("{name}: {} of {} measurements lie outside the gate", tally.outliers, tally.taken)?;
+    }
+    Ok(())
+}
+
+/// Steps of the bar.
+const STEPS: u64 = 1000;
+
+/// A bar on a terminal; nothing where standard error is a file.
+fn progress_bar() -> ProgressBar {
+    let style = ProgressStyle::with_template("{wide_bar} {percent:>3} %  {elapsed}");
+    let bar = ProgressBar::new(STEPS);
+    match style {
+        Ok(style) => bar.with_style(style),
+        Err(_) => bar,
+    }
+}

@@ -1,0 +1,66 @@
+//! `windhover refine`: a flight afterwards, in its own schemas beside the real-time estimates.
+
+use std::path::Path;
+
+use windhover::app::flight::Flight;
+
+use crate::contract::{capture, said, scratch, windhover};
+
+fn run(args: &[&str], dir: &Path) -> String {
+    let run = windhover(args, dir);
+    assert!(run.status.success(), "{args:?}: {}", said(&run));
+    String::from_utf8_lossy(&run.stdout).into_owned()
+}
+
+#[test]
+fn a_refined_flight_stands_beside_the_real_one() {
+    // Given a flight.
+    let dir = scratch();
+    run(&["replay", &capture(), "--out", "flight.mcap"], dir.path());
+    // When it is refined.
+    let text = run(&["refine", "flight.mcap"], dir.path());
+    // Then what it tells of its configuration is said, and what it does not.
+    assert!(text.contains("what the flight tells of its configuration"), "{text}");
+    assert!(text.contains("not told by this flight"), "{text}");
+    // And a file beside it has the flight without its pictures, and a refined estimate a frame.
+    let (flight, refined) = (
+        Flight::read(&dir.path().join("flight.mcap")).expect("a flight"),
+        Flight::read(&dir.path().join("flight.refined.mcap")).expect("a refined flight"),
+    );
+    let [track] = &refined.targets.values().collect::<Vec<_>>()[..] else { panic!("one target") };
+    let real_time = flight.targets.values().next().expect("the same target");
+    assert_eq!(track.filtered, real_time.filtered);
+    let known = |states: &[windhover::io::proto::windhover::TargetState]| -> Vec<u32> {
+        states.iter().filter(|state| state.known).map(|state| state.frame).collect()
+    };
+    assert!(track.paper.len() == real_time.paper.len() && refined.frames.is_empty());
+    assert!(known(&track.refined).len() >= known(&track.filtered).len(), "{:?}", known(&track.refined));
+    assert!(track.refined.iter().filter(|s| s.known).all(|s| s.covariance.len() == 15));
+    assert!(refined.ownship_refined.len() >= track.refined.len());
+    let said = refined.refined.as_ref().expect("what it says of the configuration");
+    assert!(said.constants.iter().any(|constant| constant.name == "gps_delay"));
+    // And the tables have it, in the columns of the estimates.
+    run(&["export", "flight.refined.mcap", "--format", "csv", "--out", "tables"], dir.path());
+    let head = |name: &str| {
+        let text = std::fs::read_to_string(dir.path().join("tables").join(name)).expect("exported");
+        (text.lines().next().unwrap_or_default().to_owned(), text.lines().count())
+    };
+    assert_eq!(head("refined.csv").0, head("estimates.csv").0);
+    assert_eq!(head("refined.csv").1, track.refined.len() + 1);
+    // And refined once more, it is the same flight with one refinement.
+    run(&["refine", "flight.refined.mcap", "--out", "again.mcap"], dir.path());
+    let again = Flight::read(&dir.path().join("again.mcap")).expect("a refined flight");
+    let twice = again.targets.values().next().expect("the target");
+    assert_eq!(twice.refined.len(), track.refined.len());
+    // And nothing half is left.
+    let left = std::fs::read_dir(dir.path()).expect("readable").filter_map(Result::ok);
+    assert!(left.into_iter().all(|entry| !entry.file_name().to_string_lossy().ends_with(".part")));
+}
+
+#[test]
+fn what_is_read_is_never_written_over() {
+    let dir = scratch();
+    run(&["replay", &capture(), "--out", "flight.mcap"], dir.path());
+    let over = windhover(&["refine", "flight.mcap", "--out", "flight.mcap"], dir.path());
+    assert_eq!(over.status.code(), Some(2), "{}", said(&over));
+}
