@@ -26,6 +26,7 @@ impl Core {
         self.state.learn_targets(&self.learning);
         self.judge_turns();
         self.state.copy_targets(frame.frame, self.keep_copies);
+        self.judge_camera_clock();
     }
 
     fn fuse_target(&mut self, index: usize, markers: &[MarkerDetection]) {

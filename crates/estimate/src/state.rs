@@ -122,6 +122,8 @@ pub(crate) struct State {
     pub(crate) height: HeightCheck,
     /// By how much lower than configured the ground lies, m: the receiver's heights are over that.
     pub(crate) ground_lower_m: f64,
+    /// By how much earlier than stamped frames are true, as was found out, s.
+    pub(crate) camera_late_s: f64,
     /// When the scene was last anchored anew, and by how much it moved.
     pub(crate) anchored: Option<(MonoTime, Vector3<f64>)>,
 }
@@ -169,7 +171,7 @@ impl State {
         self.t = other.t;
         self.alive = other.alive;
         self.own = other.own;
-        self.ground_lower_m = other.ground_lower_m;
+        (self.ground_lower_m, self.camera_late_s) = (other.ground_lower_m, other.camera_late_s);
         self.own_columns = other.own_columns;
         self.senses = other.senses;
         self.fits = other.fits;

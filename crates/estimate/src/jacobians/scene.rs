@@ -89,6 +89,7 @@ pub(crate) mod most {
     /// Thrust over mass, by its derivative toward tilt.
     pub(crate) const FORCE: f64 = 1.3 * (super::GRAVITY + 1.5);
     pub(crate) const DELAY_S: f64 = 0.15;
+    pub(crate) const COMPASS_DELAY_S: f64 = 0.05;
     pub(crate) const DRAG: f64 = 0.4;
     pub(crate) const ARM: f64 = 0.8;
     /// Longest step of the prediction, s.

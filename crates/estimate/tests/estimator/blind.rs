@@ -140,7 +140,9 @@ fn rates_and_forces_that_vibrate_do_not_hurt() {
 fn features_on_a_parked_vehicle_do_not_bend_own_motion() {
     let (mut tilt, mut heading, mut heading_blind) = (0.0, 0.0, 0.0);
     let seeds = 3u32..7;
-    for (seed, kind) in seeds.clone().map(u64::from).flat_map(|seed| [(seed, TiltKind::Inertial), (seed, TiltKind::Auto)]) {
+    for (seed, kind) in
+        seeds.clone().map(u64::from).flat_map(|seed| [(seed, TiltKind::Inertial), (seed, TiltKind::Auto)])
+    {
         let hovering = fly("hover10", 30.0, seed, |scenario: &mut Scenario| {
             scenario.rig.compass.tilt = kind;
             scenario.camera.feature_noise_px = 0.1;
@@ -163,7 +165,10 @@ fn features_on_a_parked_vehicle_do_not_bend_own_motion() {
     }
     println!("squares of tilt {tilt}, of heading {heading}, blind {heading_blind}");
     assert!(tilt < 2.0, "square of tilt {tilt}");
-    assert!(heading < f64::max(2.0, 1.2 * heading_blind), "square of heading {heading}, blind {heading_blind}");
+    assert!(
+        heading < f64::max(2.0, 1.2 * heading_blind),
+        "square of heading {heading}, blind {heading_blind}"
+    );
 }
 
 /// Mean square of the heading's error over what is told, from a time on.
