@@ -10,6 +10,7 @@ use windhover_simulate::{
 };
 
 use super::filter::{Flight, Heard, Score, estimates, fly, score};
+use super::time::errors;
 
 /// Pixels as sharp as rendered ones: what is wrong then shows most.
 fn sharp(scenario: &mut Scenario) {
@@ -307,6 +308,17 @@ fn a_vehicle_that_turns_on_the_spot_is_let_turn_whatever_its_model() {
     println!("unicycle {unicycle:?}\nackermann {ackermann:?}");
     assert!(ackermann.yaw_rate <= 1.5 * unicycle.yaw_rate, "{ackermann:?}, unicycle {unicycle:?}");
     assert!(told(&out).iter().any(|(cause, _)| matches!(cause, MisfitCause::TargetTurns { target: 0 })));
+}
+
+#[test]
+fn a_vehicle_that_slides_is_no_tag_that_is_turned() {
+    let rolls = errors("follow");
+    for slip_deg in [5, 10] {
+        let slides = errors(&format!("follow+slip={slip_deg}"));
+        for (k, what) in ["heading", "speed"].into_iter().enumerate() {
+            assert!(slides[k] < 1.3 * rolls[k], "{slip_deg}°: {what} {} for {}", slides[k], rolls[k]);
+        }
+    }
 }
 
 #[test]

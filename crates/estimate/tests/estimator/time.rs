@@ -35,7 +35,7 @@ fn flown(described: &str, seconds: f64, seed: u64) -> (Arc<World>, Vec<Estimator
 }
 
 /// Root mean squares of heading and speed errors from 6 s on, over two seeds.
-fn errors(described: &str) -> [f64; 2] {
+pub(super) fn errors(described: &str) -> [f64; 2] {
     let (mut sums, mut n) = ([0.0; 2], 0.0);
     for seed in 1..3 {
         let (world, out) = flown(described, 20.0, seed);
