@@ -310,6 +310,32 @@ mod tests {
     }
 
     #[test]
+    fn a_fix_goes_with_the_receiver_that_told_it() {
+        let config = Config::parse(include_str!("../../config/windhover.toml")).expect("valid");
+        let mut monitor = Monitor::new(vec![Source::Gps], &config.rig());
+        let at = |s: f64| MonoTime::from_ns(0) + Span::from_s(s);
+        let mut out = Vec::new();
+        monitor.advance(at(0.0), &mut out);
+        let value =
+            GnssEpoch { fix: FixKind::ThreeD, sats: Some(9), hdop: Some(0.9), ..GnssEpoch::default() };
+        let epoch = Stamped { t_valid: at(1.0), t_recv: at(1.0), seq: 0, value };
+        monitor.heard(Source::Gps, at(1.0), &mut out);
+        monitor.fix(at(1.0), &epoch, None, &mut out);
+        for s in 1..30 {
+            monitor.advance(at(f64::from(s) + 0.5), &mut out);
+        }
+        let healths = out.iter().filter_map(|o| match o {
+            Output::Health(health) => Some((health.t, health.fix, health.sats)),
+            _ => None,
+        });
+        for (t, fix, sats) in healths.filter(|(t, ..)| *t > at(1.0)) {
+            let is_there = t - at(1.0) < Source::Gps.silent_after();
+            let told = if is_there { (FixKind::ThreeD, Some(9)) } else { (FixKind::None, None) };
+            assert_eq!((fix, sats), told, "at {:.1} s", (t - at(0.0)).s());
+        }
+    }
+
+    #[test]
     fn only_the_sources_there_are_can_be_silent() {
         // Given a pipeline that has a receiver and a camera.
         let config = Config::parse(include_str!("../../config/windhover.toml")).expect("valid");

@@ -33,6 +33,13 @@ GROWTH = 1.25
 MARGIN_MB = 12
 
 
+def heap_of_the_unit():
+    """The heap that the payload is deployed with: without it each thread has a heap of its own, and each opening of the
+    index leaves its pages in others (docs/daemon.md)."""
+    unit = (ROOT / "systemd/windhover.service").read_text()
+    return dict(re.findall(r"^Environment=(MALLOC_\w+)=(\d+)$", unit, re.MULTILINE))
+
+
 class FlappingDaemon(rig.Daemon):
     """A payload whose serial lines are links to pseudo-terminals, which are exchanged for others."""
 
@@ -53,7 +60,8 @@ class FlappingDaemon(rig.Daemon):
     def start_process(self):
         with open(self.log, "ab") as log:
             words = [rig.BINARY, "run", "--config", self.at / "windhover.toml"]
-            self.process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stderr=log)
+            environment = {**os.environ, **heap_of_the_unit()}
+            self.process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stderr=log, env=environment)
 
     def stop_process(self):
         self.process.send_signal(signal.SIGTERM)

@@ -29,11 +29,15 @@ impl Bench {
     }
 
     fn sending(messages: Vec<MavlinkMessage>) -> Self {
+        Self::of(MavlinkConfig { messages, ..MavlinkConfig::default() })
+    }
+
+    fn of(mavlink: MavlinkConfig) -> Self {
         let receiver = UdpSocket::bind("127.0.0.1:0").expect("a socket");
         receiver.set_nonblocking(true).expect("set");
         let address = receiver.local_addr().expect("an address").to_string();
         let send_to = vec![address];
-        let mavlink = MavlinkConfig { enabled: true, send_to, messages, ..MavlinkConfig::default() };
+        let mavlink = MavlinkConfig { enabled: true, send_to, ..mavlink };
         let mut config = Config::parse(include_str!("../../../config/windhover.toml")).expect("valid");
         config.mavlink = mavlink;
         config.target.push(config.target[0].clone());
@@ -127,6 +131,24 @@ fn a_dead_camera_ends_the_positions_and_the_heartbeats_tell() {
     assert_eq!(told(&bench.sent(1.4)), (None, true));
     assert_eq!(told(&bench.sent(2.1)), (STANDBY, false));
     assert_eq!(told(&bench.sent(32.1)), (STANDBY, false));
+}
+
+/// A slow rate is that of positions; whoever listens still hears once a second that we are there.
+#[test]
+fn a_slow_rate_slows_no_heartbeat() {
+    let mut bench = Bench::of(MavlinkConfig { rate_hz: 0.2, ..MavlinkConfig::default() });
+    let (mut beats, mut positions, mut s) = (0, 0, 0.0);
+    let step = bench.sender.every().s();
+    while s < 30.0 {
+        bench.estimate(s, TrackStatus::Tracking, 0.1);
+        let (beat, position) = told(&bench.sent(s + 0.01));
+        (beats, positions) = (beats + u32::from(beat == ACTIVE), positions + u32::from(position));
+        s += step;
+    }
+    assert!(
+        (29..=31).contains(&beats) && (5..=7).contains(&positions),
+        "{beats} beats, {positions} positions"
+    );
 }
 
 #[test]
