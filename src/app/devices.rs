@@ -8,9 +8,9 @@ use crate::io::camera::{self, CameraSettings};
 use crate::io::device::{Fault, NoteKind, Report, blocking};
 use crate::io::mavlink::signing_key;
 use crate::io::pps;
-use crate::io::serial::{self, SerialSettings};
+use crate::io::serial::{self, SerialSettings, Setup};
 use windhover_base::msg::{EventBody, Source};
-use windhover_base::settings::GpsFormat;
+use windhover_base::settings::{CompassFormat, GpsFormat, shares_line};
 
 use super::context::TaskContext;
 use super::events::{self, OperatorEvent};
@@ -22,10 +22,22 @@ pub async fn gps(config: Arc<Config>, context: TaskContext, heart: Heart) {
     let settings = SerialSettings {
         device: config.gps.device.clone(),
         baud: config.gps.baud,
+        framing: config.gps.framing,
         text: config.gps.format != GpsFormat::Ubx,
-        configure_garmin: config.gps.configure_garmin,
+        setup: setup(&config),
     };
     line(Part::Gps, Source::Gps, &settings, context, heart).await;
+}
+
+/// How the receiver is to be configured. Its sentences stay on where they tell the heading.
+fn setup(config: &Config) -> Option<Setup> {
+    let (gps, compass) = (&config.gps, &config.compass);
+    let keep_text = shares_line(gps, compass) && compass.format == CompassFormat::Nmea;
+    match (gps.configure, gps.configure_garmin) {
+        (true, _) => Some(Setup::Ublox { rate_hz: gps.rate_hz, keep_text }),
+        (_, true) => Some(Setup::Garmin),
+        _ => None,
+    }
 }
 
 /// Reads the compass line until the end is asked for.
@@ -33,8 +45,9 @@ pub async fn compass(config: Arc<Config>, context: TaskContext, heart: Heart) {
     let settings = SerialSettings {
         device: config.compass.device.clone(),
         baud: config.compass.baud,
+        framing: config.compass.framing,
         text: config.compass.format.is_text(),
-        configure_garmin: false,
+        setup: None,
     };
     line(Part::Compass, Source::Compass, &settings, context, heart).await;
 }

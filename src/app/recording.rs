@@ -87,10 +87,16 @@ fn epoch(e: &wh::GnssEpoch) -> GnssEpoch {
         vel_has_down: e.vel_ned_mps.len() == 3,
         hpe_m: e.hpe_m,
         vpe_m: e.vpe_m,
+        position_sigma_m: three(&e.position_sigma_m),
+        velocity_sigma_mps: three(&e.velocity_sigma_mps),
         sats: e.sats,
         hdop: e.hdop,
         ..GnssEpoch::default()
     }
+}
+
+fn three(values: &[f64]) -> Option<Vector3<f64>> {
+    <[f64; 3]>::try_from(values).ok().map(Vector3::from)
 }
 
 /// `None` for kinds and families this version does not know.

@@ -58,6 +58,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::io::autopilot::ToAutopilot;
 use crate::io::clock::HostClock;
+use windhover_base::settings::shares_line;
 
 use super::card::{self, StoreTask};
 use super::config_file::Loaded;
@@ -151,7 +152,7 @@ pub fn start(loaded: Loaded, clock: HostClock) -> std::io::Result<Graph> {
     if config.gps.is_there() {
         tasks.spawn(GPS, |heart| devices::gps(Arc::clone(&config), context.clone(), heart));
     }
-    if config.compass.is_there() {
+    if config.compass.is_there() && !shares_line(&config.gps, &config.compass) {
         tasks.spawn(COMPASS, |heart| devices::compass(Arc::clone(&config), context.clone(), heart));
     }
     if config.autopilot.is_some() {

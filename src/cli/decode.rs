@@ -46,6 +46,9 @@ struct GpsArgs {
     /// What the receiver speaks: NMEA with Garmin's own sentences, u-blox's packets, or either
     #[arg(long, value_enum, default_value = "auto")]
     format: Speech,
+    /// Take sentences without a checksum too, of a receiver that sends none
+    #[arg(long)]
+    checksum_optional: bool,
 }
 
 #[derive(clap::ValueEnum, Clone, Copy, Debug)]
@@ -75,6 +78,9 @@ struct CompassArgs {
     /// What the compass speaks; by default the format that understands most of the log
     #[arg(long, value_parser = formats())]
     format: Option<CompassFormat>,
+    /// Take sentences without a checksum too, of a device that sends none
+    #[arg(long)]
+    checksum_optional: bool,
 }
 
 /// Formats as the configuration names them.
@@ -94,10 +100,8 @@ pub(super) fn run(args: &Args) -> CliResult {
         Device::Compass(compass) => (&compass.file, "a compass's log, recorded at the right speed"),
     };
     let counts = match &args.device {
-        Device::Gps(gps) => decode_gps(&read(&gps.file)?, gps.format.into(), gps.json, &mut out),
-        Device::Compass(compass) => {
-            decode_compass(&read(&compass.file)?, compass.format, compass.json, &mut out)
-        }
+        Device::Gps(gps) => decode_gps(&read(&gps.file)?, gps, &mut out),
+        Device::Compass(compass) => decode_compass(&read(&compass.file)?, compass, &mut out),
     };
     let counts = counts.and_then(|counts| out.flush().map(|()| counts));
     let counts = written(counts)?;
@@ -161,13 +165,10 @@ fn utc_text(epoch: &GnssEpoch) -> Option<String> {
     Some(utc.to_string())
 }
 
-fn decode_gps(
-    bytes: &[u8],
-    format: GpsFormat,
-    json: bool,
-    out: &mut impl Write,
-) -> std::io::Result<DecodeCounts> {
-    let (mut decoder, mut heard) = (GnssDecoder::patient().of_format(format), Vec::new());
+fn decode_gps(bytes: &[u8], args: &GpsArgs, out: &mut impl Write) -> std::io::Result<DecodeCounts> {
+    let (json, required) = (args.json, !args.checksum_optional);
+    let decoder = GnssDecoder::patient().of_format(args.format.into());
+    let (mut decoder, mut heard) = (decoder.checksums_required(required), Vec::new());
     decoder.push(bytes, MonoTime::default(), &mut heard);
     decoder.flush(&mut heard);
     if !json {
@@ -240,15 +241,11 @@ struct ReadingJson {
     valid: bool,
 }
 
-fn decode_compass(
-    bytes: &[u8],
-    format: Option<CompassFormat>,
-    json: bool,
-    out: &mut impl Write,
-) -> std::io::Result<DecodeCounts> {
-    let (heard, counts) = match format {
-        Some(format) => decode_as(bytes, format),
-        None => likeliest(bytes),
+fn decode_compass(bytes: &[u8], args: &CompassArgs, out: &mut impl Write) -> std::io::Result<DecodeCounts> {
+    let (json, required) = (args.json, !args.checksum_optional);
+    let (heard, counts) = match args.format {
+        Some(format) => decode_as(bytes, format, required),
+        None => likeliest(bytes, required),
     };
     if !json {
         writeln!(
@@ -272,8 +269,8 @@ fn decode_compass(
     Ok(counts)
 }
 
-fn decode_as(bytes: &[u8], format: CompassFormat) -> (Vec<HeardAttitude>, DecodeCounts) {
-    let (mut decoder, mut heard) = (CompassDecoder::new(format), Vec::new());
+fn decode_as(bytes: &[u8], format: CompassFormat, required: bool) -> (Vec<HeardAttitude>, DecodeCounts) {
+    let (mut decoder, mut heard) = (CompassDecoder::new(format).checksums_required(required), Vec::new());
     decoder.push(bytes, MonoTime::default(), &mut heard);
     decoder.flush(&mut heard);
     (heard, decoder.counts().clone())
@@ -281,15 +278,15 @@ fn decode_as(bytes: &[u8], format: CompassFormat) -> (Vec<HeardAttitude>, Decode
 
 /// The decoding by the format that understands most: whole attitudes first, then any reading. A
 /// device's own format goes before plain NMEA.
-fn likeliest(bytes: &[u8]) -> (Vec<HeardAttitude>, DecodeCounts) {
+fn likeliest(bytes: &[u8], required: bool) -> (Vec<HeardAttitude>, DecodeCounts) {
     let own = CompassFormat::ALL.into_iter().filter(|format| *format != CompassFormat::Nmea);
     let understood = |heard: &[HeardAttitude]| {
         let angles = |r: &CompassReading| [r.heading_deg, r.pitch_deg, r.roll_deg].iter().flatten().count();
         heard.iter().map(|heard| angles(&heard.reading)).sum::<usize>()
     };
-    let mut best = decode_as(bytes, CompassFormat::Nmea);
+    let mut best = decode_as(bytes, CompassFormat::Nmea, required);
     for format in own {
-        let other = decode_as(bytes, format);
+        let other = decode_as(bytes, format, required);
         if understood(&other.0) > understood(&best.0) {
             best = other;
         }
@@ -303,7 +300,9 @@ mod tests {
 
     fn gps_json(text: &str) -> Vec<serde_json::Value> {
         let mut out = Vec::new();
-        decode_gps(text.as_bytes(), GpsFormat::Auto, true, &mut out).expect("memory can be written");
+        let args =
+            GpsArgs { file: PathBuf::new(), json: true, format: Speech::Auto, checksum_optional: false };
+        decode_gps(text.as_bytes(), &args, &mut out).expect("memory can be written");
         String::from_utf8_lossy(&out).lines().map(|line| serde_json::from_str(line).expect("JSON")).collect()
     }
 
@@ -332,10 +331,21 @@ mod tests {
     #[test]
     fn the_format_of_a_compass_log_is_recognised() {
         let mut out = Vec::new();
-        let counts = decode_compass(b"$PTNTHTM,14223,N,169,N,-43,N,13641,2454*15\r\n", None, true, &mut out);
+        let mut args =
+            CompassArgs { file: PathBuf::new(), json: true, format: None, checksum_optional: false };
+        let line = b"$PTNTHTM,14223,N,169,N,-43,N,13641,2454*15\r\n";
+        let counts = decode_compass(line, &args, &mut out);
         assert_eq!(counts.map(|counts| counts.used).ok(), Some(1));
         let object: serde_json::Value = serde_json::from_slice(&out).expect("JSON");
         assert!((object["heading_deg"].as_f64().expect("a figure") - 78.13).abs() < 0.01);
         assert_eq!((&object["true"], &object["valid"]), (&false.into(), &true.into()));
+        // Without its checksum it is nothing, unless that is accepted.
+        for (is_accepted, used) in [(false, 0), (true, 1)] {
+            args.checksum_optional = is_accepted;
+            let counts = decode_compass(&line[..line.len() - 5], &args, &mut Vec::new()).expect("memory");
+            assert_eq!(counts.used, 0, "it has no end");
+            let bare = [&line[..line.len() - 5], b"\r\n"].concat();
+            assert_eq!(decode_compass(&bare, &args, &mut Vec::new()).expect("memory").used, used);
+        }
     }
 }

@@ -1,8 +1,8 @@
 //! What a configuration must satisfy beyond its syntax.
 
 use windhover_base::settings::{
-    AttitudeConfig, AutopilotUse, GroundConfig, ImuConfig, MarkerConfig, MarkerKind, TargetConfig,
-    TargetModel,
+    AttitudeConfig, AutopilotUse, GpsFormat, GroundConfig, ImuConfig, MarkerConfig, MarkerKind, TargetConfig,
+    TargetModel, shares_line,
 };
 
 use super::{AUTOPILOT, Config};
@@ -203,11 +203,8 @@ impl Config {
         baud("gps.baud", self.gps.baud)?;
         baud("compass.baud", self.compass.baud)?;
         self.check_autopilot()?;
-        // A server gives the same to everybody who asks; a serial line has one reader.
-        let is_line = self.gps.is_there() && !self.gps.device.starts_with("tcp://");
-        if is_line && self.gps.device == self.compass.device {
-            refuse("compass.device", format!("{} is the GPS receiver's line too", self.compass.device))?;
-        }
+        self.check_shared_line()?;
+        self.check_setup()?;
         let given = |what| self.autopilot.as_ref().is_some_and(|autopilot| autopilot.gives(what));
         for (key, device, what) in [
             ("gps.device", &self.gps.device, Some(AutopilotUse::Gps)),
@@ -220,12 +217,6 @@ impl Config {
         }
         network_device("gps.device", &self.gps.device)?;
         network_device("compass.device", &self.compass.device)?;
-        if self.gps.configure_garmin && self.gps.device.contains("://") {
-            refuse(
-                "gps.configure_garmin",
-                "a receiver behind the network is not configured; leave this out",
-            )?;
-        }
         for (axis, value) in self.gps.antenna_position_m.iter().enumerate() {
             within(format!("gps.antenna_position_m[{axis}]"), *value, -20.0, 20.0)?;
         }
@@ -253,6 +244,49 @@ impl Config {
         within("compass.tilt_noise_deg", compass.tilt_noise_deg, 1e-3, 90.0)?;
         self.imu.as_ref().map_or(Ok(()), check_imu)?;
         self.attitude.as_ref().map_or(Ok(()), check_attitude)
+    }
+
+    /// A receiver may tell the heading too; another device cannot be on its line.
+    fn check_shared_line(&self) -> Result<(), ConfigError> {
+        let (gps, compass) = (&self.gps, &self.compass);
+        if compass.imu && !compass.format.has_inertial() {
+            refuse("compass.imu", format!("{} tells no rates; leave this out", compass.format.name()))?;
+        }
+        if !shares_line(gps, compass) {
+            return Ok(());
+        }
+        let device = &compass.device;
+        if !compass.format.is_of_receivers() {
+            let format = compass.format.name();
+            let words = "the GPS receiver's line too, and a receiver tells its heading as format nmea or ubx";
+            refuse("compass.device", format!("{device} is {words}, not {format}"))?;
+        }
+        if (gps.baud, gps.framing) != (compass.baud, compass.framing) {
+            refuse(
+                "compass.baud",
+                format!("{device} is the GPS receiver's line too: say the same of it twice"),
+            )?;
+        }
+        Ok(())
+    }
+
+    fn check_setup(&self) -> Result<(), ConfigError> {
+        let gps = &self.gps;
+        let is_network = gps.device.contains("://");
+        for (key, is_asked) in
+            [("gps.configure_garmin", gps.configure_garmin), ("gps.configure", gps.configure)]
+        {
+            if is_asked && is_network {
+                refuse(key, "a receiver behind the network is not configured; leave this out")?;
+            }
+        }
+        if gps.configure && gps.configure_garmin {
+            refuse("gps.configure", "is for u-blox, and configure_garmin is set too; keep one of them")?;
+        }
+        if gps.configure && gps.format == GpsFormat::Nmea {
+            refuse("gps.configure", "switches u-blox's packets on, and gps.format is \"nmea\"")?;
+        }
+        within("gps.rate_hz", gps.rate_hz, 0.1, 25.0)
     }
 
     fn check_autopilot(&self) -> Result<(), ConfigError> {

@@ -18,7 +18,7 @@ pub use store::{FramePolicy, StoreConfig};
 use serde::{Deserialize, Serialize};
 use windhover_base::settings::{
     AttitudeConfig, AutopilotConfig, AutopilotUse, CameraConfig, CompassConfig, Datum, DetectorConfig,
-    EstimatorConfig, GpsConfig, GroundConfig, ImuConfig, MonteCarloConfig, Rig, TargetConfig,
+    EstimatorConfig, GpsConfig, GroundConfig, ImuConfig, MonteCarloConfig, Rig, TargetConfig, shares_line,
 };
 
 /// The whole configuration. Unknown keys are errors everywhere.
@@ -119,7 +119,7 @@ impl Config {
             gps: self.gps.clone(),
             compass: self.compass.clone(),
             autopilot: self.autopilot.clone(),
-            imu: self.imu.or_else(|| gives(AutopilotUse::Imu).then(ImuConfig::default)),
+            imu: self.imu.or_else(|| (gives(AutopilotUse::Imu) || self.compass.imu).then(ImuConfig::default)),
             attitude: self.attitude.or_else(|| second.then(AttitudeConfig::default)),
             camera: self.camera.clone(),
             target: self.target.clone(),
@@ -130,7 +130,7 @@ impl Config {
     pub fn optional_parts(&self) -> Vec<Part> {
         let absent = [
             (Part::Gps, self.gps.is_absent()),
-            (Part::Compass, self.compass.is_absent()),
+            (Part::Compass, self.compass.is_absent() || shares_line(&self.gps, &self.compass)),
             (Part::Autopilot, self.autopilot.is_none()),
         ];
         let absent = absent.into_iter().filter(|(_, is)| *is).map(|(part, _)| part);

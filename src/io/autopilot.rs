@@ -14,6 +14,7 @@ use super::device::{Backoff, Fault, NoteKind, Report, Reports, wait_for};
 use super::mavlink::companion::Companion;
 use super::mavlink::packet::{self, SigningKey};
 use super::serial::{Line, SerialSettings};
+use windhover_base::settings::Framing;
 use windhover_decode::{MavlinkFrame, MavlinkFrames};
 
 /// Frames that wait for a line that takes none; the oldest goes first.
@@ -117,8 +118,9 @@ impl Port {
                 let settings = SerialSettings {
                     device: device.clone(),
                     baud: *baud,
+                    framing: Framing::default(),
                     text: false,
-                    configure_garmin: false,
+                    setup: None,
                 };
                 let line = Line::open(&settings).await?;
                 Ok(Self::Serial(line, format!("{device} at {baud} baud")))

@@ -266,6 +266,12 @@ impl Pipeline {
         let (refused, why) = lines::refused(line.counts());
         self.monitor.refused(source, t, refused, &why, out);
         self.take_readings(source, t, out);
+        // What is refused of bytes for two was told once.
+        let beside = self.lines.beside(source);
+        if let Some((source, line)) = beside.and_then(|source| Some((source, self.lines.of(source)?))) {
+            line.push(bytes, t, event.seq, &mut self.readings);
+            self.take_readings(source, t, out);
+        }
     }
 
     /// Samples go to the filter as they are: the flight has them as they were received.

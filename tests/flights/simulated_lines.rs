@@ -8,7 +8,7 @@ use windhover::config::Config;
 use windhover::pipeline::Pipeline;
 use windhover_base::geo::wrap_angle;
 use windhover_base::msg::{
-    AttitudeSample, GnssEpoch, NoticeKind, Output, SensorReading, Stamped, TimedOutput,
+    AttitudeSample, EventBody, GnssEpoch, NoticeKind, Output, SensorReading, Source, Stamped, TimedOutput,
 };
 use windhover_base::settings::CompassFormat;
 use windhover_base::time::{MonoTime, Span};
@@ -146,9 +146,42 @@ fn every_compass_format_is_read_as_it_was_sent() {
                 assert!(wrong < 0.09, "{format:?}: tilt {wrong} degrees off");
             }
         }
-        assert!(attitudes.iter().any(|a| a.value.tilt.is_some()), "{format:?}: no tilt at all");
-        assert!(attitudes.iter().any(|a| a.value.heading.is_some()), "{format:?}: no heading at all");
+        let has = |what: fn(&AttitudeSample) -> bool| attitudes.iter().any(|a| what(&a.value));
+        // The line between two antennas has no tilt of its own, and what begins anywhere is no heading.
+        assert_eq!(has(|a| a.tilt.is_some()), format != CompassFormat::Ubx, "{format:?}: tilt");
+        assert_eq!(has(|a| a.heading.is_some()), format != CompassFormat::Bno08xRvc, "{format:?}: heading");
     }
+}
+
+/// One line for both: a receiver with two antennas, whose packets of the heading stand between its sentences.
+#[test]
+fn a_receivers_line_may_tell_the_heading_too() {
+    let mut scenario = Scenario::named("follow").expect("known");
+    (scenario.duration_s, scenario.rig.compass.format) = (8.0, CompassFormat::Ubx);
+    scenario.rig.compass.baud = scenario.rig.gps.baud;
+    let world = Arc::new(World::new(scenario, 5));
+    let mut config = config_of(world.scenario());
+    config.compass.device.clone_from(&config.gps.device);
+    let config = Config::parse(&config.to_toml().expect("writable")).expect("it is accepted");
+    let mut pipeline = Pipeline::new((&config).into());
+    let (mut outputs, mut packet) = (Vec::new(), Vec::new());
+    for event in Flight::new(world, FrameStorage::None, 1) {
+        let mut event = event.expect("serial lines need no encoder");
+        if let EventBody::Bytes { source: source @ Source::Compass, data } = &mut event.body {
+            // A packet of 64 bytes and what is around them goes out in one piece.
+            packet.append(data);
+            let whole = packet.len() / 72 * 72;
+            (*source, *data) = (Source::Gps, packet.drain(..whole).collect());
+        }
+        pipeline.handle(&event, &mut outputs);
+    }
+    let count = |wanted: &dyn Fn(&Output) -> bool| outputs.iter().filter(|o| wanted(&o.output)).count();
+    let headings =
+        count(&|o| matches!(o, Output::Reading(SensorReading::Attitude(a)) if a.value.heading_is_true));
+    let fixes = count(&|o| matches!(o, Output::Reading(SensorReading::Gnss(_))));
+    assert!(headings >= 235 && fixes >= 38, "{headings} headings, {fixes} fixes");
+    let complaint = |o: &Output| matches!(o, Output::Notice(n) if matches!(n.kind, NoticeKind::BytesRefused | NoticeKind::SourceSilent) && n.source != Some(Source::Camera));
+    assert_eq!(count(&complaint), 0);
 }
 
 /// Sentences say what the receiver worked out, to the digits they carry.

@@ -85,6 +85,25 @@ fn the_command_line_tends_flights() {
     let verified = windhover(root, &["verify"]);
     assert!(verified.status.success(), "{}", String::from_utf8_lossy(&verified.stdout));
 
+    // What a kill leaves is unfinished and nothing is wrong: the flight not closed, its last segment without an end and
+    // with half a chunk behind, all of it not in the index yet.
+    let cut = root.join(FLIGHTS).join("boot-2");
+    let before = std::fs::read(cut.join("000000.mcap")).unwrap();
+    let info = std::fs::read(cut.join(flight::FLIGHT_FILE)).unwrap();
+    std::fs::remove_file(cut.join(flight::FLIGHT_FILE)).unwrap();
+    let chunks_end = before.windows(9).rposition(|w| w == [0x0F, 4, 0, 0, 0, 0, 0, 0, 0]).unwrap();
+    std::fs::write(cut.join("000000.mcap"), [&before[..chunks_end], &[6; 300]].concat()).unwrap();
+    std::fs::remove_dir_all(root.join("index")).unwrap();
+    let verified = windhover(root, &["verify"]);
+    let words = String::from_utf8_lossy(&verified.stdout);
+    assert!(verified.status.success() && words.contains("0 things wrong"), "{words}");
+    assert!(words.contains("boot-2/000000.mcap: was cut off;") && words.contains("300 bytes"), "{words}");
+    assert!(words.contains("boot-2: not closed") && words.contains("no index"), "{words}");
+    assert!(words.contains("3 things unfinished"), "{words}");
+    std::fs::write(cut.join("000000.mcap"), before).unwrap();
+    std::fs::write(cut.join(flight::FLIGHT_FILE), info).unwrap();
+    stdout(&windhover(root, &["rebuild"]));
+
     // A cut segment is found, mended and whole again; nothing that was in it is lost.
     let segment = root.join(FLIGHTS).join("boot-1/000000.mcap");
     let bytes = std::fs::read(&segment).unwrap();

@@ -37,6 +37,7 @@ struct Ranks {
     position: u8,
     solution: u8,
     motion: u8,
+    accuracy: u8,
     hdop: u8,
 }
 
@@ -55,7 +56,13 @@ impl Draft {
             fix_told: None,
             solution: None,
             sats_listed: None,
-            ranks: Ranks { position: u8::MAX, solution: u8::MAX, motion: u8::MAX, hdop: u8::MAX },
+            ranks: Ranks {
+                position: u8::MAX,
+                solution: u8::MAX,
+                motion: u8::MAX,
+                accuracy: u8::MAX,
+                hdop: u8::MAX,
+            },
         }
     }
 
@@ -80,6 +87,7 @@ impl Draft {
         }
         self.merge_position(report);
         self.merge_motion(report);
+        self.merge_accuracy(report);
         let rank = hdop_rank(report.kind);
         if report.hdop.is_some() && rank < self.ranks.hdop {
             self.ranks.hdop = rank;
@@ -121,6 +129,18 @@ impl Draft {
         }
     }
 
+    /// A covariance says more than the figures beside the solution, and these more than GST.
+    fn merge_accuracy(&mut self, report: &Report) {
+        let rank = accuracy_rank(report.kind);
+        let says = report.position_sigma_m.is_some() || report.velocity_sigma_mps.is_some();
+        if says && rank <= self.ranks.accuracy {
+            self.ranks.accuracy = rank;
+            let epoch = &mut self.epoch;
+            epoch.position_sigma_m = report.position_sigma_m.or(epoch.position_sigma_m);
+            epoch.velocity_sigma_mps = report.velocity_sigma_mps.or(epoch.velocity_sigma_mps);
+        }
+    }
+
     /// The finished epoch.
     pub(super) fn finish(&self, calendar: &mut Calendar) -> GnssEpoch {
         let mut epoch = self.epoch;
@@ -138,6 +158,8 @@ impl Draft {
                 course_deg: None,
                 vel_ned_mps: None,
                 vel_has_down: false,
+                position_sigma_m: None,
+                velocity_sigma_mps: None,
                 ..epoch
             };
         }
@@ -208,6 +230,14 @@ const fn hdop_rank(kind: Kind) -> u8 {
     match kind {
         Kind::Gga => 0,
         Kind::Gns => 1,
+        _ => 2,
+    }
+}
+
+const fn accuracy_rank(kind: Kind) -> u8 {
+    match kind {
+        Kind::Cov => 0,
+        Kind::Pvt => 1,
         _ => 2,
     }
 }

@@ -6,7 +6,7 @@ use super::counts::{DecodeCounts, Refusal};
 use super::epoch::Draft;
 use super::lines::{Line, LineFramer, LineSpan, LineStart};
 use super::report::{Kind, Report};
-use super::sentence::Sentence;
+use super::sentence::Checksums;
 use super::ubx::{self, Piece, Splitter};
 use super::{garmin, standard};
 use windhover_base::msg::GnssEpoch;
@@ -72,6 +72,7 @@ struct Done {
 struct Assembler {
     /// Wait for the next epoch's begin instead of the learnt end of the cycle.
     patient: bool,
+    checksums: Checksums,
     order: BurstOrder,
     cycle: Cycle<Kind>,
     calendar: Calendar,
@@ -113,6 +114,7 @@ impl GnssDecoder {
             counts: DecodeCounts::default(),
             assembler: Assembler {
                 patient,
+                checksums: Checksums::REQUIRED,
                 order: BurstOrder::default(),
                 cycle: Cycle::default(),
                 calendar: Calendar::new(!patient),
@@ -131,6 +133,13 @@ impl GnssDecoder {
     #[must_use]
     pub const fn of_format(mut self, format: GpsFormat) -> Self {
         self.format = format;
+        self
+    }
+
+    /// The same for a receiver whose sentences may come without checksums.
+    #[must_use]
+    pub const fn checksums_required(mut self, required: bool) -> Self {
+        self.assembler.checksums = if required { Checksums::REQUIRED } else { Checksums::OPTIONAL };
         self
     }
 
@@ -178,7 +187,7 @@ impl GnssDecoder {
 
 impl Assembler {
     fn line(&mut self, line: &Line<'_>, counts: &mut DecodeCounts, out: &mut Vec<HeardEpoch>) {
-        let sentence = match Sentence::of_line(line.text) {
+        let sentence = match self.checksums.sentence(line.text) {
             Ok(sentence) => sentence,
             Err(why) => return counts.refuse(why),
         };
@@ -236,25 +245,71 @@ impl Assembler {
         if report.kind == Kind::Zda {
             self.place_date(report, span, out);
             Ok(())
+        } else if report.kind == Kind::Pulse {
+            self.place_pulse(&report, span);
+            Ok(())
+        } else if report.kind == Kind::Gst {
+            self.place_errors(report, address, span, out)
         } else if let Some(time) = report.time_of_day_ns {
             self.place_timed(&report, time, span, out)
         } else if report.kind.tells_time() {
             self.place_time_missing(&report, span, out)
         } else if self.order.leads(address) || (self.date.leads && self.date.heard.is_some()) {
-            self.leading.retain(|(other, _)| other.kind != report.kind);
-            if self.leading.len() < LEADING_MAX {
-                self.leading.push((report, span));
-            }
+            self.lead(report, span);
             Ok(())
         } else {
             self.place_untimed(&report, span, out)
         }
     }
 
+    /// TIM-TP dates, and is of the pulse to come: of no epoch.
+    fn place_pulse(&mut self, report: &Report, span: LineSpan) {
+        if let Some((time, date)) = report.time_of_day_ns.zip(report.date) {
+            self.calendar.told(time, date, self.draft.as_ref().map(Draft::has_fix), span.t_first);
+        }
+    }
+
+    /// A GST is of the open epoch, led its burst or came too late; it never opens one.
+    fn place_errors(
+        &mut self,
+        report: Report,
+        address: &str,
+        span: LineSpan,
+        out: &mut Vec<HeardEpoch>,
+    ) -> Result<(), Refusal> {
+        let time = report.time_of_day_ns;
+        if self.is_open(time) {
+            self.order.same_burst();
+            self.merge(&report, span, out);
+            return Ok(());
+        }
+        if time.is_some_and(|time| self.is_done(time)) {
+            self.order.same_burst();
+            self.cycle.was_longer();
+            return Err(Refusal::AfterItsEpoch);
+        }
+        if time.is_none() || !self.order.leads(address) {
+            return Err(Refusal::NoTime);
+        }
+        self.lead(report, span);
+        Ok(())
+    }
+
+    fn lead(&mut self, report: Report, span: LineSpan) {
+        self.leading.retain(|(other, _)| other.kind != report.kind);
+        if self.leading.len() < LEADING_MAX {
+            self.leading.push((report, span));
+        }
+    }
+
+    fn is_open(&self, time: Option<i64>) -> bool {
+        time.is_some() && self.draft.as_ref().is_some_and(|draft| draft.time_of_day_ns == time)
+    }
+
     /// A ZDA dates and never opens an epoch: some receivers tell it of another second.
     fn place_date(&mut self, report: Report, span: LineSpan, out: &mut Vec<HeardEpoch>) {
         let Some(time) = report.time_of_day_ns else { return };
-        if self.draft.as_ref().is_some_and(|draft| draft.time_of_day_ns == Some(time)) {
+        if self.is_open(Some(time)) {
             self.order.same_burst();
             return self.merge(&report, span, out);
         }
@@ -394,7 +449,9 @@ impl Assembler {
             draft.opens_burst = true;
         }
         for (report, span) in date.into_iter().chain(self.leading.drain(..)) {
-            draft.merge(&report, span);
+            if report.time_of_day_ns.is_none_or(|of| of == time) {
+                draft.merge(&report, span);
+            }
         }
         self.draft = Some(draft);
     }

@@ -27,4 +27,4 @@ pub use mavlink::{
     is_autopilot, question as timesync_question,
 };
 pub use sentence::{Sentence, framed};
-pub use ubx::{holds_ubx_packet, ubx_framed};
+pub use ubx::{ubx_framed, ubx_packets};

@@ -20,8 +20,13 @@ pub(super) enum Kind {
     Zda,
     Pgrme,
     Pgrmv,
+    Gst,
     /// u-blox NAV-PVT.
     Pvt,
+    /// u-blox NAV-COV.
+    Cov,
+    /// u-blox TIM-TP.
+    Pulse,
 }
 
 impl Kind {
@@ -89,6 +94,9 @@ pub(super) struct Report {
     pub vel_ned_mps: Option<Vector3<f64>>,
     pub hpe_m: Option<f64>,
     pub vpe_m: Option<f64>,
+    /// One-sigma of position and velocity along north, east, down.
+    pub position_sigma_m: Option<Vector3<f64>>,
+    pub velocity_sigma_mps: Option<Vector3<f64>>,
     /// Satellites used, as a count.
     pub sats: Option<u32>,
     /// Satellites used, as GSA lists them; GSA comes once for each constellation.
@@ -115,6 +123,8 @@ impl Report {
             vel_ned_mps: None,
             hpe_m: None,
             vpe_m: None,
+            position_sigma_m: None,
+            velocity_sigma_mps: None,
             sats: None,
             sats_listed: None,
             hdop: None,

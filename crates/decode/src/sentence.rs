@@ -19,6 +19,31 @@ pub fn framed(body: &str) -> String {
     format!("${body}*{:02X}", checksum(body.as_bytes()))
 }
 
+/// Whether a line without a checksum is a sentence: where it is said that the device sends none, and it was seen to
+/// send none.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Checksums {
+    required: bool,
+}
+
+impl Checksums {
+    pub(super) const REQUIRED: Self = Self { required: true };
+    pub(super) const OPTIONAL: Self = Self { required: false };
+
+    /// The sentence of a line.
+    pub(super) fn sentence<'a>(&mut self, line: &'a [u8]) -> Result<Sentence<'a>, Refusal> {
+        if line.contains(&b'*') {
+            let sentence = Sentence::of_line(line)?;
+            self.required = true;
+            Ok(sentence)
+        } else if self.required {
+            Err(Refusal::NoChecksum)
+        } else {
+            Sentence::of_bare_line(line)
+        }
+    }
+}
+
 impl<'a> Sentence<'a> {
     /// From a line `$body*HH`, nothing after the checksum.
     ///
@@ -42,6 +67,15 @@ impl<'a> Sentence<'a> {
             return Err(Refusal::BadChecksum);
         }
         Ok(Self { body })
+    }
+
+    /// From a line `$body` without a checksum.
+    fn of_bare_line(line: &'a [u8]) -> Result<Self, Refusal> {
+        let line = std::str::from_utf8(line).map_err(|_| Refusal::NotAscii)?;
+        if !line.bytes().all(|byte| (0x20..0x7F).contains(&byte)) {
+            return Err(Refusal::NotAscii);
+        }
+        Ok(Self { body: line.strip_prefix('$').ok_or(Refusal::Malformed)?.trim_end() })
     }
 
     /// The address: talker and sentence, or a proprietary name.

@@ -13,6 +13,7 @@
 //! | GSA | kind of fix | satellites, HDOP | PDOP, VDOP |
 //! | VTG | | course, speed (knots, else km/h), mode | magnetic course |
 //! | ZDA | time | day, month, year | |
+//! | GST | time | one-sigma of latitude, longitude, altitude | the ellipse |
 //!
 //! A mode or quality that is unknown counts as no measured fix, but an unknown quality of GGA leaves
 //! the decision to the other sentences of its epoch. Fields not named are not read.
@@ -23,6 +24,7 @@
 //! put into a form it reads.
 
 use chrono::Datelike;
+use nalgebra::Vector3;
 use nmea::ParseResult;
 use nmea::sentences::{FixType, GgaData, GllData, GnsData, GsaData, RmcData, VtgData, ZdaData};
 
@@ -30,6 +32,9 @@ use super::counts::Refusal;
 use super::report::{Date, Kind, Report, Solution, angle_deg, time_of_day_ns};
 use super::sentence::{Sentence, framed, number};
 use windhover_base::msg::FixKind;
+
+/// Largest one-sigma of a position, m: what is beyond tells that nothing is known.
+const SIGMA_MAX_M: f64 = 1.0e5;
 
 /// Metres a second in a knot.
 const KNOT_MPS: f64 = 1852.0 / 3600.0;
@@ -43,6 +48,10 @@ pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<Report>, Refusal> {
         return Err(Refusal::Malformed);
     }
     let mut report = Report::new(kind);
+    if kind == Kind::Gst {
+        of_gst(&mut report, sentence)?;
+        return Ok(Some(report));
+    }
     if let Some(field) = time_field(kind) {
         report.time_of_day_ns = time_of_day_ns(sentence.field(field))?;
     }
@@ -74,6 +83,7 @@ fn kind_of(formatter: &str) -> Option<Kind> {
         "GSA" => Kind::Gsa,
         "VTG" => Kind::Vtg,
         "ZDA" => Kind::Zda,
+        "GST" => Kind::Gst,
         _ => return None,
     })
 }
@@ -101,7 +111,7 @@ const fn fields_min(kind: Kind) -> usize {
     match kind {
         Kind::Rmc | Kind::Gga => 9,
         Kind::Gns => 10,
-        Kind::Vtg => 8,
+        Kind::Vtg | Kind::Gst => 8,
         Kind::Gll => 6,
         Kind::Zda => 4,
         _ => 2,
@@ -368,6 +378,19 @@ fn of_vtg(report: &mut Report, data: &VtgData, sentence: &Sentence<'_>) {
         report.speed_mps = data.speed_over_ground.map(|knots| decimal(knots) * KNOT_MPS).or_else(by_kmh);
         report.course_deg = data.true_course.map(decimal);
     }
+}
+
+/// Errors: time, range residuals, ellipse (two axes and their direction), latitude, longitude, altitude.
+fn of_gst(report: &mut Report, sentence: &Sentence<'_>) -> Result<(), Refusal> {
+    report.time_of_day_ns = time_of_day_ns(sentence.field(1))?;
+    let mut sigma =
+        |name, field| report.optional(name, sentence.number(field, 0.0, SIGMA_MAX_M)).filter(|s| *s > 0.0);
+    let across = sigma("GST latitude", 6).zip(sigma("GST longitude", 7));
+    let up = sigma("GST altitude", 8);
+    // Without an altitude the solution is flat, and its height is not used.
+    report.position_sigma_m =
+        across.map(|(north, east)| Vector3::new(north, east, up.unwrap_or(SIGMA_MAX_M)));
+    Ok(())
 }
 
 fn of_zda(report: &mut Report, data: &ZdaData) {

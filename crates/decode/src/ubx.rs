@@ -5,20 +5,25 @@
 //!
 //! | packet | what is used |
 //! |---|---|
-//! | NAV-PVT | time and date where valid, kind of fix, position, both heights, velocity, accuracies, satellites |
-//! | NAV-TIMEUTC | the date, where UTC is valid |
+//! | NAV-PVT | time and date where valid, kind of fix (also: RTK), position, both heights, velocity, accuracies, satellites |
+//! | NAV-COV | one-sigma of position and velocity along north, east, down, where valid |
+//! | NAV-TIMEUTC, TIM-TP | the date, where UTC is valid |
+//! | NAV-RELPOSNED | the heading between two antennas ([`relative_heading`]) |
 //!
 //! Others are passed over. Source: u-blox's interface descriptions.
 
 use nalgebra::Vector3;
 use ublox::UbxProtocol;
+use ublox::nav_cov::NavCovRef;
+use ublox::nav_pvt::proto31::NavPvtRef;
 use ublox::proto31::{PacketRef, Proto31};
+use ublox::tim_tp::{TimTpRef, TimTpTimeBase};
 
 use super::counts::{DecodeCounts, Refusal};
 use super::lines::LineSpan;
-use super::report::{Date, Kind, Report};
+use super::report::{Date, Kind, Report, Solution};
 use windhover_base::msg::FixKind;
-use windhover_base::time::{MonoTime, NS_PER_S};
+use windhover_base::time::{MonoTime, NS_PER_S, UtcTime};
 
 /// Marks, class, identity, length.
 const HEAD: usize = 6;
@@ -142,13 +147,13 @@ pub fn ubx_framed(class: u8, identity: u8, payload: &[u8]) -> Vec<u8> {
     packet
 }
 
-/// Whether bytes hold a whole packet of any class, its checksum sound.
-pub fn holds_ubx_packet(bytes: &[u8]) -> bool {
-    bytes.windows(HEAD).enumerate().any(|(at, head)| {
-        let &[0xB5, 0x62, _, _, low, high] = head else { return false };
+/// Class, identity and payload of each whole packet in bytes, checksum sound.
+pub fn ubx_packets(bytes: &[u8]) -> impl Iterator<Item = (u8, u8, &[u8])> {
+    bytes.windows(HEAD).enumerate().filter_map(|(at, head)| {
+        let &[0xB5, 0x62, class, identity, low, high] = head else { return None };
         let end = at + HEAD + usize::from(u16::from_le_bytes([low, high]));
-        let sum = bytes.get(at + 2..end).map(checksum);
-        sum.is_some_and(|sum| bytes.get(end..end + 2) == Some(&sum[..]))
+        let is_sound = bytes.get(end..end + 2)? == checksum(bytes.get(at + 2..end)?);
+        is_sound.then_some((class, identity, &bytes[at + HEAD..end]))
     })
 }
 
@@ -164,60 +169,26 @@ fn packet_ref(packet: &[u8]) -> Result<PacketRef<'_>, Refusal> {
 
 /// What a packet says of a fix; `None` where it says nothing.
 pub(super) fn read(packet: &[u8]) -> Result<Option<Report>, Refusal> {
-    if (packet[2], packet[3]) == (0x01, 0x07) && packet.len() == PVT_OLD + AROUND {
-        // The seventh generation ends before what is not used here.
-        let mut longer = packet[..HEAD + PVT_OLD].to_vec();
-        longer.resize(HEAD + PVT_NEW + 2, 0);
-        return position(&packet_ref(&longer)?).transpose();
+    match (packet[2], packet[3]) {
+        (0x01, 0x07) if packet.len() == PVT_OLD + AROUND => {
+            // The seventh generation ends before what is not used here.
+            let mut longer = packet[..HEAD + PVT_OLD].to_vec();
+            longer.resize(HEAD + PVT_NEW + 2, 0);
+            of_packet(&packet_ref(&longer)?)
+        }
+        (0x01, 0x07 | 0x21 | 0x36) | (0x0D, 0x01) => of_packet(&packet_ref(packet)?),
+        _ => Ok(None),
     }
-    if !matches!((packet[2], packet[3]), (0x01, 0x07 | 0x21)) {
-        return Ok(None);
-    }
-    position(&packet_ref(packet)?).transpose()
 }
 
 /// Payloads of NAV-PVT up to the seventh generation, and since.
 const PVT_OLD: usize = 84;
 const PVT_NEW: usize = 92;
 
-fn position(packet: &PacketRef<'_>) -> Option<Result<Report, Refusal>> {
+fn of_packet(packet: &PacketRef<'_>) -> Result<Option<Report>, Refusal> {
     match packet {
-        PacketRef::NavPvt(pvt) => {
-            let clock = Clock {
-                time: [pvt.hour(), pvt.min(), pvt.sec()],
-                nanoseconds: pvt.nanosec(),
-                date: (pvt.year(), pvt.month(), pvt.day()),
-            };
-            let valid = pvt.valid_raw();
-            let mut report = Report::new(Kind::Pvt);
-            if let Err(why) = clock.fill(&mut report, valid & 2 != 0, valid & 1 != 0) {
-                return Some(Err(why));
-            }
-            let ok = pvt.flags_raw() & 1 != 0;
-            // Dead reckoning alone (1) and time alone (5) are no fixes.
-            let fix = match pvt.fix_type_raw() {
-                2 if ok => FixKind::TwoD,
-                3 | 4 if ok => FixKind::ThreeD,
-                _ => FixKind::None,
-            };
-            (report.fix, report.valid) = (Some(fix), Some(fix != FixKind::None));
-            report.sats = Some(u32::from(pvt.num_satellites()));
-            if fix == FixKind::None {
-                return Some(Ok(report));
-            }
-            let (lat, lon) = (pvt.latitude(), pvt.longitude());
-            if !(-90.0..=90.0).contains(&lat) || !(-180.0..=180.0).contains(&lon) {
-                return Some(Err(Refusal::OutOfRange));
-            }
-            report.position_deg = Some((lat, lon));
-            report.alt_msl_m = Some(pvt.height_msl());
-            report.geoid_m = Some(pvt.height_above_ellipsoid() - pvt.height_msl());
-            report.vel_ned_mps = Some(Vector3::new(pvt.vel_north(), pvt.vel_east(), pvt.vel_down()));
-            report.speed_mps = Some(pvt.ground_speed_2d());
-            report.course_deg = Some(pvt.heading_motion().rem_euclid(360.0));
-            (report.hpe_m, report.vpe_m) = (Some(pvt.horizontal_accuracy()), Some(pvt.vertical_accuracy()));
-            Some(Ok(report))
-        }
+        PacketRef::NavPvt(pvt) => solution(pvt).map(Some),
+        PacketRef::NavCov(cov) => covariance(cov),
         PacketRef::NavTimeUTC(utc) => {
             let clock = Clock {
                 time: [utc.hour(), utc.min(), utc.sec()],
@@ -226,10 +197,125 @@ fn position(packet: &PacketRef<'_>) -> Option<Result<Report, Refusal>> {
             };
             let mut report = Report::new(Kind::Zda);
             let is_valid = utc.valid_raw() & 4 != 0;
-            Some(clock.fill(&mut report, is_valid, is_valid).map(|()| report))
+            clock.fill(&mut report, is_valid, is_valid)?;
+            Ok(Some(report))
         }
-        _ => Some(Err(Refusal::Malformed)),
+        PacketRef::TimTp(pulse) => next_pulse(pulse),
+        _ => Err(Refusal::Malformed),
     }
+}
+
+fn solution(pvt: &NavPvtRef<'_>) -> Result<Report, Refusal> {
+    let clock = Clock {
+        time: [pvt.hour(), pvt.min(), pvt.sec()],
+        nanoseconds: pvt.nanosec(),
+        date: (pvt.year(), pvt.month(), pvt.day()),
+    };
+    let (valid, flags) = (pvt.valid_raw(), pvt.flags_raw());
+    let mut report = Report::new(Kind::Pvt);
+    clock.fill(&mut report, valid & 2 != 0, valid & 1 != 0)?;
+    let ok = flags & 1 != 0;
+    // Dead reckoning alone (1) and time alone (5) are no fixes.
+    let fix = match pvt.fix_type_raw() {
+        2 if ok => FixKind::TwoD,
+        3 | 4 if ok => FixKind::ThreeD,
+        _ => FixKind::None,
+    };
+    (report.fix, report.valid) = (Some(fix), Some(fix != FixKind::None));
+    report.sats = Some(u32::from(pvt.num_satellites()));
+    if fix == FixKind::None {
+        return Ok(report);
+    }
+    let (lat, lon) = (pvt.latitude(), pvt.longitude());
+    if !(-90.0..=90.0).contains(&lat) || !(-180.0..=180.0).contains(&lon) {
+        return Err(Refusal::OutOfRange);
+    }
+    report.position_deg = Some((lat, lon));
+    report.solution = Some(match flags >> 6 {
+        1 => Solution::RtkFloat,
+        2 => Solution::RtkFixed,
+        _ => Solution::Code,
+    });
+    report.alt_msl_m = Some(pvt.height_msl());
+    report.geoid_m = Some(pvt.height_above_ellipsoid() - pvt.height_msl());
+    report.vel_ned_mps = Some(Vector3::new(pvt.vel_north(), pvt.vel_east(), pvt.vel_down()));
+    report.speed_mps = Some(pvt.ground_speed_2d());
+    report.course_deg = Some(pvt.heading_motion().rem_euclid(360.0));
+    let (across, up, speed) = (pvt.horizontal_accuracy(), pvt.vertical_accuracy(), pvt.speed_accuracy());
+    (report.hpe_m, report.vpe_m) = (Some(across), Some(up));
+    // Of the whole horizontal error and of the whole speed: along an axis it is no more.
+    report.position_sigma_m = sigmas([across, across, up]);
+    report.velocity_sigma_mps = sigmas([speed; 3]);
+    Ok(report)
+}
+
+/// Its time of week is that of the solution it comes with.
+fn covariance(cov: &NavCovRef<'_>) -> Result<Option<Report>, Refusal> {
+    let of = |valid: u8, variances: [f32; 3]| match valid {
+        0 => Ok(None),
+        _ => {
+            sigmas(variances.map(|variance| f64::from(variance).sqrt())).ok_or(Refusal::OutOfRange).map(Some)
+        }
+    };
+    let mut report = Report::new(Kind::Cov);
+    let position = [cov.pos_cov_nn(), cov.pos_cov_ee(), cov.pos_cov_dd()];
+    let velocity = [cov.vel_cov_nn(), cov.vel_cov_ee(), cov.vel_cov_dd()];
+    report.position_sigma_m = of(cov.pos_cov_valid(), position)?;
+    report.velocity_sigma_mps = of(cov.vel_cov_valid(), velocity)?;
+    Ok(Some(report))
+}
+
+/// One-sigmas that can be; `None` where one is nothing, endless or no number.
+fn sigmas(values: [f64; 3]) -> Option<Vector3<f64>> {
+    values.iter().all(|sigma| sigma.is_finite() && *sigma > 0.0).then(|| Vector3::from(values))
+}
+
+/// TIM-TP: the time of the pulse to come; `None` where it is not of UTC.
+fn next_pulse(pulse: &TimTpRef<'_>) -> Result<Option<Report>, Refusal> {
+    let flags = pulse.flags();
+    if flags.time_base() != TimTpTimeBase::Utc || !flags.utc_available() {
+        return Ok(None);
+    }
+    let (week, of_week) = (i64::from(pulse.week()), i64::from(pulse.tow_ms()) * (NS_PER_S / 1_000));
+    if week > WEEK_MAX || of_week > WEEK_NS {
+        return Err(Refusal::OutOfRange);
+    }
+    let since_gps_began = week * WEEK_NS + of_week;
+    let unix_ns = GPS_BEGAN.unix_ns() + since_gps_began;
+    let mut report = Report::new(Kind::Pulse);
+    report.time_of_day_ns = Some(unix_ns.rem_euclid(DAY_NS));
+    let civil = UtcTime::from_unix_ns(unix_ns).civil();
+    report.date = Date::new(civil.year, civil.month, civil.day);
+    Ok(Some(report))
+}
+
+/// 1980-01-06, from which weeks are counted.
+const GPS_BEGAN: UtcTime = UtcTime::from_unix_ns(315_964_800 * NS_PER_S);
+const DAY_NS: i64 = 86_400 * NS_PER_S;
+const WEEK_NS: i64 = 7 * DAY_NS;
+/// Two centuries of weeks.
+const WEEK_MAX: i64 = 10_000;
+
+/// Flags of NAV-RELPOSNED that a heading needs: fix, relative position, a solution of known or unknown whole
+/// cycles (two bits), heading.
+const RELATIVE: [u32; 4] = [1, 1 << 2, 3 << 3, 1 << 8];
+
+/// The heading from one antenna to the other, degrees, of NAV-RELPOSNED: `Some(None)` where it is not valid, `None`
+/// where this is another packet. The eighth generation's packet has none.
+pub(super) fn relative_heading(packet: &[u8]) -> Result<Option<Option<f64>>, Refusal> {
+    if (packet[2], packet[3]) != (0x01, 0x3C) || packet[HEAD..].first() == Some(&0) {
+        return Ok(None);
+    }
+    let PacketRef::NavRelPosNed(relative) = packet_ref(packet)? else { return Ok(None) };
+    let flags = relative.flags_raw();
+    if RELATIVE.iter().any(|bits| flags & bits == 0) {
+        return Ok(Some(None));
+    }
+    let degrees = relative.rel_pos_heading_degrees();
+    if !(-360.0..=360.0).contains(&degrees) {
+        return Err(Refusal::OutOfRange);
+    }
+    Ok(Some(Some(degrees.rem_euclid(360.0))))
 }
 
 /// Date and time as the packets have them.

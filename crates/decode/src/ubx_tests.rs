@@ -1,5 +1,6 @@
 //! Packets of u-blox as receivers send them, alone and among sentences.
 
+use nalgebra::Vector3;
 use proptest::prelude::*;
 
 use super::gnss::{GnssDecoder, HeardEpoch};
@@ -127,14 +128,117 @@ fn the_seventh_generation_is_read() {
     assert_eq!((epochs.len(), epochs[0].epoch.fix), (1, FixKind::ThreeD), "{counts}");
 }
 
+#[test]
+fn accuracies_and_rtk_are_told() {
+    let epoch = |packets: &[Vec<u8>]| decode(GpsFormat::Auto, &packets.concat()).0[0].epoch;
+    let with = |flags: u8, speed_accuracy_mm: u32| {
+        let mut payload = pvt(5, 0, 3, flags)[6..98].to_vec();
+        payload[68..72].copy_from_slice(&speed_accuracy_mm.to_le_bytes());
+        ubx_framed(1, 7, &payload)
+    };
+    let alone = epoch(&[with(1, 120)]);
+    let of = |v: Option<Vector3<f64>>| v.expect("told");
+    assert_eq!(of(alone.position_sigma_m), Vector3::new(0.8, 0.8, 1.2));
+    assert_eq!(of(alone.velocity_sigma_mps), Vector3::repeat(0.12));
+    assert_eq!(epoch(&[with(1, 0)]).velocity_sigma_mps, None, "nothing is no accuracy");
+    assert_eq!(epoch(&[with(0x41, 9)]).fix, FixKind::RtkFloat);
+    assert_eq!(epoch(&[with(0x81, 9)]).fix, FixKind::RtkFixed);
+    let covered = epoch(&[with(1, 120), cov([1, 1], [0.25, 0.5, 4.0], [0.01, 0.04, 0.09])]);
+    assert_eq!(of(covered.position_sigma_m), Vector3::new(0.5, 0.5f64.sqrt(), 2.0));
+    let near = |v: Vector3<f64>, wanted: Vector3<f64>| (v - wanted).norm() < 1e-6;
+    assert!(near(of(covered.velocity_sigma_mps), Vector3::new(0.1, 0.2, 0.3)));
+    let half = epoch(&[with(1, 120), cov([0, 1], [0.25; 3], [0.01; 3])]);
+    assert_eq!(of(half.position_sigma_m), Vector3::new(0.8, 0.8, 1.2), "an invalid half is left out");
+    for odd in [f32::NAN, f32::INFINITY, -1.0, 0.0] {
+        let counts = decode(GpsFormat::Auto, &[with(1, 120), cov([1, 1], [odd; 3], [0.01; 3])].concat()).1;
+        assert_eq!((counts.used, counts.refused(Refusal::OutOfRange)), (1, 1), "{odd}");
+    }
+    assert_eq!(epoch(&[pvt(5, 0, 0, 0), cov([1, 1], [0.25; 3], [0.01; 3])]).position_sigma_m, None);
+}
+
+/// NAV-COV with these flags of validity and variances.
+fn cov(valid: [u8; 2], position: [f32; 3], velocity: [f32; 3]) -> Vec<u8> {
+    let mut payload = vec![0; 64];
+    payload[5..7].copy_from_slice(&valid);
+    for (at, variances) in [(16, position), (40, velocity)] {
+        // NN NE ND EE ED DD
+        for (place, variance) in [0, 3, 5].into_iter().zip(variances) {
+            payload[at + 4 * place..at + 4 * place + 4].copy_from_slice(&variance.to_le_bytes());
+        }
+    }
+    ubx_framed(1, 0x36, &payload)
+}
+
+#[test]
+fn covariances_of_a_stream_are_of_their_epochs() {
+    let burst = |second: u8| [pvt(second, 0, 3, 1), cov([1, 1], [f32::from(second); 3], [0.01; 3])].concat();
+    let bytes: Vec<u8> = (5..30).flat_map(burst).collect();
+    for mut decoder in [GnssDecoder::patient(), GnssDecoder::new()] {
+        let mut out = Vec::new();
+        for (n, packet) in bytes.chunks(100 + 72).enumerate() {
+            decoder.push(
+                packet,
+                MonoTime::from_ns(1_795_014_245_000_000_000 + n as i64 * 1_000_000_000),
+                &mut out,
+            );
+        }
+        decoder.flush(&mut out);
+        assert_eq!((out.len(), decoder.counts().refused_total()), (25, 0), "{}", decoder.counts());
+        for (second, heard) in (5..30).zip(&out) {
+            let sigma = heard.epoch.position_sigma_m.expect("told").x;
+            assert!((sigma - f64::from(second).sqrt()).abs() < 1e-6, "{second}: {sigma}");
+        }
+    }
+}
+
+/// TIM-TP of 2026-11-18 15:04:06 (week 2445) with these flags.
+fn pulse(flags: u8) -> Vec<u8> {
+    let mut payload = vec![0; 16];
+    payload[..4].copy_from_slice(&(((3 * 24 + 15) * 3_600 + 4 * 60 + 6) * 1_000u32).to_le_bytes());
+    payload[12..14].copy_from_slice(&2_445u16.to_le_bytes());
+    payload[14] = flags;
+    ubx_framed(0x0D, 1, &payload)
+}
+
+#[test]
+fn a_pulse_tells_the_date_and_opens_nothing() {
+    let rmc = |second: u8| {
+        (framed(&format!("GNGGA,1504{second:02}.00,3842.2,N,00911.0,W,1,17,0.6,43.0,M,50.0,M,,")) + "\r\n")
+            .into_bytes()
+    };
+    let (epochs, counts) = decode(GpsFormat::Auto, &[rmc(5), pulse(3), rmc(6), rmc(7)].concat());
+    assert_eq!((epochs.len(), counts.used), (3, 4), "{counts}");
+    assert_eq!(epochs[1].epoch.utc.expect("dated").to_string(), "2026-11-18T15:04:06.000Z");
+    let (epochs, counts) = decode(GpsFormat::Auto, &[rmc(5), pulse(2), pulse(1), rmc(6)].concat());
+    assert_eq!((epochs[1].epoch.utc, counts.ignored), (None, 2), "the receiver's own time is not UTC");
+}
+
+#[test]
+fn sentences_of_errors_are_of_their_epoch_and_open_none() {
+    let at = |second: u8, body: &str| {
+        (framed(&body.replace("TIME", &format!("1504{second:02}.00"))) + "\r\n").into_bytes()
+    };
+    let gga = "GNGGA,TIME,3842.2,N,00911.0,W,1,17,0.6,43.0,M,50.0,M,,";
+    let gst = "GNGST,TIME,1.2,1.5,0.9,30,0.8,0.9,1.7";
+    let bytes = [at(5, gga), at(5, gst), at(6, gga), at(9, gst), at(7, gga), at(7, gst)].concat();
+    let (epochs, counts) = decode(GpsFormat::Nmea, &bytes);
+    let told: Vec<bool> = epochs.iter().map(|heard| heard.epoch.position_sigma_m.is_some()).collect();
+    assert_eq!((told, counts.refused(Refusal::NoTime)), (vec![true, false, true], 1), "{counts}");
+    assert_eq!(epochs[0].epoch.position_sigma_m, Some(Vector3::new(0.8, 0.9, 1.7)));
+    for gst in ["GNGST,TIME,,,,,,,", "GNGST,TIME,1,,,,0.0,0.0,0.0", "GNGST,TIME,1,,,,x,1,1"] {
+        let (epochs, counts) = decode(GpsFormat::Nmea, &[at(5, gga), at(5, gst)].concat());
+        assert_eq!((epochs[0].epoch.position_sigma_m, counts.used), (None, 2), "{gst}");
+    }
+}
+
 proptest! {
     #[test]
     fn any_payload_is_survived(
-        which in 0usize..4,
+        which in 0usize..6,
         payload in prop::collection::vec(any::<u8>(), 0..120),
         sized: bool,
     ) {
-        let (class, identity, length) = [(1, 7, 92), (1, 0x21, 20), (1, 0x3C, 64), (1, 7, 84)][which];
+        let (class, identity, length) = [(1, 7, 92), (1, 0x21, 20), (1, 0x3C, 64), (1, 7, 84), (1, 0x36, 64), (0x0D, 1, 16)][which];
         let mut payload = payload;
         if sized {
             payload.resize(length, 0xFF);
@@ -142,6 +246,8 @@ proptest! {
         let bytes = ubx_framed(class, identity, &payload);
         for heard in decode(GpsFormat::Auto, &bytes).0 {
             prop_assert!(heard.epoch.lat_deg.is_none_or(|lat| (-90.0..=90.0).contains(&lat)));
+            let sigmas = [heard.epoch.position_sigma_m, heard.epoch.velocity_sigma_mps];
+            prop_assert!(sigmas.iter().flatten().flatten().all(|sigma| sigma.is_finite() && *sigma > 0.0));
             prop_assert!(heard.epoch.course_deg.is_none_or(|course| (0.0..=360.0).contains(&course)));
         }
     }

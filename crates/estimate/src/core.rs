@@ -55,7 +55,8 @@ impl Core {
         let tilt = [rig.compass.tilt, second.tilt].map(TiltWatch::new);
         let mut senses = Senses::default();
         senses.of_tilt(&tilt);
-        senses.of_fix(FixKind::ThreeD, &models);
+        senses.of_fix(FixKind::ThreeD, None, &models);
+        senses.hold_bias(MonoTime::default());
         let tilt_error_var = senses.tilt_error_var;
         let start = Learnt {
             target_q: vec![models.target_walks; rig.target.len()],

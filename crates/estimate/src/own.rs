@@ -7,6 +7,7 @@
 use nalgebra::{Matrix3, Rotation3, Vector2, Vector3};
 
 use windhover_base::msg::FixKind;
+use windhover_base::time::MonoTime;
 
 use super::blocks::{Block, Layout, own};
 use super::fitted::Learnt;
@@ -131,10 +132,14 @@ pub(crate) struct Senses {
     /// Likewise of the second source of attitude.
     pub(crate) second_error_var: f64,
     pub(crate) second_error_tau_s: f64,
-    /// The quality of the receiver's fix, and by it the variances of its bias and its noise, m².
+    /// The quality of the receiver's fix, and by it and by what the receiver says of its errors the variances of its bias
+    /// and its noise, m².
     pub(crate) fix: FixKind,
     pub(crate) gps_bias_var: [f64; 3],
     pub(crate) gps_noise_var: f64,
+    /// What the bias may still be by what was said before, m², and when that was so.
+    pub(crate) gps_bias_held_var: [f64; 3],
+    pub(crate) gps_bias_held_at: MonoTime,
 }
 
 /// What the walks depend on.

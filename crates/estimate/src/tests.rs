@@ -85,6 +85,8 @@ struct Scene {
     step: u32,
     /// Where the rover is: north, east; added to its heading.
     rover: [f64; 3],
+    /// What the receiver says of its errors, position and velocity.
+    told: Option<(f64, f64)>,
 }
 
 impl Scene {
@@ -95,7 +97,13 @@ impl Scene {
         let ground = Ground::Flat { down_m: 0.0 };
         let site = Site { frame: LocalFrame::new(datum), ground, declination_rad: 0.0 };
         let filter = Estimator::new(&rig, &estimator, &site);
-        Self { filter, models: Models::new(&rig, &estimator, &site), step: 0, rover: [-2.0, -3.0, 0.0] }
+        Self {
+            filter,
+            models: Models::new(&rig, &estimator, &site),
+            step: 0,
+            rover: [-2.0, -3.0, 0.0],
+            told: None,
+        }
     }
 
     fn truth(&self, target: usize) -> [f64; TARGET] {
@@ -151,6 +159,8 @@ impl Scene {
                     geoid_m: Some(0.0),
                     vel_ned_mps: Some(Vector3::zeros()),
                     vel_has_down: true,
+                    position_sigma_m: self.told.map(|(position_m, _)| Vector3::repeat(position_m)),
+                    velocity_sigma_mps: self.told.map(|(_, velocity_mps)| Vector3::repeat(velocity_mps)),
                     ..GnssEpoch::default()
                 };
                 self.filter.gnss(&Stamped { t_valid: t, t_recv: t, seq: seq + 2, value }, &mut out);
@@ -252,4 +262,29 @@ fn a_vehicle_that_comes_back_elsewhere_is_placed_anew_and_never_lost() {
     assert!(coasting <= 1 && coasting + tracking == statuses.len(), "{statuses:?}");
     scene.assert_right(&out, "being carried");
     assert_eq!(resets(&out), 0);
+}
+
+#[test]
+fn what_the_receiver_says_of_its_errors_is_believed() {
+    // Position and velocity of the helicopter, one sigma, after eight seconds of such a receiver.
+    let sigmas = |told: Option<(f64, f64)>| {
+        let mut scene = Scene::new();
+        scene.told = told;
+        let out = scene.hear(120);
+        let last = out.iter().rev().find_map(|o| match o {
+            EstimatorOutput::Ownship(ownship) => Some(*ownship),
+            _ => None,
+        });
+        let last = last.expect("it is told");
+        (last.position_sigma_m(), last.velocity_sigma_mps().x)
+    };
+    let (usual, usual_velocity) = sigmas(None);
+    let (poor, poor_velocity) = sigmas(Some((12.0, 1.0)));
+    let (good, _) = sigmas(Some((0.7, 0.05)));
+    let (boast, boast_velocity) = sigmas(Some((0.001, 0.001)));
+    assert!((10.0..14.0).contains(&poor.x), "{poor}");
+    assert!(good.x < 0.8 * usual.x && good.x > 0.6, "{good} {usual}");
+    assert!(boast.x > 0.4, "a fix by codes is not as good as that: {boast}");
+    assert!(poor_velocity > 1.5 * usual_velocity, "{poor_velocity} {usual_velocity}");
+    assert!((boast_velocity / usual_velocity - 1.0).abs() < 0.2, "{boast_velocity} {usual_velocity}");
 }

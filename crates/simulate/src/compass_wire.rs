@@ -1,5 +1,6 @@
 //! Compass sentences and packets in every format that is understood.
 
+use super::compass_binary::{write_pni, write_rvc, write_ubx, write_witmotion};
 use super::garmin::write_sentence;
 use windhover_base::msg::AttitudeSample;
 use windhover_base::settings::CompassFormat;
@@ -14,15 +15,6 @@ pub(super) struct WireContext {
     /// For formats with a time of day.
     pub(super) utc: UtcTime,
 }
-
-/// CRC-16 of PNI's binary packets: polynomial 0x1021, start 0 (XMODEM).
-const PNI_CRC: crc::Crc<u16> = crc::Crc::<u16>::new(&crc::CRC_16_XMODEM);
-/// kDataResp and the components sent.
-const PNI_DATA_RESPONSE: u8 = 5;
-const PNI_HEADING: u8 = 5;
-const PNI_DISTORTION: u8 = 8;
-const PNI_PITCH: u8 = 24;
-const PNI_ROLL: u8 = 25;
 
 /// Appends one reading as the device sends it. A reading without a heading is one that the device
 /// flags as not valid.
@@ -70,6 +62,13 @@ pub(super) fn write_reading(sample: &AttitudeSample, context: &WireContext, line
             format!("HCXDR,A,{pitch:.1},D,PITCH,A,{roll:.1},D,ROLL")
         }
         CompassFormat::Pni => return write_pni(heading, pitch, roll, valid, line),
+        CompassFormat::Ubx => {
+            return write_ubx((heading + context.declination_deg).rem_euclid(360.0), valid, line);
+        }
+        CompassFormat::Witmotion if !valid => return,
+        CompassFormat::Witmotion => return write_witmotion(heading, pitch, roll, line),
+        CompassFormat::Bno08xRvc if !valid => return,
+        CompassFormat::Bno08xRvc => return write_rvc(heading, pitch, roll, line),
     };
     write_sentence(line, &body);
 }
@@ -78,19 +77,4 @@ pub(super) fn write_reading(sample: &AttitudeSample, context: &WireContext, line
 fn wrapped(degrees: f64, digits: i32) -> f64 {
     let scale = 10_f64.powi(digits);
     ((degrees * scale).round() / scale).rem_euclid(360.0)
-}
-
-/// A binary packet: length of the whole, frame, count of components, components, checksum.
-fn write_pni(heading: f64, pitch: f64, roll: f64, valid: bool, line: &mut Vec<u8>) {
-    let mut packet = vec![0, 0, PNI_DATA_RESPONSE, 4];
-    for (component, degrees) in [(PNI_HEADING, heading), (PNI_PITCH, pitch), (PNI_ROLL, roll)] {
-        packet.push(component);
-        packet.extend_from_slice(&(degrees as f32).to_be_bytes());
-    }
-    packet.extend_from_slice(&[PNI_DISTORTION, u8::from(!valid)]);
-    let length = (packet.len() + 2) as u16;
-    packet[..2].copy_from_slice(&length.to_be_bytes());
-    let sum = PNI_CRC.checksum(&packet);
-    packet.extend_from_slice(&sum.to_be_bytes());
-    line.extend_from_slice(&packet);
 }

@@ -164,5 +164,6 @@ fn fix(
         vpe_m: Some(STATED_ERROR_M.1),
         sats: Some(9),
         hdop: Some(0.9),
+        ..GnssEpoch::default()
     }
 }

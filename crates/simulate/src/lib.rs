@@ -5,6 +5,7 @@ mod camera;
 mod closed;
 mod company;
 mod compass;
+mod compass_binary;
 mod compass_wire;
 mod deviation;
 mod deviations;

@@ -22,6 +22,7 @@ const WIRE_BYTES: (f64, f64) = (223.0, 20.0);
 /// One measurement with when it was really true. `t_valid` is what the configured latency makes of
 /// it: off by this flight's latency error and the remaining jitter.
 #[derive(Clone, Copy, PartialEq, Debug)]
+#[expect(clippy::large_enum_variant, reason = "a value at a time, handed on")]
 pub enum Sample {
     /// A GPS epoch.
     Gnss {

@@ -10,69 +10,99 @@ use crate::io::store::inspect;
 use crate::io::store::keeper::{describe, settle_flight};
 use crate::io::store::rebuild;
 use crate::io::store::scan::SegmentFile;
+use crate::io::store::seal::{Condition, condition};
 use crate::io::store::volume::Volume;
 use crate::text::counted;
+
+/// What was found: what is wrong, and what the daemon finishes by itself at its next start (a kill or a power cut
+/// leaves it so, and nothing is lost).
+#[derive(Default)]
+struct Found {
+    wrong: usize,
+    unfinished: usize,
+}
+
+impl Found {
+    fn wrong(&mut self, line: &str) -> CliResult {
+        self.wrong += 1;
+        Ok(outln!("{line}")?)
+    }
+
+    fn unfinished(&mut self, line: &str) -> CliResult {
+        self.unfinished += 1;
+        Ok(outln!("{line}")?)
+    }
+}
 
 /// Reads every byte of the flights; says what is wrong; compares with the index where `all` are
 /// looked at and nobody else has it open. `called` is how `store` was called, for advice.
 pub(super) fn verify(root: &Path, names: &[String], all: bool, called: &str) -> CliResult {
     let present = inspect::in_the_air(root)?;
-    let mut wrong = 0;
+    let mut found = Found::default();
     let mut segments = 0;
     for name in names.iter().filter(|name| Some(*name) != present.as_ref()) {
-        let dir = root.join(FLIGHTS).join(name);
-        for segment_name in flight::segment_names(&dir) {
-            segments += 1;
-            let segment = SegmentFile::open(&dir.join(&segment_name))?;
-            let fault = match segment.sealed() {
-                None => Some("is not sealed"),
-                Some(sealed) => (!segment.agrees(&sealed, &segment.salvage())).then_some("is damaged"),
-            };
-            if let Some(fault) = fault {
-                wrong += 1;
-                outln!("{name}/{segment_name}: {fault}")?;
-            }
-        }
-        if !dir.join(flight::FLIGHT_FILE).exists() {
-            wrong += 1;
-            outln!("{name}: not closed")?;
-        }
+        segments += verify_flight(root, name, &mut found)?;
     }
     if all {
-        wrong += verify_index(root, called)?;
+        verify_index(root, called, &mut found)?;
     }
     let (segments, flights) = (counted(segments, "segment"), counted(names.len(), "flight"));
+    let Found { wrong, unfinished } = found;
     outln!("{segments} of {flights} read, {} wrong", counted(wrong, "thing"))?;
+    if unfinished > 0 {
+        let things = counted(unfinished, "thing");
+        outln!(
+            "{things} unfinished, and none of them lost: the daemon finishes it at its next start, or `{called} repair`"
+        )?;
+    }
     if wrong == 0 {
         return Ok(());
     }
     Err(CliError::failed(format!("the store is not whole; `{called} repair` and `{called} rebuild` mend it")))
 }
 
-fn verify_index(root: &Path, called: &str) -> Result<usize, CliError> {
+/// Reads a flight's segments; how many.
+fn verify_flight(root: &Path, name: &str, found: &mut Found) -> Result<usize, CliError> {
+    let dir = root.join(FLIGHTS).join(name);
+    let is_closed = dir.join(flight::FLIGHT_FILE).exists();
+    let segments = flight::segment_names(&dir);
+    for segment_name in &segments {
+        let segment = SegmentFile::open(&dir.join(segment_name))?;
+        match condition(&segment) {
+            Condition::Whole => {}
+            Condition::Damaged => found.wrong(&format!("{name}/{segment_name}: is damaged"))?,
+            // A flight is closed when all its segments are.
+            Condition::CutOff { .. } if is_closed => {
+                found.wrong(&format!("{name}/{segment_name}: is not sealed"))?;
+            }
+            Condition::CutOff { chunks, cut_bytes } => {
+                let (chunks, cut) = (counted(chunks, "chunk"), counted(cut_bytes, "byte"));
+                let words = format!("was cut off; {chunks} whole, {cut} behind them were never acknowledged");
+                found.unfinished(&format!("{name}/{segment_name}: {words}"))?;
+            }
+        }
+    }
+    if !is_closed {
+        found.unfinished(&format!("{name}: not closed"))?;
+    }
+    Ok(segments.len())
+}
+
+fn verify_index(root: &Path, called: &str, found: &mut Found) -> CliResult {
     let dir = root.join(INDEX);
     if !dir.exists() {
-        outln!("no index; the daemon makes it, or `{called} rebuild`")?;
-        return Ok(1);
+        return found.unfinished(&format!("no index; the daemon makes it, or `{called} rebuild`"));
     }
     if inspect::is_recording(root) {
-        outln!("the daemon has the index; it was not compared")?;
-        return Ok(0);
+        return Ok(outln!("the daemon has the index; it was not compared")?);
     }
     match Index::open(&dir) {
-        Ok(index) => {
-            let told = rebuild::differences(root, &index)?;
-            told.iter().try_for_each(|line| outln!("index: {line}"))?;
-            Ok(told.len())
-        }
-        Err(IndexError::InUse { .. }) => {
-            outln!("the daemon has the index; it was not compared")?;
-            Ok(0)
-        }
-        Err(error) => {
-            outln!("{error}")?;
-            Ok(1)
-        }
+        Ok(index) => rebuild::differences(root, &index)?.into_iter().try_for_each(|difference| {
+            let line = format!("index: {difference}");
+            if difference.is_finished_at_start() { found.unfinished(&line) } else { found.wrong(&line) }
+        }),
+        Err(IndexError::InUse { .. }) => Ok(outln!("the daemon has the index; it was not compared")?),
+        Err(error) => found.wrong(&error.to_string()),
     }
 }
 

@@ -178,6 +178,8 @@ fn fix(epoch: &Stamped<GnssEpoch>, log: MonoTime, out: &mut Vec<Record>) {
         hdop: e.hdop,
         heard: stamp(epoch.t_recv),
         rtk: rtk(e.fix).into(),
+        position_sigma_m: e.position_sigma_m.map_or(Vec::new(), |v| v.iter().copied().collect()),
+        velocity_sigma_mps: e.velocity_sigma_mps.map_or(Vec::new(), |v| v.iter().copied().collect()),
     };
     out.push(record(topic::GPS_EPOCH.into(), Schema::GnssEpoch, log, t, &message));
     let (Some(latitude), Some(longitude)) = (e.lat_deg, e.lon_deg) else { return };

@@ -1,7 +1,7 @@
 //! Tells a wrong line speed by what arrives: text read at the wrong speed is not text, and holds no sound sentence.
 
 use super::garmin::bodies;
-use windhover_decode::holds_ubx_packet;
+use windhover_decode::ubx_packets;
 
 /// Counts bytes that have no place in a text protocol, and looks for what only the right speed gives.
 #[derive(Debug, Default)]
@@ -59,7 +59,7 @@ fn holds_a_sentence(bytes: &[u8]) -> bool {
 /// Whether this is packets of a u-blox receiver: a whole one, or the marks of one beside a sound sentence.
 fn holds_packets(bytes: &[u8]) -> bool {
     let is_marked = bytes.windows(2).any(|pair| pair == [0xB5, 0x62]);
-    is_marked && (holds_ubx_packet(bytes) || holds_a_sentence(bytes))
+    is_marked && (ubx_packets(bytes).next().is_some() || holds_a_sentence(bytes))
 }
 
 #[cfg(test)]

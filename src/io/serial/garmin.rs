@@ -3,22 +3,9 @@
 //! Source: Garmin GPS 18x technical specifications, "Received NMEA 0183 sentences". An echo of a
 //! sentence means accepted; an echo with other values means refused.
 
-use super::GARMIN_ANSWER;
+use super::{ANSWER, Step};
 use windhover_base::time::MonoTime;
 use windhover_decode::{Sentence, framed};
-
-/// What to do now.
-#[derive(Clone, PartialEq, Eq, Debug)]
-pub(super) enum Step {
-    /// Nothing until the receiver answers, or until this time.
-    Wait(MonoTime),
-    /// Write this sentence.
-    Send(String),
-    /// All done: so many settings were accepted.
-    Accepted(u32),
-    /// The receiver refused or ignored a setting.
-    Refused(String),
-}
 
 /// Sentences sent, in order: all sentences off; position averaging off and NMEA 2.30 mode indicators
 /// on (PGRMC1 fields 3 and 7: averaging would freeze a hovering helicopter); then those decoded on.
@@ -66,14 +53,14 @@ impl GarminSetup {
             let Some(asked) = self.asked else {
                 self.asked = Some(now);
                 self.heard.clear();
-                return Step::Send(sentence(body));
+                return Step::Send(sentence(body).into_bytes());
             };
             match self.answer(body) {
                 Some(true) => self.accepted += 1,
                 Some(false) => {
                     return Step::Refused(format!("the receiver answered {body} with other values"));
                 }
-                None if now < asked + GARMIN_ANSWER => return Step::Wait(asked + GARMIN_ANSWER),
+                None if now < asked + ANSWER => return Step::Wait(asked + ANSWER),
                 None if must_answer => {
                     return Step::Refused(format!("the receiver did not answer {body}; is it a Garmin?"));
                 }
@@ -132,7 +119,7 @@ mod tests {
             match setup.due(at(f64::from(pass) * 50.0)) {
                 Step::Wait(_) => {}
                 Step::Send(sentence) => {
-                    if let Some(echo) = answer(&sentence) {
+                    if let Some(echo) = answer(&String::from_utf8_lossy(&sentence)) {
                         setup.heard(echo.as_bytes());
                     }
                 }

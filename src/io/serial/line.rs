@@ -4,12 +4,14 @@ use std::io::{ErrorKind as IoKind, Read, Write};
 use std::path::Path;
 use std::time::Duration;
 
-use serialport::TTYPort;
+use serialport::{DataBits, StopBits, TTYPort};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
 use super::network::{Network, is_network};
 use super::{SerialSettings, unplugged};
+use windhover_base::settings::{Framing, Parity};
+
 use crate::io::device::{Fault, FaultKind, Opened, OwnsDescriptor, blocking, register};
 
 /// Longest that a line takes to accept a sentence.
@@ -31,12 +33,12 @@ impl Line {
     /// Opens the line for this program alone. A device that is busy, missing, forbidden or no serial
     /// line is told apart.
     pub(in crate::io) async fn open(settings: &SerialSettings) -> Result<Self, Fault> {
-        let SerialSettings { device, baud, .. } = settings.clone();
+        let SerialSettings { device, baud, framing, .. } = settings.clone();
         if is_network(&device) {
             let network = Some(Network::open(&device).await?);
             return Ok(Self { device, port: None, network });
         }
-        let port = blocking(move || open(&device, baud)).await?;
+        let port = blocking(move || open(&device, baud, framing)).await?;
         let mut line = Self { device: settings.device.clone(), port: None, network: None };
         line.register(port)?;
         Ok(line)
@@ -123,13 +125,21 @@ fn not_ready(error: std::io::Error) -> std::io::Error {
     if error.kind() == IoKind::TimedOut { IoKind::WouldBlock.into() } else { error }
 }
 
-fn open(device: &str, baud: u32) -> Result<TTYPort, Fault> {
+fn open(device: &str, baud: u32, framing: Framing) -> Result<TTYPort, Fault> {
     if baud == 0 {
         return Err(Fault::new(FaultKind::Unsuitable, device, "line speed 0 hangs up; set baud"));
     }
     // The serial library folds several errors into one; the plain system calls tell them apart.
     std::fs::metadata(device).map_err(|e| Fault::from_io(device, &e))?;
+    let data_bits = if framing.data_bits == 7 { DataBits::Seven } else { DataBits::Eight };
+    let stop_bits = if framing.stop_bits == 2 { StopBits::Two } else { StopBits::One };
+    let parity = match framing.parity {
+        Parity::None => serialport::Parity::None,
+        Parity::Even => serialport::Parity::Even,
+        Parity::Odd => serialport::Parity::Odd,
+    };
     let builder = serialport::new(device, baud).timeout(Duration::ZERO);
+    let builder = builder.data_bits(data_bits).parity(parity).stop_bits(stop_bits);
     TTYPort::open(&builder).map_err(|error| fault_from_open(device, baud, &error))
 }
 

@@ -6,6 +6,9 @@ mod garmin;
 mod garmin_speed;
 mod line;
 mod network;
+mod talk;
+mod ublox;
+mod ublox_speed;
 
 use std::convert::Infallible;
 use std::time::Duration;
@@ -13,13 +16,15 @@ use std::time::Duration;
 use super::clock::HostClock;
 use super::device::{Backoff, Fault, FaultKind, NoteKind, Report, Reports, wait_for};
 use garbled::TextShare;
-use garmin::{GarminSetup, Step};
-use garmin_speed::Settling;
+use garmin::GarminSetup;
 pub(super) use line::Line;
+use talk::Talk;
+use ublox::UbloxSetup;
+use windhover_base::settings::Framing;
 use windhover_base::time::{MonoTime, Span};
 
 /// What a line is and how it is set.
-#[derive(Clone, PartialEq, Eq, Debug)]
+#[derive(Clone, PartialEq, Debug)]
 pub struct SerialSettings {
     /// Path of the device, or its address on the network; opened anew by this name each time, so a `by-id` path
     /// survives renumbering.
@@ -28,15 +33,31 @@ pub struct SerialSettings {
     pub baud: u32,
     /// Whether what arrives is text: then bytes that are not tell of a wrong line speed.
     pub text: bool,
-    /// Configure a Garmin receiver each time the line is opened.
-    pub configure_garmin: bool,
+    /// Data bits, parity and stop bits.
+    pub framing: Framing,
+    /// How what is at its other end is configured each time the line is opened.
+    pub setup: Option<Setup>,
+}
+
+/// How a receiver is configured.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum Setup {
+    /// A Garmin receiver.
+    Garmin,
+    /// A u-blox receiver: so many solutions a second, its sentences off unless they are kept.
+    Ublox {
+        /// Solutions a second.
+        rate_hz: f64,
+        /// Whether sentences stay as they are.
+        keep_text: bool,
+    },
 }
 
 /// Bytes one read can return; a line at 2 Mbit/s fills it in 20 ms.
 const READ_BYTES: usize = 4096;
 
-/// How long a receiver has to answer a configuration sentence.
-const GARMIN_ANSWER: Span = Span::from_ns(1_500_000_000);
+/// How long a receiver has to answer what configures it.
+const ANSWER: Span = Span::from_ns(1_500_000_000);
 
 /// Reads the line for ever; dropping the future closes it.
 pub async fn run(settings: &SerialSettings, clock: HostClock, reports: Reports<'_>) -> Infallible {
@@ -75,10 +96,19 @@ impl Reader<'_> {
     /// Reads until the line is lost.
     async fn read(&mut self, backoff: &mut Backoff) -> Result<Infallible, Fault> {
         let mut setup = None;
-        if self.settings.configure_garmin {
+        if let Some(kind) = self.settings.setup {
             let (settings, clock, reports) = (self.settings, self.clock, self.reports);
-            Settling { line: &mut self.line, settings, clock, reports }.settle().await?;
-            setup = Some(GarminSetup::new());
+            let talk = Talk { line: &mut self.line, settings, clock, reports };
+            setup = Some(match kind {
+                Setup::Garmin => {
+                    garmin_speed::settle(talk).await?;
+                    Running::Garmin(GarminSetup::new())
+                }
+                Setup::Ublox { rate_hz, keep_text } => {
+                    ublox_speed::settle(talk).await?;
+                    Running::Ublox(UbloxSetup::new(rate_hz, keep_text))
+                }
+            });
         }
         let mut buffer = vec![0; READ_BYTES];
         let mut share = TextShare::default();
@@ -122,12 +152,12 @@ impl Reader<'_> {
     }
 
     /// Goes on with a receiver's configuration; until when its answer is waited for, `None` where it is through.
-    async fn configure(&mut self, setup: &mut GarminSetup) -> Result<Option<MonoTime>, Fault> {
+    async fn configure(&mut self, setup: &mut Running) -> Result<Option<MonoTime>, Fault> {
         loop {
             let note = match setup.due(self.clock.now()) {
                 Step::Wait(limit) => return Ok(Some(limit)),
-                Step::Send(sentence) => {
-                    self.line.write(sentence.as_bytes()).await?;
+                Step::Send(bytes) => {
+                    self.line.write(&bytes).await?;
                     continue;
                 }
                 Step::Accepted(count) => {
@@ -137,6 +167,41 @@ impl Reader<'_> {
             };
             (self.reports)(note);
             return Ok(None);
+        }
+    }
+}
+
+/// What to do now to configure a receiver.
+#[derive(Clone, PartialEq, Eq, Debug)]
+enum Step {
+    /// Nothing until the receiver answers, or until this time.
+    Wait(MonoTime),
+    /// Write this.
+    Send(Vec<u8>),
+    /// All done: so many settings were accepted.
+    Accepted(u32),
+    /// The receiver refused or ignored a setting.
+    Refused(String),
+}
+
+/// A configuration that goes on.
+enum Running {
+    Garmin(GarminSetup),
+    Ublox(UbloxSetup),
+}
+
+impl Running {
+    fn heard(&mut self, bytes: &[u8]) {
+        match self {
+            Self::Garmin(setup) => setup.heard(bytes),
+            Self::Ublox(setup) => setup.heard(bytes),
+        }
+    }
+
+    fn due(&mut self, now: MonoTime) -> Step {
+        match self {
+            Self::Garmin(setup) => setup.due(now),
+            Self::Ublox(setup) => setup.due(now),
         }
     }
 }

@@ -12,6 +12,8 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use serialport::TTYPort;
 use tokio_util::sync::CancellationToken;
 
+use windhover_decode::{ubx_framed, ubx_packets};
+
 use super::*;
 
 /// The far end of a pseudo-terminal and the name of its near end.
@@ -33,8 +35,11 @@ struct Line {
 
 impl Line {
     fn start(device: &str, configure_garmin: bool) -> Self {
-        let settings =
-            SerialSettings { device: device.to_owned(), baud: 38400, text: true, configure_garmin };
+        Self::start_with(device, Framing::default(), configure_garmin.then_some(Setup::Garmin))
+    }
+
+    fn start_with(device: &str, framing: Framing, setup: Option<Setup>) -> Self {
+        let settings = SerialSettings { device: device.to_owned(), baud: 38400, framing, text: true, setup };
         let (sender, reports) = channel();
         let stop = CancellationToken::new();
         let thread = std::thread::spawn({
@@ -217,6 +222,88 @@ fn a_receiver_left_in_binary_mode_is_told_to_speak_nmea() {
     let text = line.wait(configured);
     assert!(text.contains("was in binary mode"), "{text}");
     line.wait(|r| matches!(r, Report::Bytes(_, bytes) if bytes.starts_with(b"$GPRMC")).then_some(()));
+}
+
+/// A u-blox receiver at the far end of a line, at its own speed. Of keys, or of messages and ports.
+fn ublox_at(mut far: File, mut own: u32, has_keys: bool) {
+    let mut reader = far.try_clone().expect("a second handle");
+    let (sender, asked) = channel::<Vec<u8>>();
+    std::thread::spawn(move || {
+        let mut buffer = [0; 256];
+        while let Ok(count) = reader.read(&mut buffer) {
+            if sender.send(buffer[..count].to_vec()).is_err() {
+                return;
+            }
+        }
+    });
+    let speed = |far: &File| rustix::termios::tcgetattr(far).map_or(0, |line| line.output_speed());
+    std::thread::spawn(move || {
+        loop {
+            let said = asked.recv_timeout(Duration::from_millis(100)).unwrap_or_default();
+            let mut answers = Vec::new();
+            if speed(&far) != own {
+                answers.extend([0xf8, 0x00, 0x9e, 0xe6]);
+            } else {
+                answers.extend(ubx_framed(1, 7, &[0; 92]));
+                for (class, identity, payload) in ubx_packets(&said) {
+                    let knows = match (class, identity) {
+                        (0x0A, 4) => continue,
+                        (6, 0x8A) => has_keys,
+                        _ => !has_keys,
+                    };
+                    answers.extend(ubx_framed(5, u8::from(knows), &[class, identity]));
+                    match (identity, payload) {
+                        (0x8A, [_, _, _, _, 1, 0, 0x52, 0x40, baud @ ..]) if knows => {
+                            own = u32::from_le_bytes(baud.try_into().expect("a figure"));
+                        }
+                        (0x00, payload) if knows => {
+                            own = u32::from_le_bytes(payload[8..12].try_into().expect("a figure"));
+                        }
+                        _ => {}
+                    }
+                }
+            }
+            if far.write_all(&answers).is_err() {
+                return;
+            }
+        }
+    });
+}
+
+#[test]
+fn a_ublox_receiver_is_found_and_configured() {
+    let start = |(own, has_keys, settings)| {
+        let (far, name) = pty();
+        ublox_at(far, own, has_keys);
+        let setup = Setup::Ublox { rate_hz: 5.0, keep_text: false };
+        (Line::start_with(&name, Framing::default(), Some(setup)), settings)
+    };
+    let lines = [(9_600, true, "13 settings"), (9_600, false, "10 settings")].map(start);
+    for (line, settings) in lines {
+        line.up();
+        let text = line.wait(configured);
+        assert!(text.contains("spoke at 9600 baud"), "{text}");
+        assert_eq!(line.wait(configured), format!("{settings} accepted"));
+        line.wait(|r| matches!(r, Report::Bytes(_, bytes) if bytes.starts_with(&[0xB5, 0x62])).then_some(()));
+    }
+}
+
+/// A pseudo-terminal has eight data bits whatever is asked of it, and keeps the rest.
+#[test]
+fn a_line_is_framed_as_configured() {
+    use rustix::termios::ControlModes;
+    for (framing, wanted) in [
+        ("8N1", ControlModes::empty()),
+        ("7O1", ControlModes::PARODD),
+        ("8E2", ControlModes::CSTOPB),
+        ("8O2", ControlModes::PARODD | ControlModes::CSTOPB),
+    ] {
+        let (far, name) = pty();
+        let line = Line::start_with(&name, Framing::try_from(framing.to_owned()).expect("sound"), None);
+        line.up();
+        let set = rustix::termios::tcgetattr(&far).expect("its settings").control_modes;
+        assert_eq!(set & (ControlModes::PARODD | ControlModes::CSTOPB), wanted, "{framing}");
+    }
 }
 
 /// What a line hears, in one piece.

@@ -290,7 +290,7 @@ fn a_segment_that_the_index_missed_at_the_end_is_found_at_the_next_start() {
     let (store, notices) = start();
     expect_notice(&notices, "index_ready");
     let index = store.handle().index().unwrap();
-    assert_eq!(super::rebuild::differences(dir.path(), &index).unwrap(), Vec::<String>::new());
+    assert_eq!(super::rebuild::differences(dir.path(), &index).unwrap(), []);
     store.stop();
 }
 

@@ -97,18 +97,46 @@ fn queue_of(segment: &SegmentFile, sealed: &SealedSegment, index: &Index) -> Vec
     changes
 }
 
+/// Where index and segments differ.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub enum Difference {
+    /// The index knows a flight that is gone.
+    NotOnCard(String),
+    /// The index does not know a flight or a segment.
+    NotInIndex(String),
+    /// The index tells of a segment what is not so.
+    Otherwise(String),
+}
+
+impl Difference {
+    /// Whether the daemon mends it by itself at its next start.
+    pub fn is_finished_at_start(&self) -> bool {
+        !matches!(self, Self::Otherwise(_))
+    }
+}
+
+impl std::fmt::Display for Difference {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::NotOnCard(name) => write!(f, "{name}: in the index, not on the card"),
+            Self::NotInIndex(name) => write!(f, "{name}: on the card, not in the index"),
+            Self::Otherwise(name) => write!(f, "{name}: the index tells otherwise"),
+        }
+    }
+}
+
 /// Differences between the index and the closed flights on the card, one line each.
-pub fn differences(root: &Path, index: &Index) -> StoreResult<Vec<String>> {
+pub fn differences(root: &Path, index: &Index) -> StoreResult<Vec<Difference>> {
     let mut told = Vec::new();
     let names = flight::flight_names(root)?;
     let known: BTreeMap<String, u32> = index.flights().into_iter().map(|(run, name)| (name, run)).collect();
     let entries: BTreeMap<(u32, u32), SegmentEntry> = index.segments().into_iter().collect();
     for name in known.keys().filter(|name| !names.contains(name)) {
-        told.push(format!("{name}: in the index, not on the card"));
+        told.push(Difference::NotOnCard(name.clone()));
     }
     for name in &names {
         let Some(run) = known.get(name) else {
-            told.push(format!("{name}: on the card, not in the index"));
+            told.push(Difference::NotInIndex(name.clone()));
             continue;
         };
         let dir = root.join(FLIGHTS).join(name);
@@ -116,9 +144,9 @@ pub fn differences(root: &Path, index: &Index) -> StoreResult<Vec<String>> {
             let segment = SegmentFile::open(&dir.join(&segment_name))?;
             let (Some(sealed), Some(number)) = (segment.sealed(), number_of(&segment_name)) else { continue };
             match entries.get(&(*run, number)) {
-                None => told.push(format!("{name}/{segment_name}: not in the index")),
+                None => told.push(Difference::NotInIndex(format!("{name}/{segment_name}"))),
                 Some(entry) if *entry != entry_of(&segment, &sealed) => {
-                    told.push(format!("{name}/{segment_name}: the index tells otherwise"));
+                    told.push(Difference::Otherwise(format!("{name}/{segment_name}")));
                 }
                 Some(_) => {}
             }

@@ -33,6 +33,40 @@ pub enum Sealing {
     Removed,
 }
 
+/// How a segment lies on the card.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Condition {
+    /// Sealed, and as its seal says.
+    Whole,
+    /// Without its end, and whole up to there: what a kill or a power cut leaves.
+    CutOff {
+        /// Whole chunks.
+        chunks: usize,
+        /// Bytes behind them.
+        cut_bytes: usize,
+    },
+    /// Otherwise than it was written.
+    Damaged,
+}
+
+/// Looks at a segment, every byte of it.
+pub fn condition(segment: &SegmentFile) -> Condition {
+    let salvage = segment.salvage();
+    if let Some(sealed) = segment.sealed() {
+        return if segment.agrees(&sealed, &salvage) { Condition::Whole } else { Condition::Damaged };
+    }
+    let chunks = salvage.chunks.len();
+    let end = salvage.last_commit_end.unwrap_or(salvage.chunks_end);
+    let cut_bytes = usize::try_from(salvage.length.saturating_sub(end)).unwrap_or(usize::MAX);
+    let is_whole = salvage.head_whole
+        && salvage.config.is_some()
+        && salvage.metadata.is_some()
+        && salvage.head_definitions.agrees_with(&salvage.definitions)
+        && salvage.contiguous;
+    // The head alone was still being written where there is no chunk.
+    if is_whole || chunks == 0 { Condition::CutOff { chunks, cut_bytes } } else { Condition::Damaged }
+}
+
 /// Seals one segment of a flight directory. `deep` also reads every chunk of one that looks whole.
 pub fn seal_segment(volume: &Volume, dir: &str, name: &str, deep: bool) -> StoreResult<Sealing> {
     let path = format!("{dir}/{name}");

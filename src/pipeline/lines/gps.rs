@@ -1,6 +1,6 @@
 //! The GPS line: bytes to epochs at their time of validity.
 
-use super::{SourceLine, on_the_wire};
+use super::{SourceLine, Wire};
 use windhover_base::msg::{SensorReading, Stamped, WarmArrival};
 use windhover_base::settings::GpsConfig;
 use windhover_base::time::{GnssClock, MonoTime, PulseTrouble, Span};
@@ -15,7 +15,7 @@ pub(in crate::pipeline) struct GpsLine {
     heard: Vec<HeardEpoch>,
     clock: GnssClock,
     clock_sigma: Option<Span>,
-    baud: u32,
+    wire: Wire,
     latency: Span,
 }
 
@@ -23,18 +23,18 @@ impl GpsLine {
     pub(super) fn new(config: &GpsConfig) -> Self {
         let latency = Span::from_ms(config.latency_ms);
         Self {
-            decoder: GnssDecoder::new().of_format(config.format),
+            decoder: GnssDecoder::new().of_format(config.format).checksums_required(config.require_checksum),
             heard: Vec::new(),
             clock: GnssClock::new(latency),
             clock_sigma: None,
-            baud: config.baud,
+            wire: Wire::new(config.framing, config.baud),
             latency,
         }
     }
 
     fn stamp(&mut self, seq: u64, out: &mut Vec<SensorReading>) {
         for heard in self.heard.drain(..) {
-            let began = heard.t_first_byte - on_the_wire(heard.bytes_before_end, self.baud);
+            let began = heard.t_first_byte - self.wire.time(heard.bytes_before_end);
             if let (true, Some(time_of_day_ns)) = (heard.opens_burst, heard.epoch.time_of_day_ns) {
                 self.clock.observe(time_of_day_ns, began);
             }

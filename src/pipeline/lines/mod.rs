@@ -12,7 +12,7 @@ pub(super) use gps::GpsLine;
 pub(super) use samples::{Sample, SampleLine};
 
 use windhover_base::msg::{Delivery, SensorReading, Source};
-use windhover_base::settings::{AutopilotUse, Rig};
+use windhover_base::settings::{AutopilotUse, Framing, Rig};
 use windhover_base::time::{MonoTime, Span};
 use windhover_decode::DecodeCounts;
 
@@ -38,19 +38,20 @@ pub(super) struct SourceLines {
     pub(super) imu: Option<SampleLine>,
     pub(super) attitude: Option<SampleLine>,
     autopilot: Option<AutopilotLine>,
-    /// Whether receiver and compass have lines of their own.
     has_gps: bool,
     has_compass: bool,
+    /// Whether the receiver's line is the compass's too.
+    is_shared: bool,
 }
 
 impl SourceLines {
     pub(super) fn new(rig: &Rig) -> Self {
         Self {
             gps: GpsLine::new(&rig.gps),
-            compass: CompassLine::new(&rig.compass),
+            compass: CompassLine::new(&rig.compass, rig.imu.map_or(0.0, |imu| imu.latency_ms)),
             imu: rig
                 .imu
-                .filter(|_| !by_autopilot(rig, AutopilotUse::Imu))
+                .filter(|_| !by_autopilot(rig, AutopilotUse::Imu) && !rig.compass.imu)
                 .map(|i| SampleLine::new(i.latency_ms)),
             attitude: rig
                 .attitude
@@ -59,6 +60,7 @@ impl SourceLines {
             autopilot: rig.autopilot.as_ref().map(|autopilot| AutopilotLine::new(autopilot, rig)),
             has_gps: rig.gps.is_there(),
             has_compass: rig.compass.is_there(),
+            is_shared: rig.compass_is_receivers(),
         }
     }
 
@@ -70,6 +72,11 @@ impl SourceLines {
             Source::Autopilot => self.autopilot.as_mut().map(|line| line as &mut dyn SourceLine),
             Source::Gps | Source::Compass | Source::Camera | Source::Imu | Source::Attitude => None,
         }
+    }
+
+    /// Other sources that the bytes of this one tell of.
+    pub(super) fn beside(&self, source: Source) -> Option<Source> {
+        (source == Source::Gps && self.is_shared).then_some(Source::Compass)
     }
 
     /// The line of a source of samples; `None` where it delivers something else, or is not configured.
@@ -103,7 +110,19 @@ pub(super) fn refused(counts: &DecodeCounts) -> (u64, String) {
     (counts.refused_total(), reasons.chain(fields).collect::<Vec<_>>().join(", "))
 }
 
-/// Time on the wire: ten bits a byte (8N1).
-fn on_the_wire(bytes: usize, baud: u32) -> Span {
-    Span::from_s(bytes as f64 * 10.0 / f64::from(baud.max(1)))
+/// What bytes take on a serial line.
+#[derive(Clone, Copy)]
+struct Wire {
+    bits_a_byte: u32,
+    baud: u32,
+}
+
+impl Wire {
+    fn new(framing: Framing, baud: u32) -> Self {
+        Self { bits_a_byte: framing.bits(), baud: baud.max(1) }
+    }
+
+    fn time(self, bytes: usize) -> Span {
+        Span::from_s(bytes as f64 * f64::from(self.bits_a_byte) / f64::from(self.baud))
+    }
 }

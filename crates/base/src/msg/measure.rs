@@ -85,6 +85,10 @@ pub struct GnssEpoch {
     pub hpe_m: Option<f64>,
     /// Vertical position error as the receiver puts it, metres.
     pub vpe_m: Option<f64>,
+    /// One-sigma of the position along north, east, down, as the receiver puts it, metres.
+    pub position_sigma_m: Option<Vector3<f64>>,
+    /// One-sigma of the velocity along north, east, down, as the receiver puts it, m/s.
+    pub velocity_sigma_mps: Option<Vector3<f64>>,
     /// Satellites used.
     pub sats: Option<u32>,
     /// Horizontal dilution of precision.
@@ -127,6 +131,10 @@ pub struct AutopilotPosition {
 }
 
 /// What a source's bytes were decoded to.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "some hundred readings a second, moved from a list to the filter"
+)]
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum SensorReading {
     /// Of a GPS receiver.

@@ -5,6 +5,7 @@
 
 mod autopilot;
 mod estimator;
+mod framing;
 mod inertial;
 mod montecarlo;
 mod rig;
@@ -13,9 +14,10 @@ mod target;
 
 pub use autopilot::{AutopilotConfig, AutopilotUse};
 pub use estimator::{DetectorConfig, EstimatorConfig};
+pub use framing::{Framing, Parity};
 pub use inertial::{AttitudeConfig, ImuConfig};
 pub use montecarlo::{Distribution, MonteCarloConfig};
-pub use rig::Rig;
+pub use rig::{Rig, shares_line};
 pub use sensors::{
     CameraConfig, CameraMount, CompassConfig, CompassFormat, Datum, Declination, GpsConfig, GpsFormat,
     GroundConfig, GroundSource, PixelFormat, TiltKind,

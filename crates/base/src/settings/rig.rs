@@ -30,3 +30,15 @@ pub struct Rig {
     /// The vehicles to watch.
     pub target: Vec<TargetConfig>,
 }
+
+impl Rig {
+    /// Whether the receiver's line tells the heading too. A server behind TCP gives the same to everybody who asks.
+    pub fn compass_is_receivers(&self) -> bool {
+        shares_line(&self.gps, &self.compass)
+    }
+}
+
+/// Whether receiver and compass are one line.
+pub fn shares_line(gps: &GpsConfig, compass: &CompassConfig) -> bool {
+    gps.is_there() && gps.device == compass.device && !gps.device.starts_with("tcp://")
+}

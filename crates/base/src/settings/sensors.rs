@@ -3,6 +3,7 @@
 use nalgebra::{Rotation3, Vector3};
 use serde::{Deserialize, Serialize};
 
+use super::Framing;
 use crate::geo::{CameraModel, ImageTop, TiltConvention, body_from_camera};
 
 /// `[gps]`
@@ -17,6 +18,13 @@ pub struct GpsConfig {
     /// What the receiver speaks: sentences ("nmea"), u-blox's packets ("ubx"), or either ("auto").
     #[serde(default)]
     pub format: GpsFormat,
+    /// Data bits, parity and stop bits of the serial line.
+    #[serde(default, skip_serializing_if = "Framing::is_default")]
+    pub framing: Framing,
+    /// Whether sentences must have a checksum. Without it what noise makes of a sentence may pass; one that is there
+    /// must match all the same.
+    #[serde(default = "defaults::yes", skip_serializing_if = "is_true")]
+    pub require_checksum: bool,
     /// Antenna in the body frame, forward-right-down, metres.
     #[serde(default)]
     pub antenna_position_m: [f64; 3],
@@ -41,6 +49,12 @@ pub struct GpsConfig {
     /// Configure a Garmin receiver at start: sentences, position averaging off, line speed.
     #[serde(default)]
     pub configure_garmin: bool,
+    /// Configure a u-blox receiver at start: line speed, rate, packets, sentences off.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub configure: bool,
+    /// Solutions a second that `configure` asks for.
+    #[serde(default = "defaults::gps_rate_hz")]
+    pub rate_hz: f64,
     /// Pulse-per-second device (`/dev/pps0`) that marks the receiver's seconds.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pps_device: Option<String>,
@@ -61,6 +75,10 @@ impl Default for GpsConfig {
             noise_m: defaults::gps_noise_m(),
             velocity_noise_mps: defaults::gps_velocity_noise_mps(),
             configure_garmin: false,
+            configure: false,
+            rate_hz: defaults::gps_rate_hz(),
+            framing: Framing::default(),
+            require_checksum: true,
             pps_device: None,
         }
     }
@@ -95,12 +113,22 @@ pub enum GpsFormat {
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CompassConfig {
-    /// Serial device, or `tcp://HOST:PORT`, `udp://ADDRESS:PORT` as for the receiver.
+    /// Serial device, or `tcp://HOST:PORT`, `udp://ADDRESS:PORT` as for the receiver. The receiver's own line where
+    /// the receiver tells the heading too.
     pub device: String,
     /// Line speed, bits a second.
     pub baud: u32,
     /// What the device speaks.
     pub format: CompassFormat,
+    /// Data bits, parity and stop bits of the serial line.
+    #[serde(default, skip_serializing_if = "Framing::is_default")]
+    pub framing: Framing,
+    /// Whether sentences must have a checksum, as of the receiver.
+    #[serde(default = "defaults::yes", skip_serializing_if = "is_true")]
+    pub require_checksum: bool,
+    /// Use the rates and forces it tells beside its attitude, as `[imu]` says.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub imu: bool,
     /// What it means by pitch and roll.
     #[serde(default)]
     pub angles: TiltConvention,
@@ -144,6 +172,9 @@ impl Default for CompassConfig {
             device: String::new(),
             baud: 38_400,
             format: CompassFormat::Nmea,
+            framing: Framing::default(),
+            require_checksum: true,
+            imu: false,
             angles: TiltConvention::default(),
             tilt: TiltKind::Inertial,
             declination_deg: None,
@@ -235,12 +266,28 @@ compass_formats! {
     Vectornav = "vectornav";
     /// Plain NMEA, and headings that receivers measure between antennas.
     Nmea = "nmea";
+    /// u-blox's packets: NAV-RELPOSNED.
+    Ubx = "ubx";
+    /// WitMotion's records.
+    Witmotion = "witmotion";
+    /// BNO08x in its UART-RVC mode: tilt, and no heading.
+    Bno08xRvc = "bno08x-rvc";
 }
 
 impl CompassFormat {
+    /// Whether a receiver tells its heading so, on the line of its fixes.
+    pub fn is_of_receivers(self) -> bool {
+        matches!(self, Self::Nmea | Self::Ubx)
+    }
+
+    /// Whether rates or forces come beside the attitude.
+    pub fn has_inertial(self) -> bool {
+        matches!(self, Self::Vectornav | Self::Witmotion)
+    }
+
     /// Whether the device sends lines of text.
     pub fn is_text(self) -> bool {
-        self != Self::Pni
+        !matches!(self, Self::Pni | Self::Ubx | Self::Witmotion | Self::Bno08xRvc)
     }
 }
 
@@ -407,8 +454,18 @@ pub struct Datum {
     pub height_m: f64,
 }
 
+fn is_true(value: &bool) -> bool {
+    *value
+}
+
 /// Defaults from data sheets; `config/windhover.toml` tells where each comes from.
 mod defaults {
+    pub(super) fn yes() -> bool {
+        true
+    }
+    pub(super) fn gps_rate_hz() -> f64 {
+        5.0
+    }
     pub(super) fn gps_latency_ms() -> f64 {
         120.0
     }

@@ -1,16 +1,19 @@
 //! What each format's sentences say.
 
+use nalgebra::Vector3;
+
 use super::*;
 use crate::sentence::framed;
+use crate::ubx::ubx_framed;
 
 fn said(format: CompassFormat, body: &str) -> Result<Option<CompassReading>, Refusal> {
     let framed = framed(body);
     let sentence = Sentence::of_line(framed.as_bytes())?;
     match reader(format) {
-        Reader::Sentences(read) | Reader::SentencesOrLong(read) | Reader::SentencesOrBare(read, _) => {
-            read(&sentence)
-        }
-        Reader::Packets => panic!("packets are no sentences"),
+        Reader::Sentences(read)
+        | Reader::SentencesOrBare(read, _)
+        | Reader::Receiver { sentence: read, .. } => read(&sentence),
+        Reader::Packets | Reader::Records(_) => panic!("these are no sentences"),
     }
 }
 
@@ -273,4 +276,147 @@ fn headings_between_antennas_are_true() {
     for body in ["PTNL,GGK,1,2", "PSAT,GBS,1,2", "PSSN,SNC,1"] {
         assert_eq!(said(CompassFormat::Nmea, body), Ok(None), "{body}");
     }
+}
+
+/// Everything a format makes of bytes.
+fn all(format: CompassFormat, bytes: &[u8]) -> (Vec<CompassReading>, DecodeCounts) {
+    let (mut decoder, mut out) = (CompassDecoder::new(format), Vec::new());
+    decoder.push(bytes, MonoTime::default(), &mut out);
+    decoder.flush(&mut out);
+    (out.iter().map(|heard| heard.reading).collect(), decoder.counts().clone())
+}
+
+/// NAV-RELPOSNED of this version with this heading, 1e-5 degrees, and these flags.
+fn relative(version: u8, heading: i32, flags: u32) -> Vec<u8> {
+    let mut payload = vec![0; 64];
+    payload[0] = version;
+    payload[24..28].copy_from_slice(&heading.to_le_bytes());
+    payload[60..].copy_from_slice(&flags.to_le_bytes());
+    ubx_framed(1, 0x3C, &payload)
+}
+
+#[test]
+fn ublox_tells_the_heading_between_its_antennas() {
+    let sentence =
+        (framed("GNGGA,150405.00,3842.2,N,00911.0,W,4,17,0.6,43.0,M,50.0,M,,") + "\r\n").into_bytes();
+    for format in [CompassFormat::Ubx, CompassFormat::Nmea] {
+        // Fix, relative position and heading valid, cycles known or not.
+        for flags in [0x117, 0x10D | 0x200] {
+            let bytes = [sentence.clone(), relative(1, 20_175_000, flags), sentence.clone()].concat();
+            let (out, counts) = all(format, &bytes);
+            assert!(
+                (out[0].heading_deg.expect("told") - 201.75).abs() < 1e-9 && out[0].heading_is_true,
+                "{counts}"
+            );
+            assert_eq!((out.len(), out[0].pitch_deg, counts.refused_total()), (1, None, 0), "{counts}");
+        }
+        // Each flag alone missing takes it.
+        for missing in [0x001, 0x004, 0x010, 0x100] {
+            let (out, counts) = all(format, &relative(1, 20_175_000, 0x115 & !missing));
+            assert_eq!(
+                (out[0].heading_deg, out[0].is_valid(), counts.flagged),
+                (None, false, 1),
+                "{missing:x}"
+            );
+        }
+        assert_eq!(all(format, &relative(1, 40_000_000, 0x117)).1.refused(Refusal::OutOfRange), 1);
+        // The eighth generation's packet is shorter and has no heading.
+        assert_eq!(all(format, &ubx_framed(1, 0x3C, &[0; 40])).1.ignored, 1);
+    }
+    let (out, counts) = all(CompassFormat::Ubx, &(framed("GNHDT,10.0,T") + "\r\n").into_bytes());
+    assert!(out.is_empty() && counts.noise_bytes > 0, "{counts}");
+}
+
+#[test]
+fn headings_of_sentences_beside_packets_are_read() {
+    let hpr = (framed("GNHPR,040400.00,201.75,+1.20,000.00,4,33,1.00,0004") + "\r\n").into_bytes();
+    let noise = ubx_framed(2, 0x15, &[b'$'; 300]);
+    let bytes: Vec<u8> = (0..5).flat_map(|_| [noise.clone(), hpr.clone()].concat()).collect();
+    let (out, counts) = all(CompassFormat::Nmea, &bytes);
+    assert_eq!((out.len(), counts.refused_total(), counts.ignored), (5, 0, 5), "{counts}");
+}
+
+/// A record of WitMotion's.
+fn wit(kind: u8, figures: [i16; 3]) -> Vec<u8> {
+    let mut record = vec![0x55, kind];
+    figures.iter().for_each(|figure| record.extend(figure.to_le_bytes()));
+    record.extend([0x12, 0x34]);
+    record.push(record.iter().fold(0u8, |sum, byte| sum.wrapping_add(*byte)));
+    record
+}
+
+/// Degrees as WitMotion's figure.
+fn steps(degrees: f64) -> i16 {
+    (degrees / 180.0 * 32_768.0).round() as i16
+}
+
+#[test]
+fn witmotion_tells_angles_rates_and_forces() {
+    let angles = |x: f64, y: f64, z: f64| wit(0x53, [steps(x), steps(y), steps(z)]);
+    for (bytes, wanted) in [
+        (angles(0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        (angles(0.0, 0.0, -90.0), (90.0, 0.0, 0.0)),
+        (angles(5.0, 0.0, 30.0), (330.0, 5.0, 0.0)),
+        (angles(0.0, -7.0, 0.0), (0.0, 0.0, -7.0)),
+    ] {
+        let (out, _) = all(CompassFormat::Witmotion, &bytes);
+        let told = (out[0].heading_deg, out[0].pitch_deg, out[0].roll_deg);
+        let near = |told: Option<f64>, wanted: f64| {
+            let off = told.expect("told") - wanted;
+            (off - 360.0 * (off / 360.0).round()).abs() < 0.01
+        };
+        assert!(
+            near(told.0, wanted.0) && near(told.1, wanted.1) && near(told.2, wanted.2),
+            "{told:?} {wanted:?}"
+        );
+    }
+    // At rest the force is up: one g about z. A turn to the right seen from above is negative about z.
+    let stream =
+        [wit(0x51, [0, 0, 2_048]), wit(0x52, [0, 0, -1_638]), wit(0x54, [1, 2, 3]), angles(0.0, 0.0, 0.0)];
+    let mut bytes = vec![0x55, 0x55, 0x53];
+    bytes.extend(stream.concat());
+    bytes.extend(angles(0.0, 0.0, 10.0));
+    let (out, counts) = all(CompassFormat::Witmotion, &bytes);
+    assert_eq!((out.len(), counts.used, counts.ignored, counts.noise_bytes), (2, 2, 3, 3), "{counts}");
+    let inertial = out[0].inertial.expect("told");
+    let (force, rate) = (inertial.force_mps2.expect("told"), inertial.rate_rps.expect("told"));
+    assert!((force.z + 9.806_65).abs() < 1e-9 && force.xy().norm() < 1e-9, "{force}");
+    assert!((rate.z.to_degrees() - 100.0).abs() < 0.05 && rate.xy().norm() < 1e-9, "{rate}");
+    assert_eq!(out[1].inertial, None, "what was told is used once");
+}
+
+#[test]
+fn bno08x_tells_tilt_and_a_yaw_that_is_no_heading() {
+    let record = |angles: [i16; 3]| {
+        let mut record = vec![0xAA, 0xAA, 0xDE];
+        angles.iter().for_each(|angle| record.extend(angle.to_le_bytes()));
+        record.extend([0x00, 0x00, 0x00, 0x00, 0xE8, 0x03, 0, 0, 0]);
+        record.push(record[2..].iter().fold(0u8, |sum, byte| sum.wrapping_add(*byte)));
+        record
+    };
+    let mut damaged = record([100, 200, 300]);
+    damaged[7] ^= 1;
+    let bytes = [vec![0xAA], record([-9_000, 250, -1_050]), damaged, record([0, 0, 0])].concat();
+    let (mut decoder, mut heard) = (CompassDecoder::new(CompassFormat::Bno08xRvc), Vec::new());
+    decoder.push(&bytes, MonoTime::default(), &mut heard);
+    let (first, counts) = (heard[0], decoder.counts());
+    let near = |told: Option<f64>, wanted: f64| (told.expect("told") - wanted).abs() < 1e-9;
+    assert!(near(first.reading.heading_deg, 270.0) && near(first.reading.pitch_deg, 2.5));
+    assert!(near(first.reading.roll_deg, -10.5) && first.reading.is_valid());
+    assert_eq!((first.sample.heading, first.sample.tilt.is_some()), (None, true), "yaw begins anywhere");
+    assert_eq!((heard.len(), counts.refused(Refusal::BadChecksum) > 0), (2, true), "{counts}");
+    assert!(all(CompassFormat::Bno08xRvc, &record([20_000, 0, 0])).1.refused(Refusal::OutOfRange) > 0);
+}
+
+#[test]
+fn vectornav_tells_rates_and_forces() {
+    let told = |body: &str| said(CompassFormat::Vectornav, body).expect("sound").expect("told").inertial;
+    let vnymr =
+        "VNYMR,+085.123,-000.900,+000.800,+01.06,-00.25,+03.06,+00.005,+00.344,-09.758,-0.001,+0.002,-0.003";
+    let inertial = told(vnymr).expect("told");
+    assert_eq!(inertial.force_mps2, Some(Vector3::new(0.005, 0.344, -9.758)));
+    assert_eq!(inertial.rate_rps, Some(Vector3::new(-0.001, 0.002, -0.003)));
+    let vnqmr = "VNQMR,0,0,0,1,1.0,2.0,3.0,0.1,0.2,-9.8,0.01,0.02,0.03";
+    assert_eq!(told(vnqmr).expect("told").rate_rps, Some(Vector3::new(0.01, 0.02, 0.03)));
+    assert_eq!((told("VNYPR,+085.1,-000.9,+000.8"), told("VNYMR,1,2,3,,,,,,,,,")), (None, None));
 }

@@ -14,13 +14,16 @@ mod os5000;
 mod pashr;
 mod pni;
 mod reading;
+mod records;
 mod revolution;
+mod rvc;
 mod tagged;
 mod tcm2;
 #[cfg(test)]
 mod tests;
 mod together;
 mod vectornav;
+mod witmotion;
 
 pub use reading::{CompassReading, HeardAttitude};
 
@@ -29,7 +32,9 @@ use windhover_base::time::MonoTime;
 
 use crate::counts::{DecodeCounts, Refusal};
 use crate::lines::{LineFramer, LineStart};
-use crate::sentence::Sentence;
+use crate::sentence::{Checksums, Sentence};
+use crate::ubx::{Piece, Splitter, relative_heading};
+use records::{RecordForm, RecordFramer};
 use together::Together;
 
 /// What a sentence with a sound checksum says.
@@ -42,12 +47,15 @@ type ReadLine = fn(&[u8]) -> Result<Option<CompassReading>, Refusal>;
 enum Reader {
     /// Sentences `$…*HH`.
     Sentences(ReadSentence),
-    /// Sentences, and long messages `#…*CRC`.
-    SentencesOrLong(ReadSentence),
+    /// What a receiver says of the line between its antennas: sentences, long messages `#…*CRC` and packets of u-blox.
+    /// Without text: packets alone.
+    Receiver { sentence: ReadSentence, has_text: bool },
     /// Sentences, and lines without frame and checksum of a device that never sends one.
     SentencesOrBare(ReadSentence, ReadLine),
     /// Binary packets of PNI.
     Packets,
+    /// Binary records of a fixed length.
+    Records(RecordForm),
 }
 
 /// The table of formats.
@@ -60,7 +68,10 @@ const fn reader(format: CompassFormat) -> Reader {
         CompassFormat::Pni => Reader::Packets,
         CompassFormat::Pashr => Reader::Sentences(pashr::read),
         CompassFormat::Vectornav => Reader::Sentences(vectornav::read),
-        CompassFormat::Nmea => Reader::SentencesOrLong(nmea::read),
+        CompassFormat::Nmea => Reader::Receiver { sentence: nmea::read, has_text: true },
+        CompassFormat::Ubx => Reader::Receiver { sentence: nmea::read, has_text: false },
+        CompassFormat::Witmotion => Reader::Records(witmotion::FORM),
+        CompassFormat::Bno08xRvc => Reader::Records(rvc::FORM),
     }
 }
 
@@ -75,7 +86,20 @@ pub struct CompassDecoder {
 #[derive(Clone, Debug)]
 enum Input {
     Text(Box<TextInput>),
+    Receiver(Box<ReceiverInput>),
     Packets(pni::PacketFramer),
+    Records(RecordFramer),
+}
+
+impl Input {
+    /// What puts sentences together, where there are any.
+    fn together(&mut self) -> Option<&mut Together> {
+        match self {
+            Self::Text(text) => Some(&mut text.together),
+            Self::Receiver(receiver) => Some(&mut receiver.text.together),
+            Self::Packets(_) | Self::Records(_) => None,
+        }
+    }
 }
 
 #[derive(Clone, Debug)]
@@ -83,9 +107,49 @@ struct TextInput {
     lines: LineFramer,
     sentence: ReadSentence,
     bare: Option<ReadLine>,
-    /// Whether the device was seen to send checksums: then a line without one is damaged.
+    checksums: Checksums,
+    /// Whether the device was seen to send checksums: then a bare line is damaged.
     has_checksums: bool,
     together: Together,
+}
+
+/// A receiver's line: packets of u-blox, and what is outside them.
+#[derive(Clone, Debug)]
+struct ReceiverInput {
+    splitter: Splitter,
+    text: TextInput,
+    /// Whether what is outside packets is read.
+    has_text: bool,
+}
+
+impl ReceiverInput {
+    fn push(
+        &mut self,
+        bytes: &[u8],
+        t_recv: MonoTime,
+        counts: &mut DecodeCounts,
+        out: &mut Vec<HeardAttitude>,
+    ) {
+        let Self { splitter, text, has_text } = self;
+        splitter.push(bytes, 0, t_recv, counts, &mut |piece, counts| match piece {
+            Piece::Outside(bytes, after) if *has_text => text.push(bytes, after, t_recv, counts, out),
+            Piece::Outside(bytes, _) => counts.noise_bytes += bytes.len() as u64,
+            Piece::Packet(packet, span) => match relative_heading(packet) {
+                Ok(Some(heading_deg)) => {
+                    let flagged = heading_deg.is_none();
+                    let reading = CompassReading {
+                        heading_deg,
+                        heading_is_true: true,
+                        flagged,
+                        ..CompassReading::default()
+                    };
+                    text.together.whole(reading, span, counts, out);
+                }
+                Ok(None) => counts.ignored += 1,
+                Err(why) => counts.refuse(why),
+            },
+        });
+    }
 }
 
 impl TextInput {
@@ -94,6 +158,7 @@ impl TextInput {
             lines: LineFramer::new(start),
             sentence,
             bare,
+            checksums: Checksums::REQUIRED,
             has_checksums: false,
             together: Together::default(),
         }
@@ -102,12 +167,13 @@ impl TextInput {
     fn push(
         &mut self,
         bytes: &[u8],
+        after: usize,
         t_recv: MonoTime,
         counts: &mut DecodeCounts,
         out: &mut Vec<HeardAttitude>,
     ) {
-        let Self { lines, sentence: read, bare, has_checksums, together } = self;
-        lines.push(bytes, 0, t_recv, counts, |line, counts| {
+        let Self { lines, sentence: read, bare, checksums, has_checksums, together } = self;
+        lines.push(bytes, after, t_recv, counts, |line, counts| {
             if line.text.starts_with(b"#") && bare.is_none() {
                 return match long_ascii::read(line.text) {
                     Ok(Some(reading)) => together.whole(reading, line.span, counts, out),
@@ -115,19 +181,18 @@ impl TextInput {
                     Err(why) => counts.refuse(why),
                 };
             }
-            if line.text.contains(&b'*') {
-                *has_checksums = true;
-            } else if *has_checksums || bare.is_none() {
-                return counts.refuse(Refusal::NoChecksum);
-            }
+            *has_checksums |= line.text.contains(&b'*');
             if let Some(bare) = bare.filter(|_| !line.text.starts_with(b"$")) {
+                if *has_checksums && !line.text.contains(&b'*') {
+                    return counts.refuse(Refusal::NoChecksum);
+                }
                 return match bare(line.text) {
                     Ok(Some(reading)) => together.whole(reading, line.span, counts, out),
                     Ok(None) => counts.ignored += 1,
                     Err(why) => counts.refuse(why),
                 };
             }
-            let sentence = match Sentence::of_line(line.text) {
+            let sentence = match checksums.sentence(line.text) {
                 Ok(sentence) => sentence,
                 Err(why) => return counts.refuse(why),
             };
@@ -154,32 +219,50 @@ impl CompassDecoder {
         let text = |start, read, bare| Input::Text(Box::new(TextInput::new(start, read, bare)));
         let input = match reader(format) {
             Reader::Sentences(read) => text(LineStart::Dollar, read, None),
-            Reader::SentencesOrLong(read) => text(LineStart::DollarOrHash, read, None),
+            Reader::Receiver { sentence, has_text } => {
+                let text = TextInput::new(LineStart::DollarOrHash, sentence, None);
+                Input::Receiver(Box::new(ReceiverInput { splitter: Splitter::default(), text, has_text }))
+            }
             Reader::SentencesOrBare(read, bare) => text(LineStart::Any, read, Some(bare)),
             Reader::Packets => Input::Packets(pni::PacketFramer::default()),
+            Reader::Records(form) => Input::Records(RecordFramer::new(form)),
         };
         Self { counts: DecodeCounts::default(), input }
+    }
+
+    /// The same for a device whose sentences may come without checksums.
+    #[must_use]
+    pub fn checksums_required(mut self, required: bool) -> Self {
+        let text = match &mut self.input {
+            Input::Text(text) => &mut **text,
+            Input::Receiver(receiver) => &mut receiver.text,
+            Input::Packets(_) | Input::Records(_) => return self,
+        };
+        text.checksums = if required { Checksums::REQUIRED } else { Checksums::OPTIONAL };
+        self
     }
 
     /// Takes the bytes one read returned at `t_recv`; appends the samples they complete to `out`.
     pub fn push(&mut self, bytes: &[u8], t_recv: MonoTime, out: &mut Vec<HeardAttitude>) {
         match &mut self.input {
-            Input::Text(text) => text.push(bytes, t_recv, &mut self.counts, out),
+            Input::Text(text) => text.push(bytes, 0, t_recv, &mut self.counts, out),
+            Input::Receiver(receiver) => receiver.push(bytes, t_recv, &mut self.counts, out),
+            Input::Records(records) => records.push(bytes, t_recv, &mut self.counts, out),
             Input::Packets(packets) => packets.push(bytes, t_recv, &mut self.counts, out),
         }
     }
 
     /// Time passed: gives out an open reading the device has fallen silent after.
     pub fn tick(&mut self, now: MonoTime, out: &mut Vec<HeardAttitude>) {
-        if let Input::Text(text) = &mut self.input {
-            text.together.tick(now, &mut self.counts, out);
+        if let Some(together) = self.input.together() {
+            together.tick(now, &mut self.counts, out);
         }
     }
 
     /// The stream has ended: gives out what is open.
     pub fn flush(&mut self, out: &mut Vec<HeardAttitude>) {
-        if let Input::Text(text) = &mut self.input {
-            text.together.close(&mut self.counts, out);
+        if let Some(together) = self.input.together() {
+            together.close(&mut self.counts, out);
         }
     }
 

@@ -25,7 +25,7 @@ fn pashr(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
         heading_is_true: sentence.field(3) == "T",
         roll_deg: tilt(sentence.field(4))?,
         pitch_deg: tilt(sentence.field(5))?,
-        flagged: false,
+        ..CompassReading::default()
     };
     if sentence.field(10) == "0" {
         reading.heading_deg = None;

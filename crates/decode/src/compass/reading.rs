@@ -1,7 +1,7 @@
 //! Readings of a compass, and when they came.
 
 use windhover_base::geo::Tilt;
-use windhover_base::msg::AttitudeSample;
+use windhover_base::msg::{AttitudeSample, InertialSample};
 use windhover_base::time::MonoTime;
 
 use crate::counts::DecodeCounts;
@@ -14,12 +14,16 @@ pub struct CompassReading {
     pub heading_deg: Option<f64>,
     /// Whether the heading is already true.
     pub heading_is_true: bool,
+    /// Whether the heading is counted from an arbitrary direction, so that it is none.
+    pub heading_is_free: bool,
     /// Pitch, nose up positive.
     pub pitch_deg: Option<f64>,
     /// Roll, right side down positive.
     pub roll_deg: Option<f64>,
     /// Whether the device's own flags made something of this reading invalid.
     pub flagged: bool,
+    /// Rates of turn and specific forces beside it, in the device's axes forward, right, down.
+    pub inertial: Option<InertialSample>,
 }
 
 impl CompassReading {
@@ -27,7 +31,7 @@ impl CompassReading {
     pub fn sample(&self) -> AttitudeSample {
         let tilt = self.pitch_deg.zip(self.roll_deg);
         AttitudeSample {
-            heading: self.heading_deg.map(f64::to_radians),
+            heading: self.heading_deg.filter(|_| !self.heading_is_free).map(f64::to_radians),
             heading_is_true: self.heading_is_true,
             tilt: tilt.map(|(pitch, roll)| Tilt { pitch: pitch.to_radians(), roll: roll.to_radians() }),
         }

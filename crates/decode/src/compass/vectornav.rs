@@ -1,15 +1,19 @@
 //! VectorNav's ASCII messages: yaw, pitch, roll (`$VNYPR`, `$VNYMR`, `$VNYBA`, `$VNYIA`), a quaternion (`$VNQTN`,
-//! `$VNQMR`), or an inertial solution (`$VNINS`, whose yaw is true). Angles are 3-2-1 from the tangent plane to
+//! `$VNQMR`; with `$VNYMR` rates and forces), or an inertial solution (`$VNINS`, whose yaw is true). Angles are 3-2-1 from the tangent plane to
 //! the device, yaw from −180 to 180 degrees. Source: VectorNav's manuals.
 
-use nalgebra::{Quaternion, UnitQuaternion};
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
 use super::fields::tilt;
 use super::nmea;
 use super::reading::CompassReading;
 use crate::counts::Refusal;
 use crate::sentence::Sentence;
+use windhover_base::msg::InertialSample;
 
+/// Largest force, m/s², and rate, rad/s, that any of their sensors measures.
+const FORCE_MAX: f64 = 1_000.0;
+const RATE_MAX: f64 = 100.0;
 /// How far a quaternion's length may be off one.
 const UNIT_OFF: f64 = 0.01;
 /// Modes of the inertial solution (bits 0 and 1 of its status) in which it aligns or follows.
@@ -18,12 +22,27 @@ const INS_MODES: std::ops::RangeInclusive<u16> = 1..=2;
 /// What a sentence says; `None` where it says nothing of attitude.
 pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
     match sentence.address() {
-        "VNYPR" | "VNYMR" | "VNYBA" | "VNYIA" => angles(sentence, 1).map(Some),
-        "VNQTN" | "VNQMR" => quaternion(sentence).map(Some),
+        "VNYPR" | "VNYBA" | "VNYIA" => angles(sentence, 1).map(Some),
+        "VNYMR" => Ok(Some(CompassReading { inertial: inertial_at(sentence, 7)?, ..angles(sentence, 1)? })),
+        "VNQTN" => quaternion(sentence).map(Some),
+        "VNQMR" => Ok(Some(CompassReading { inertial: inertial_at(sentence, 8)?, ..quaternion(sentence)? })),
         "VNINS" => inertial(sentence).map(Some),
         address if address.starts_with("VN") => Ok(None),
         _ => nmea::read(sentence),
     }
+}
+
+/// Specific force, m/s², and rates, rad/s, in the device's axes forward, right, down. `None` where they are not there.
+fn inertial_at(sentence: &Sentence<'_>, first: usize) -> Result<Option<InertialSample>, Refusal> {
+    let three = |at: usize, most: f64| {
+        let axis = |index| sentence.number(at + index, -most, most);
+        Ok::<_, Refusal>(match (axis(0)?, axis(1)?, axis(2)?) {
+            (Some(x), Some(y), Some(z)) => Some(Vector3::new(x, y, z)),
+            _ => None,
+        })
+    };
+    let (force_mps2, rate_rps) = (three(first, FORCE_MAX)?, three(first + 3, RATE_MAX)?);
+    Ok((force_mps2.is_some() || rate_rps.is_some()).then_some(InertialSample { rate_rps, force_mps2 }))
 }
 
 fn angles(sentence: &Sentence<'_>, first: usize) -> Result<CompassReading, Refusal> {

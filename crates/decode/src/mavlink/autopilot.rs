@@ -37,6 +37,7 @@ pub struct HeardAutopilot {
 
 /// What an autopilot says.
 #[derive(Clone, Copy, PartialEq, Debug)]
+#[expect(clippy::large_enum_variant, reason = "a value at a time, handed on")]
 pub enum AutopilotSaid {
     /// Attitude, its heading true.
     Attitude(AttitudeSample),
@@ -259,6 +260,7 @@ impl AutopilotDecoder {
         let t = self.clock.host(boot).unwrap_or(t);
         let kind = fix_kind(fix.fix_type);
         let metres = |mm: u32| (mm > 0 && mm < u32::MAX).then(|| f64::from(mm) * 1e-3);
+        let (across, up) = (metres(fix.h_acc), metres(fix.v_acc));
         let (speed, course) = (known(fix.vel).map(|v| v * 1e-2), known(fix.cog).map(|c| c * 1e-2));
         let velocity = speed.zip(course).map(|(v, course_deg)| {
             let (s, c) = course_deg.to_radians().sin_cos();
@@ -279,8 +281,13 @@ impl AutopilotDecoder {
             speed_mps: speed.filter(|_| there),
             course_deg: course.filter(|_| there),
             vel_ned_mps: velocity.filter(|_| there),
-            hpe_m: metres(fix.h_acc),
-            vpe_m: metres(fix.v_acc),
+            hpe_m: across,
+            vpe_m: up,
+            position_sigma_m: across
+                .zip(up)
+                .map(|(across, up)| Vector3::new(across, across, up))
+                .filter(|_| there),
+            velocity_sigma_mps: metres(fix.vel_acc).map(Vector3::repeat).filter(|_| there),
             sats: (fix.satellites_visible != u8::MAX).then(|| fix.satellites_visible.into()),
             hdop: known(fix.eph).map(|dop| dop * 1e-2),
             ..GnssEpoch::default()

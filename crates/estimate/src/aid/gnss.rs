@@ -33,7 +33,7 @@ pub(crate) fn velocity(epoch: &GnssEpoch) -> Option<GpsVelocity> {
     };
     let ned_mps = epoch.vel_ned_mps.or_else(from_course).filter(|_| epoch.fix != FixKind::None);
     let has_down = epoch.vel_ned_mps.is_some() && epoch.vel_has_down;
-    ned_mps.map(|ned_mps| GpsVelocity { ned_mps, has_down })
+    ned_mps.map(|ned_mps| GpsVelocity { ned_mps, has_down, sigma_mps: epoch.velocity_sigma_mps })
 }
 
 impl GpsPosition {
@@ -62,7 +62,7 @@ pub(crate) fn fuse(core: &mut Core, epoch: &GnssEpoch) {
     }
     match position(epoch, &core.models) {
         Some(position) if position.is_credible() => {
-            core.sense_fix(epoch.fix);
+            core.sense_fix(epoch.fix, epoch.position_sigma_m);
             position.fuse(core);
         }
         Some(_) => core.refuse(FusionSource::GpsPosition, Disposition::Invalid),

@@ -19,6 +19,8 @@ use crate::state::State;
 pub(crate) struct GpsVelocity {
     pub(crate) ned_mps: Vector3<f64>,
     pub(crate) has_down: bool,
+    /// One-sigma as the receiver puts it; what is configured holds where that is more.
+    pub(crate) sigma_mps: Option<Vector3<f64>>,
 }
 
 /// Fixes the fitted noise of the receiver remembers: ten seconds at 5 Hz.
@@ -49,7 +51,8 @@ impl Aid for GpsVelocity {
         z.block(own::DRAG, &(force.d_drag * -tau));
         for i in 0..z.m {
             z.residual[i] = self.ned_mps[i] - expected[i];
-            z.noise[i][i] = models.gps_velocity_var * state.learnt.gps_velocity_factor;
+            let told_var = self.sigma_mps.map_or(0.0, |sigma| sigma[i].powi(2));
+            z.noise[i][i] = models.gps_velocity_var.max(told_var) * state.learnt.gps_velocity_factor;
         }
         Ok(())
     }

@@ -15,6 +15,7 @@ use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 
 /// One measurement as the pipeline hands it over.
 #[derive(Clone)]
+#[expect(clippy::large_enum_variant, reason = "a value at a time, handed on")]
 pub(super) enum Heard {
     Gnss(Stamped<GnssEpoch>),
     Attitude(Stamped<AttitudeSample>),

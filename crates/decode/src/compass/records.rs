@@ -1,0 +1,101 @@
+//! Records of a fixed length behind a mark, with a sum of their bytes at the end: WitMotion's and the BNO08x's.
+
+use std::collections::VecDeque;
+
+use super::reading::{CompassReading, HeardAttitude, heard};
+use crate::counts::{DecodeCounts, Refusal};
+use crate::lines::LineSpan;
+use windhover_base::time::MonoTime;
+
+/// How the records of a device look, and what is made of one.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct RecordForm {
+    /// Bytes that begin a record.
+    pub mark: &'static [u8],
+    /// Length with mark and sum.
+    pub length: usize,
+    /// Index of the first byte that is summed: up to the last but one, modulo 256.
+    pub summed_from: usize,
+    /// Takes a record in; `None` where it says nothing of attitude alone.
+    pub read: fn(&[u8], &mut Gathered) -> Result<Option<CompassReading>, Refusal>,
+}
+
+/// What came in records before the one that tells the attitude.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Gathered {
+    /// Specific force, device axes as the form gives them, forward-right-down, m/s².
+    pub force_mps2: Option<[f64; 3]>,
+    /// Rates of turn, the same axes, rad/s.
+    pub rate_rps: Option<[f64; 3]>,
+}
+
+/// Collects bytes into records.
+#[derive(Clone, Debug)]
+pub(super) struct RecordFramer {
+    form: RecordForm,
+    buffer: VecDeque<u8>,
+    gathered: Gathered,
+}
+
+impl RecordFramer {
+    pub(super) fn new(form: RecordForm) -> Self {
+        Self { form, buffer: VecDeque::with_capacity(form.length), gathered: Gathered::default() }
+    }
+
+    /// Takes the bytes of one read; appends the samples they complete.
+    pub(super) fn push(
+        &mut self,
+        bytes: &[u8],
+        t_recv: MonoTime,
+        counts: &mut DecodeCounts,
+        out: &mut Vec<HeardAttitude>,
+    ) {
+        for (index, &byte) in bytes.iter().enumerate() {
+            self.buffer.push_back(byte);
+            if !self.is_record(counts) {
+                continue;
+            }
+            let record: Vec<u8> = self.buffer.drain(..).collect();
+            let bytes_after = bytes.len() - 1 - index;
+            let span = LineSpan { t_last: t_recv, bytes_after, bytes: record.len(), ..LineSpan::default() };
+            match (self.form.read)(&record, &mut self.gathered) {
+                Ok(Some(reading)) => {
+                    counts.used += 1;
+                    out.push(heard(reading, span, span, counts));
+                }
+                Ok(None) => counts.ignored += 1,
+                Err(why) => counts.refuse(why),
+            }
+        }
+    }
+
+    /// Whether the buffer is a whole sound record; what cannot begin one is dropped.
+    fn is_record(&mut self, counts: &mut DecodeCounts) -> bool {
+        loop {
+            let begun = self.buffer.iter().zip(self.form.mark).all(|(byte, mark)| byte == mark);
+            if begun && self.buffer.len() < self.form.length {
+                return false;
+            }
+            if begun && self.sum_is_right() {
+                return true;
+            }
+            if begun {
+                counts.refuse(Refusal::BadChecksum);
+            }
+            counts.noise_bytes += 1;
+            self.buffer.pop_front();
+        }
+    }
+
+    fn sum_is_right(&self) -> bool {
+        let summed = self.buffer.range(self.form.summed_from..self.form.length - 1);
+        let sum = summed.fold(0u8, |sum, byte| sum.wrapping_add(*byte));
+        self.buffer.back() == Some(&sum)
+    }
+}
+
+/// The signed figure of two bytes at `index`, low byte first.
+pub(super) fn figure(record: &[u8], index: usize) -> f64 {
+    let byte = |at: usize| record.get(at).copied().unwrap_or(0);
+    f64::from(i16::from_le_bytes([byte(index), byte(index + 1)]))
+}
