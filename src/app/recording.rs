@@ -52,6 +52,7 @@ pub fn whole(flight: &Flight) -> windhover_refine::Recording {
         epochs: gnss,
         readings: attitude,
         frames: flight.detections.iter().map(frame).collect(),
+        positions: Vec::new(),
     }
 }
 

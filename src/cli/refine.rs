@@ -1,4 +1,4 @@
-//! `windhover refine FLIGHT [--out FILE] [--adopt] [--truth TRUTH.csv]`
+//! `windhover refine FLIGHT… [--out FILE] [--adopt] [--positions FILE] [--truth TRUTH.csv]`
 
 use std::path::PathBuf;
 
@@ -7,7 +7,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::{CliError, CliResult, place};
 use crate::app::flight::Flight;
 use crate::app::refine::{
-    RefineFlightError, RefinedFlight, adopted, beside, constant_words, refine_flight, source_name,
+    RefineFlightError, RefinedFlight, adopted, beside, constant_words, refine_flights, source_name,
 };
 use crate::app::replay::ReplayError;
 use crate::app::report;
@@ -27,28 +27,44 @@ use crate::text::one_line;
   windhover refine flight.mcap                              # flight.refined.mcap
   windhover refine flight.mcap --adopt                      # and TOML of what the flight settles
   windhover refine flight.mcap --truth flight.truth.csv --out refined.mcap
+  windhover refine monday.mcap tuesday.mcap                 # two flights over the same markers, with constants in common
+  windhover refine flight.mcap --positions base.pos         # with a base station's solution (RTKLIB, GPX, CSV)
   windhover export refined.mcap --format csv                # refined.csv among the tables")]
 pub(super) struct Args {
-    /// Flight: an .mcap file, or a directory of segments
-    flight: PathBuf,
-    /// What is written [default: FLIGHT.refined.mcap beside the flight]
+    /// Flights: .mcap files, or directories of segments; several are of the same vehicles and configuration
+    #[arg(required = true, value_name = "FLIGHT")]
+    flights: Vec<PathBuf>,
+    /// What is written, of one flight [default: FLIGHT.refined.mcap beside each flight]
     #[arg(long)]
     out: Option<PathBuf>,
     /// Print, as TOML to paste, what the flight settles of its configuration (beyond three sigmas)
     #[arg(long)]
     adopt: bool,
-    /// Compare with true positions: CSV as `windhover report` takes it
+    /// Positions of the antenna from outside: RTKLIB's .pos, a .gpx track, or .csv with time_ns or utc, lat_deg, lon_deg,
+    /// height_m (above the ellipsoid), sigma_m
+    #[arg(long, value_name = "FILE")]
+    positions: Option<PathBuf>,
+    /// Compare the first flight with true positions: CSV as `windhover report` takes it
     #[arg(long, value_name = "TRUTH.csv")]
     truth: Option<PathBuf>,
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
-    let to = args.out.clone().unwrap_or_else(|| beside(&args.flight));
-    let inputs = Inputs::of([Some(args.flight.as_path()), args.truth.as_deref()].into_iter().flatten());
-    place::check(&to, &inputs, &Maker::Refine.marks())?;
+    if args.out.is_some() && args.flights.len() > 1 {
+        return Err(CliError::usage(
+            "--out names one file: of several flights each result stands beside its flight",
+        ));
+    }
+    let outs: Vec<PathBuf> = match &args.out {
+        Some(out) => vec![out.clone()],
+        None => args.flights.iter().map(|flight| beside(flight)).collect(),
+    };
+    let read = args.flights.iter().chain(&args.truth).chain(&args.positions);
+    let inputs = Inputs::of(read.map(PathBuf::as_path));
+    outs.iter().try_for_each(|out| place::check(out, &inputs, &Maker::Refine.marks()))?;
     let truth = args.truth.as_deref().map(Truth::read).transpose()?;
     let bar = progress_bar();
-    let done = refine_flight(&args.flight, &mut |share| {
+    let done = refine_flights(&args.flights, args.positions.as_deref(), &mut |share| {
         bar.set_position((share * STEPS as f64) as u64);
         true
     });
@@ -59,20 +75,21 @@ pub(super) fn run(args: &Args) -> CliResult {
         }
         other => CliError::failed(other),
     })?;
-    done.write(&args.flight, &to)?;
-    for warning in done.flight.warnings.iter().chain(&done.remarks) {
-        note!("windhover: {}", one_line(warning));
+    for ((done, from), to) in done.iter().zip(&args.flights).zip(&outs) {
+        done.write(from, to)?;
+        for warning in done.flight.warnings.iter().chain(&done.remarks) {
+            note!("windhover: {}", one_line(warning));
+        }
     }
-    if args.adopt {
-        print_adopted(&done)?;
-    } else {
-        print_found(&done)?;
+    // Constants are common to all flights.
+    if let Some(first) = done.first() {
+        if args.adopt { print_adopted(first)? } else { print_found(first)? }
     }
-    if let Some(truth) = &truth {
-        let table = report::error_text(&Flight::read(&to)?, truth);
+    if let (Some(truth), Some(first)) = (&truth, outs.first()) {
+        let table = report::error_text(&Flight::read(first)?, truth);
         out!("\n{}", table.unwrap_or_else(|| "nothing to compare with the truth\n".to_owned()))?;
     }
-    note!("wrote {}", to.display());
+    outs.iter().for_each(|to| note!("wrote {}", to.display()));
     Ok(())
 }
 

@@ -29,6 +29,10 @@ pub enum Source {
     Drive(usize),
     /// How a target turns.
     Turn(usize),
+    /// Positions from outside.
+    Outside,
+    /// What is finer than a gust in the helicopter's velocity.
+    Vibration,
     /// What has figures that are not fitted.
     Known,
 }
@@ -44,7 +48,13 @@ impl Source {
                 | Self::Tilt
                 | Self::Marker(_)
                 | Self::Feature
+                | Self::Outside
         )
+    }
+
+    /// Whether it is motion whose figure changes with time: driving on and turning in are other things than standing still.
+    pub(crate) const fn is_local(self) -> bool {
+        matches!(self, Self::TiltMotion | Self::YawMotion | Self::Drive(_) | Self::Turn(_))
     }
 
     /// Where its figure stands.
@@ -60,15 +70,17 @@ impl Source {
             Self::Gust => 7,
             Self::Thrust => 8,
             Self::Known => 9,
-            Self::Marker(target) => 10 + 3 * target,
-            Self::Drive(target) => 11 + 3 * target,
-            Self::Turn(target) => 12 + 3 * target,
+            Self::Vibration => 10,
+            Self::Outside => 11,
+            Self::Marker(target) => 12 + 3 * target,
+            Self::Drive(target) => 13 + 3 * target,
+            Self::Turn(target) => 14 + 3 * target,
         }
     }
 
     /// How many there are with so many targets.
     pub(crate) const fn count(targets: usize) -> usize {
-        10 + 3 * targets
+        12 + 3 * targets
     }
 }
 
@@ -126,19 +138,35 @@ impl Block {
 
 /// Variances, or intensities, by source: factors on what is configured of measurements, figures of motion.
 #[derive(Clone, Debug)]
-pub(crate) struct Noise(Vec<f64>);
+pub(crate) struct Noise {
+    figures: Vec<f64>,
+    /// By source, factors on its figure in each window of time: none where it is the same at all times.
+    local: Vec<Vec<f64>>,
+}
 
 impl Noise {
     pub(crate) fn new(targets: usize) -> Self {
-        Self(vec![1.0; Source::count(targets)])
+        let n = Source::count(targets);
+        Self { figures: vec![1.0; n], local: vec![Vec::new(); n] }
     }
 
     pub(crate) fn of(&self, source: Source) -> f64 {
-        self.0[source.index()]
+        self.figures[source.index()]
+    }
+
+    /// The figure in a window of time.
+    pub(crate) fn at(&self, source: Source, window: usize) -> f64 {
+        self.of(source) * self.local[source.index()].get(window).unwrap_or(&1.0)
+    }
+
+    /// Puts a source's figures in the windows of time, one behind the other.
+    pub(crate) fn set_local(&mut self, source: Source, figures: &[f64]) {
+        let whole = self.of(source);
+        self.local[source.index()] = figures.iter().map(|figure| figure / whole).collect();
     }
 
     pub(crate) fn set(&mut self, source: Source, value: f64) {
-        self.0[source.index()] = value;
+        self.figures[source.index()] = value;
     }
 }
 

@@ -104,7 +104,7 @@ fn rows_are_the_derivatives_of_what_is_left_over() {
         let blocks = left_over(&mut pass, k, &values, &noise);
         for column in 0..problem.shape.len() {
             let constant = column.checked_sub(problem.shape.constants_at());
-            if constant.is_some_and(|i| problem.priors[i].sigma == 0.0) {
+            if constant.is_some_and(|i| !problem.priors[i].is_estimated()) {
                 continue;
             }
             let more = left_over(&mut pass, k, &moved(&problem, &values, k, column, STEP), &noise);

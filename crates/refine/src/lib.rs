@@ -20,7 +20,7 @@ mod unknowns;
 mod values;
 
 pub use block::Source;
-pub use recording::Recording;
+pub use recording::{OutsidePosition, Recording};
 pub use refine::{RefineError, refine};
 pub use told::{Constant, Outlier, Refined, Tally};
 pub use unknowns::ConstantKind;

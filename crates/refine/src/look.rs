@@ -1,8 +1,10 @@
 //! A pass with covariances: the whole problem opened backward, what is left over of each measurement, and the estimates.
 
+use std::collections::BTreeMap;
+
 use nalgebra::{SMatrix, UnitQuaternion};
 
-use windhover_base::msg::{Ownship, TargetEstimate, TrackStatus};
+use windhover_base::msg::{MarkerId, Ownship, TargetEstimate, TrackStatus};
 use windhover_estimate::Site;
 
 use crate::block::{Block, Noise, Source};
@@ -19,6 +21,8 @@ use crate::values::Values;
 pub(crate) struct Looked {
     pub(crate) components: Components,
     pub(crate) refined: Refined,
+    /// How long errors of pixels last.
+    pub(crate) memory: PixelMemory,
     /// Of each landmark: sightings, and those outside the gate.
     pub(crate) landmarks: Vec<(usize, usize)>,
 }
@@ -34,8 +38,9 @@ pub(crate) fn look(
 ) -> Looked {
     let problem = pass.problem;
     let mut looked = Looked {
-        components: Components::new(problem.targets),
+        components: Components::new(problem.targets, problem.plan.windows),
         refined: Refined::default(),
+        memory: PixelMemory::default(),
         landmarks: vec![(0, 0); problem.plan.landmarks],
     };
     let mut counts = vec![(0usize, 0usize); Source::count(problem.targets)];
@@ -48,7 +53,7 @@ pub(crate) fn look(
             What::Knot(k) => {
                 let stop = &problem.plan.stops[*k];
                 pass.blocks(*k, values, noise, &mut |origin: Origin, block: &Block| {
-                    looked.take(origin, block, &back, problem, *k, &mut counts);
+                    looked.take(origin, block, &back, problem, (*k, noise), &mut counts);
                 });
                 let own = ownship(problem, values, &back, *k, site, recordings);
                 looked.refined.own.push((stop.flight, own));
@@ -74,7 +79,7 @@ impl Looked {
         block: &Block,
         back: &Back,
         problem: &Problem<'_>,
-        k: usize,
+        (k, noise): (usize, &Noise),
         counts: &mut [(usize, usize)],
     ) {
         let measured = origin.source.is_measured();
@@ -86,20 +91,62 @@ impl Looked {
             let seen = &mut self.landmarks[landmark];
             (seen.0, seen.1) = (seen.0 + 1, seen.1 + usize::from(outside));
         }
+        if let Some(marker) = origin.marker.filter(|_| !outside) {
+            self.memory.take(marker, k, &block.right);
+        }
         if outside {
             let stop = &problem.plan.stops[k];
             let Origin { source, marker, .. } = origin;
             self.refined.outliers.push(Outlier { flight: stop.flight, t: stop.t, source, marker, ratio });
         } else {
-            self.components.take(origin.source, block, back);
+            let window = problem.plan.stops[k].window;
+            let figure = noise.at(origin.source, window);
+            self.components.take(origin.source, window, figure, block, back);
         }
+    }
+}
+
+/// How long errors of markers' pixels last, from what is left over of a marker in neighbouring frames.
+///
+/// A lens that is a little off, or an edge that is located a little to one side, errs alike in all frames. Trajectories hardly
+/// feel it; constants, which gather thousands of pixels, would be told far too well.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct PixelMemory {
+    last: BTreeMap<MarkerId, (usize, Vec<f64>)>,
+    together: f64,
+    alone: f64,
+}
+
+/// Most that errors which last make of a variance.
+const MOST_INFLATION: f64 = 100.0;
+
+impl PixelMemory {
+    fn take(&mut self, marker: MarkerId, k: usize, left: &[f64]) {
+        if let Some((later, before)) = self.last.get(&marker)
+            && before.len() == left.len()
+            && later.abs_diff(k) == 1
+        {
+            self.together += before.iter().zip(left).map(|(a, b)| a * b).sum::<f64>();
+            self.alone += before.iter().chain(left).map(|a| 0.5 * a * a).sum::<f64>();
+        }
+        self.last.insert(marker, (k, left.to_vec()));
+    }
+
+    /// By what factor variances of what is constant are larger than white errors would make them, `(1 + ρ)/(1 − ρ)` with the
+    /// correlation ρ from frame to frame.
+    pub(crate) fn inflation(&self) -> f64 {
+        if self.alone <= 0.0 {
+            return 1.0;
+        }
+        let correlation = (self.together / self.alone).clamp(0.0, 0.99);
+        ((1.0 + correlation) / (1.0 - correlation)).min(MOST_INFLATION)
     }
 }
 
 fn tallies(targets: usize, counts: &[(usize, usize)], noise: &Noise) -> Vec<Tally> {
     use Source as S;
-    let own = [S::GpsPosition, S::GpsVelocity, S::Heading, S::Tilt, S::Feature];
-    let motion = [S::TiltMotion, S::YawMotion, S::Gust, S::Thrust];
+    let own = [S::Outside, S::GpsPosition, S::GpsVelocity, S::Heading, S::Tilt, S::Feature];
+    let motion = [S::TiltMotion, S::YawMotion, S::Gust, S::Thrust, S::Vibration];
     let of_targets = (0..targets).flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t)]);
     let all = own.into_iter().chain(motion).chain(of_targets);
     let tally = |source: Source| {
@@ -112,7 +159,8 @@ fn tallies(targets: usize, counts: &[(usize, usize)], noise: &Noise) -> Vec<Tall
 fn constants(problem: &Problem<'_>, values: &Values, back: &Back) -> Vec<Constant> {
     let at = problem.shape.constants_at();
     let constant = |(i, (prior, value)): (usize, (&Prior, &f64))| {
-        let sigma = if prior.sigma > 0.0 { back.covariance(at + i, at + i).max(0.0).sqrt() } else { 0.0 };
+        let found = back.covariance(at + i, at + i).max(0.0).sqrt();
+        let sigma = if prior.is_estimated() { found } else { prior.sigma };
         Constant { kind: prior.kind, value: *value, sigma, prior: prior.mean, prior_sigma: prior.sigma }
     };
     problem.priors.iter().zip(&values.constants).enumerate().map(constant).collect()
@@ -139,7 +187,11 @@ fn ownship(
         lat_deg: place.lat_deg,
         lon_deg: place.lon_deg,
         height_m: place.height_m,
-        covariance: SMatrix::from_fn(|i, j| back.covariance(at + i, at + j)),
+        covariance: SMatrix::from_fn(|i, j| {
+            let tilt = i == j && (knot::ATTITUDE..knot::ATTITUDE + 2).contains(&i);
+            let considered = if tilt { problem.considered_tilt_var } else { 0.0 };
+            back.covariance(at + i, at + j) + considered
+        }),
     }
 }
 

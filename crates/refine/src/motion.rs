@@ -1,11 +1,11 @@
 //! How helicopter and targets move from one knot to the next.
 //!
-//! Real motion is smooth. Angular acceleration of the helicopter, acceleration and yaw acceleration of a target are driven by
-//! white noise, and forget themselves over some seconds (Singer 1970): over the interval of knots a jerk of white noise. Of
-//! a triple (x, ẋ, ẍ) with ẍ' = e^(−h/τ) ẍ
+//! Real motion is smooth. Each angle of the helicopter is a chain (angle, rate, acceleration) at whose end stands white noise;
+//! a target's way along its course, and its heading, are chains of four (way, speed, acceleration, jerk). The last links forget
+//! themselves: acceleration over some seconds (Singer 1970), a target's jerk over the time in which its drive and steering
+//! respond. With the chain's matrix A, over the interval h of two knots
 //!
-//! `x' = x + h ẋ + τ² (h/τ − 1 + e^(−h/τ)) ẍ`, `ẋ' = ẋ + τ (1 − e^(−h/τ)) ẍ`,
-//! `Q = q [h⁵/20 h⁴/8 h³/6; h⁴/8 h³/3 h²/2; h³/6 h²/2 h]`.
+//! `x' = e^(A h) x + w`, `cov w = q ∫₀ʰ e^(A s) b bᵀ e^(Aᵀ s) ds`.
 //!
 //! The helicopter's place and velocity follow its acceleration a, the filter's own model of thrust, wind and drag:
 //! `v' = v + h/2 (a + a')`, `p' = p + h/2 (v + v') − h²/12 (a' − a)`.
@@ -19,13 +19,14 @@ use crate::front::Shape;
 use crate::unknowns::{Place, knot};
 use crate::values::Knot;
 
-/// Over how long angular acceleration of the helicopter is remembered, s, and acceleration of a target.
-const SPIN_TAU_S: f64 = 1.0;
-const DRIVE_TAU_S: f64 = 2.0;
-/// Vibration and what is finer than a gust straight into velocity, m/s per √s.
-const VELOCITY_WALK: f64 = 0.02;
+/// Over how long the links of a chain remember, s: the helicopter's angle, rate, angular acceleration.
+const SPIN: [f64; 3] = [f64::INFINITY, f64::INFINITY, 1.0];
+/// And a target's way or heading, its rate, acceleration and jerk.
+const DRIVE: [f64; 4] = [f64::INFINITY, f64::INFINITY, 2.0, 0.4];
 /// Slow force of the wind, m/s² per √s.
 const WIND_WALK: f64 = 0.1;
+/// Least variance of a step, m² or rad²: what is stiffer drowns the knowledge of absolute place in rounding.
+const LEAST_VAR: f64 = 1e-13;
 /// Side slip of what does not move at all, m²/s.
 const STILL_Q: f64 = 1e-12;
 
@@ -55,29 +56,61 @@ pub(crate) struct Link<'a> {
     pub(crate) shape: Shape,
     pub(crate) places: &'a [Place],
     pub(crate) noise: &'a Noise,
+    /// Window of time of the figures of motion.
+    pub(crate) window: usize,
     pub(crate) processes: &'a Processes,
 }
 
-/// Transition of a triple.
-struct Triple {
-    /// Of the first by the third, of the second by the third, of the third by itself.
-    by_third: [f64; 3],
-    h: f64,
+/// A chain of links, each the derivative of the one before, over a step.
+struct Chain<const N: usize> {
+    /// `e^(A h)`.
+    transition: [[f64; N]; N],
+    /// Of unit intensity, row by row.
+    covariance: Vec<f64>,
 }
 
-impl Triple {
-    fn new(h: f64, tau_s: f64) -> Self {
-        let (share, decay) = (h / tau_s, (-h / tau_s).exp());
-        Self { by_third: [tau_s * tau_s * (share - 1.0 + decay), tau_s * (1.0 - decay), decay], h }
-    }
+/// Nodes and weights of Gauss's quadrature with five points over (−1, 1).
+const GAUSS: [(f64, f64); 5] = [
+    (0.0, 0.568_888_888_888_888_9),
+    (-0.538_469_310_105_683, 0.478_628_670_499_366_5),
+    (0.538_469_310_105_683, 0.478_628_670_499_366_5),
+    (-0.906_179_845_938_664, 0.236_926_885_056_189_1),
+    (0.906_179_845_938_664, 0.236_926_885_056_189_1),
+];
 
-    /// Covariance of unit intensity, row by row.
-    fn covariance(&self) -> [f64; 9] {
-        let h = self.h;
-        let (a, b, c) = (h.powi(5) / 20.0, h.powi(4) / 8.0, h.powi(3) / 6.0);
-        [a, b, c, b, h.powi(3) / 3.0, h * h / 2.0, c, h * h / 2.0, h]
+impl<const N: usize> Chain<N> {
+    fn new(h: f64, memories_s: &[f64; N]) -> Self {
+        let mut covariance = vec![0.0; N * N];
+        for (node, weight) in GAUSS {
+            let s = 0.5 * h * (1.0 + node);
+            let driven = exponential(s, memories_s).map(|row| row[N - 1]);
+            for i in 0..N {
+                (0..N).for_each(|j| covariance[i * N + j] += 0.5 * h * weight * driven[i] * driven[j]);
+            }
+        }
+        Self { transition: exponential(h, memories_s), covariance }
     }
 }
+
+/// `e^(A s)` by its series, with `A` of a chain: `(A x)_i = x_(i+1) − x_i/τ_i`.
+fn exponential<const N: usize>(s: f64, memories_s: &[f64; N]) -> [[f64; N]; N] {
+    let mut sum: [[f64; N]; N] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(i == j)));
+    let mut term = sum;
+    for k in 1..TERMS {
+        let by = s / f64::from(k);
+        term = std::array::from_fn(|i| {
+            std::array::from_fn(|j| {
+                let next = if i + 1 < N { term[i + 1][j] } else { 0.0 };
+                by * (next - term[i][j] / memories_s[i])
+            })
+        });
+        (0..N).for_each(|i| (0..N).for_each(|j| sum[i][j] += term[i][j]));
+    }
+    sum
+}
+
+/// Terms of the series: a step is a fraction of every memory.
+const TERMS: u32 = 14;
 
 impl Link<'_> {
     /// Gives every block of the step.
@@ -121,22 +154,26 @@ impl Link<'_> {
                 .map(move |i| at + i)
         };
         let pushed = [self.pushed.0, self.pushed.1];
-        let forces: Vec<usize> =
-            (0..2).flat_map(|end| pushed[end].1.iter().map(move |(c, _)| self.column(end, *c))).collect();
-        block.over(own(ends[0]).chain(own(ends[1])).chain(forces));
+        let forces: Vec<(usize, usize, Vector3<f64>)> = (0..2)
+            .flat_map(|end| {
+                pushed[end].1.iter().filter_map(move |(c, d)| Some((end, self.column(end, *c)?, *d)))
+            })
+            .collect();
+        block.over(own(ends[0]).chain(own(ends[1])).chain(forces.iter().map(|(_, column, _)| *column)));
         for i in 0..3 {
             (block.right[i], block.right[3 + i]) = (-place[i], -velocity[i]);
             for (end, sign) in [(0, -1.0), (1, 1.0)] {
                 *block.at(i, 6 * end + i) = sign;
                 *block.at(i, 6 * end + 3 + i) = -0.5 * h;
                 *block.at(3 + i, 6 * end + 3 + i) = sign;
-                for (k, (_, d)) in pushed[end].1.iter().enumerate() {
-                    *block.at(i, 12 + 14 * end + k) = sign * h * h / 12.0 * d[i];
-                    *block.at(3 + i, 12 + 14 * end + k) = -0.5 * h * d[i];
-                }
+            }
+            for (k, (end, _, d)) in forces.iter().enumerate() {
+                let sign = if *end == 0 { -1.0 } else { 1.0 };
+                *block.at(i, 12 + k) = sign * h * h / 12.0 * d[i];
+                *block.at(3 + i, 12 + k) = -0.5 * h * d[i];
             }
         }
-        let q = VELOCITY_WALK.powi(2);
+        let q = self.noise.of(Source::Vibration);
         let sigma = [(q * h.powi(3) / 12.0).sqrt(), (q * h).sqrt()];
         let width = block.columns.len();
         for row in 0..6 {
@@ -144,31 +181,28 @@ impl Link<'_> {
             block.right[row] *= by;
             block.rows[row * width..][..width].iter_mut().for_each(|x| *x *= by);
         }
-        take(Source::Known, block);
+        take(Source::Vibration, block);
     }
 
-    /// Where a column of the filter's stands, at either end.
-    fn column(&self, end: usize, column: usize) -> usize {
+    /// Where a column of the filter's stands, at either end; `None` where it is known.
+    fn column(&self, end: usize, column: usize) -> Option<usize> {
         let at = if end == 0 { self.at.0 } else { self.at.1 };
         match self.places[column] {
-            Place::Knot(i) => at + i,
-            Place::Constant(i) => self.shape.constants_at() + i,
-            Place::Landmark(_) | Place::Known(_) | Place::Nowhere => {
-                unreachable!("forces depend on the helicopter's own unknowns")
-            }
+            Place::Knot(i) => Some(at + i),
+            Place::Constant(i) => Some(self.shape.constants_at() + i),
+            Place::Landmark(_) | Place::Known(_) | Place::Nowhere => None,
         }
     }
 
     /// Attitude, rate and angular acceleration, an axis of the body after another.
     fn attitude(&self, block: &mut Block, take: &mut dyn FnMut(Source, &Block)) {
-        let (from, to, triple) = (self.from, self.to, Triple::new(self.h, SPIN_TAU_S));
+        let (from, to, chain) = (self.from, self.to, Chain::new(self.h, &SPIN));
         let turn = (from.attitude.inverse() * to.attitude).scaled_axis();
         let bend = skew(&(turn * 0.5));
         let by_to = (Matrix3::identity() + bend) * to.attitude.matrix().transpose();
         let by_from = -(Matrix3::identity() - bend) * from.attitude.matrix().transpose();
         let (rate, spin) = (from.three(knot::RATE), from.three(knot::SPIN));
         let (rate_to, spin_to) = (to.three(knot::RATE), to.three(knot::SPIN));
-        let [turned, quicker, kept] = triple.by_third;
         for axis in 0..3 {
             let source = if axis < 2 { Source::TiltMotion } else { Source::YawMotion };
             block.begin(3);
@@ -182,11 +216,9 @@ impl Link<'_> {
                 *block.at(0, i) = by_from[(axis, i)];
                 *block.at(0, 5 + i) = by_to[(axis, i)];
             }
-            set_triple(block, [None, Some(3), Some(4)], [None, Some(8), Some(9)], &triple);
-            block.right[0] = -(turn[axis] - rate[axis] * self.h - turned * spin[axis]);
-            block.right[1] = -(rate_to[axis] - rate[axis] - quicker * spin[axis]);
-            block.right[2] = -(spin_to[axis] - kept * spin[axis]);
-            self.finish(block, &triple.covariance(), source, take);
+            let states = ([0.0, rate[axis], spin[axis]], [turn[axis], rate_to[axis], spin_to[axis]]);
+            set_chain(block, &[None, Some(3), Some(4)], &[None, Some(8), Some(9)], &chain, &states);
+            self.finish(block, &chain.covariance, source, take);
         }
     }
 
@@ -223,35 +255,37 @@ impl Link<'_> {
         if !moves {
             return self.still(a, b, at, block, take);
         }
-        let triple = Triple::new(self.h, DRIVE_TAU_S);
-        let [run, quicker, kept] = triple.by_third;
+        let chain = Chain::new(self.h, &DRIVE);
         let turned = wrap_angle(b[knot::HEADING] - a[knot::HEADING]);
         let (s, c) = (a[knot::HEADING] + 0.5 * turned).sin_cos();
         let (north, east) = (b[0] - a[0], b[1] - a[1]);
         let (along, across) = (c * north + s * east, c * east - s * north);
-        // Along: place, speed, acceleration.
-        block.begin(3);
-        let of = |at: usize| [0, 1, knot::HEADING, knot::SPEED, knot::ACCELERATION].map(move |i| at + i);
+        // Along the course.
+        let links = [knot::SPEED, knot::ACCELERATION, knot::JERK];
+        block.begin(4);
+        let of = |at: usize| {
+            [0, 1, knot::HEADING, knot::SPEED, knot::ACCELERATION, knot::JERK].map(move |i| at + i)
+        };
         block.over(of(at[0]).into_iter().chain(of(at[1])));
         for (end, sign) in [(0, -1.0), (1, 1.0)] {
-            *block.at(0, 5 * end) = sign * c;
-            *block.at(0, 5 * end + 1) = sign * s;
-            *block.at(0, 5 * end + 2) = 0.5 * across;
+            *block.at(0, 6 * end) = sign * c;
+            *block.at(0, 6 * end + 1) = sign * s;
+            *block.at(0, 6 * end + 2) = 0.5 * across;
         }
-        set_triple(block, [None, Some(3), Some(4)], [None, Some(8), Some(9)], &triple);
-        block.right[0] = -(along - a[knot::SPEED] * self.h - run * a[knot::ACCELERATION]);
-        block.right[1] = -(b[knot::SPEED] - a[knot::SPEED] - quicker * a[knot::ACCELERATION]);
-        block.right[2] = -(b[knot::ACCELERATION] - kept * a[knot::ACCELERATION]);
-        self.finish(block, &triple.covariance(), Source::Drive(target), take);
-        // Heading, yaw rate, yaw acceleration.
-        block.begin(3);
-        let of = |at: usize| [knot::HEADING, knot::YAW_RATE, knot::YAW_ACCELERATION].map(move |i| at + i);
+        let states = (chained(0.0, a, links), chained(along, b, links));
+        let (from, to) = ([None, Some(3), Some(4), Some(5)], [None, Some(9), Some(10), Some(11)]);
+        set_chain(block, &from, &to, &chain, &states);
+        self.finish(block, &chain.covariance, Source::Drive(target), take);
+        // Heading.
+        let links = [knot::YAW_RATE, knot::YAW_ACCELERATION, knot::YAW_JERK];
+        block.begin(4);
+        let of = |at: usize| {
+            [knot::HEADING, knot::YAW_RATE, knot::YAW_ACCELERATION, knot::YAW_JERK].map(move |i| at + i)
+        };
         block.over(of(at[0]).into_iter().chain(of(at[1])));
-        set_triple(block, [Some(0), Some(1), Some(2)], [Some(3), Some(4), Some(5)], &triple);
-        block.right[0] = -(turned - a[knot::YAW_RATE] * self.h - run * a[knot::YAW_ACCELERATION]);
-        block.right[1] = -(b[knot::YAW_RATE] - a[knot::YAW_RATE] - quicker * a[knot::YAW_ACCELERATION]);
-        block.right[2] = -(b[knot::YAW_ACCELERATION] - kept * a[knot::YAW_ACCELERATION]);
-        self.finish(block, &triple.covariance(), Source::Turn(target), take);
+        let states = (chained(0.0, a, links), chained(turned, b, links));
+        set_chain(block, &[0, 1, 2, 3].map(Some), &[4, 5, 6, 7].map(Some), &chain, &states);
+        self.finish(block, &chain.covariance, Source::Turn(target), take);
         // Across.
         block.begin(1);
         block.over([0, 1].into_iter().flat_map(|end| [0, 1, knot::HEADING].map(|i| at[end] + i)));
@@ -290,27 +324,41 @@ impl Link<'_> {
         source: Source,
         take: &mut dyn FnMut(Source, &Block),
     ) {
-        let figure = self.noise.of(source);
+        let figure = self.noise.at(source, self.window);
         let mut covariance: Vec<f64> = covariance.iter().map(|c| c * figure).collect();
+        covariance[0] += LEAST_VAR;
         if block.whiten(&mut covariance) {
             take(source, block);
         }
     }
 }
 
-/// The derivatives of a triple's three rows by its components, by the places of their columns at either end; `None` where they
-/// are set elsewhere.
-fn set_triple(block: &mut Block, from: [Option<usize>; 3], to: [Option<usize>; 3], triple: &Triple) {
-    let [by_first, by_second, kept] = triple.by_third;
-    let transition = [[-1.0, -triple.h, -by_first], [0.0, -1.0, -by_second], [0.0, 0.0, -kept]];
-    for row in 0..3 {
-        for component in 0..3 {
-            if let Some(place) = from[component] {
-                *block.at(row, place) = transition[row][component];
+/// A chain's state: its first link, and the others out of a target's part.
+fn chained(first: f64, target: &[f64], links: [usize; 3]) -> [f64; 4] {
+    [first, target[links[0]], target[links[1]], target[links[2]]]
+}
+
+/// Writes a chain's rows: derivatives by the links at either end, by the places of their columns (`None` where they are set
+/// elsewhere), and what is left over of the states. The first link counts from where it was at the first end.
+fn set_chain<const N: usize>(
+    block: &mut Block,
+    from: &[Option<usize>; N],
+    to: &[Option<usize>; N],
+    chain: &Chain<N>,
+    states: &([f64; N], [f64; N]),
+) {
+    for row in 0..N {
+        let mut expected = 0.0;
+        for link in 0..N {
+            let by = chain.transition[row][link];
+            expected += by * states.0[link];
+            if let Some(place) = from[link] {
+                *block.at(row, place) = -by;
             }
-            if let Some(place) = to[component] {
-                *block.at(row, place) = if row == component { 1.0 } else { 0.0 };
+            if let Some(place) = to[link] {
+                *block.at(row, place) = f64::from(row == link);
             }
         }
+        block.right[row] = expected - states.1[row];
     }
 }

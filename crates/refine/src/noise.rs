@@ -12,47 +12,83 @@ const FEWEST: f64 = 8.0;
 /// A figure of motion moves by no more than this at once.
 const AT_ONCE: f64 = 30.0;
 /// Limits of figures of motion.
-const MOTION: (f64, f64) = (1e-9, 1e6);
+const MOTION: (f64, f64) = (1e-6, 1e6);
 
-/// Sums over the blocks of each source.
+/// Windows of time to either side that a window's figure of motion is fitted over, the farther ones with less weight.
+const REACH: usize = 3;
+/// Rows that speak for the figure of the whole flight in each window.
+const OF_WHOLE: f64 = 4.0;
+
+/// Sums over the blocks of each source, in windows of time.
 #[derive(Clone, Debug)]
 pub(crate) struct Components {
-    found: Vec<f64>,
-    due: Vec<f64>,
+    sums: Vec<Vec<Sum>>,
+}
+
+/// Sum of squares over the figure, what was expected, and that sum of squares times the figure.
+#[derive(Clone, Copy, Debug, Default)]
+struct Sum {
+    found: f64,
+    due: f64,
+    absolute: f64,
+}
+
+impl Sum {
+    fn add(&mut self, other: &Self, weight: f64) {
+        self.found += weight * other.found;
+        self.due += weight * other.due;
+        self.absolute += weight * other.absolute;
+    }
 }
 
 impl Components {
-    pub(crate) fn new(targets: usize) -> Self {
-        let n = Source::count(targets);
-        Self { found: vec![0.0; n], due: vec![0.0; n] }
+    pub(crate) fn new(targets: usize, windows: usize) -> Self {
+        Self { sums: vec![vec![Sum::default(); windows]; Source::count(targets)] }
     }
 
-    /// Takes a block that is no outlier.
-    pub(crate) fn take(&mut self, source: Source, block: &Block, back: &Back) {
+    /// Takes a block that is no outlier, whitened by this figure.
+    pub(crate) fn take(&mut self, source: Source, window: usize, figure: f64, block: &Block, back: &Back) {
         let width = block.columns.len();
         let taken: f64 =
             block.rows.chunks_exact(width).map(|row| back.product(&block.columns, row, row)).sum();
-        self.found[source.index()] += block.square();
-        self.due[source.index()] += (block.len() as f64 - taken).max(0.0);
+        let (found, due) = (block.square(), (block.len() as f64 - taken).max(0.0));
+        self.sums[source.index()][window].add(&Sum { found, due, absolute: found * figure }, 1.0);
     }
 
     /// Moves the figures; by how much the one that moved most did (its logarithm).
     pub(crate) fn fit(&self, targets: usize, noise: &mut Noise) -> f64 {
         let mut most = 0.0f64;
         for source in fitted(targets) {
-            let (found, due) = (self.found[source.index()], self.due[source.index()]);
-            if due < FEWEST {
+            let windows = &self.sums[source.index()];
+            let mut whole = Sum::default();
+            windows.iter().for_each(|sum| whole.add(sum, 1.0));
+            if whole.due < FEWEST {
                 continue;
             }
-            let ratio = (found / due).clamp(1.0 / AT_ONCE, AT_ONCE);
             let (least, largest) = limits(source);
             let before = noise.of(source);
-            let after = (before * ratio).clamp(least, largest);
-            most = most.max((after / before).ln().abs());
+            let ratio = whole.absolute / whole.due / before;
+            let after = (before * ratio.clamp(1.0 / AT_ONCE, AT_ONCE)).clamp(least, largest);
+            most = most.max((whole.found / whole.due).clamp(1.0 / AT_ONCE, AT_ONCE).ln().abs());
             noise.set(source, after);
+            if source.is_local() {
+                let local = |window| in_window(windows, window, after).clamp(least, largest);
+                noise.set_local(source, &(0..windows.len()).map(local).collect::<Vec<_>>());
+            }
         }
         most
     }
+}
+
+/// The figure of motion in a window: what was found in it and about it, and a little of the whole flight.
+fn in_window(windows: &[Sum], window: usize, whole: f64) -> f64 {
+    let mut sum = Sum { due: OF_WHOLE, absolute: OF_WHOLE * whole, found: 0.0 };
+    let near = window.saturating_sub(REACH)..(window + REACH + 1).min(windows.len());
+    for other in near {
+        let weight = 1.0 - other.abs_diff(window) as f64 / (REACH + 1) as f64;
+        sum.add(&windows[other], weight);
+    }
+    sum.absolute / sum.due
 }
 
 /// The sources whose figures are fitted.
@@ -68,6 +104,7 @@ fn fitted(targets: usize) -> impl Iterator<Item = Source> {
         S::YawMotion,
         S::Gust,
         S::Thrust,
+        S::Vibration,
     ];
     own.into_iter().chain((0..targets).flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t)]))
 }
@@ -79,20 +116,23 @@ fn limits(source: Source) -> (f64, f64) {
         Source::Heading => (0.25, 36.0),
         Source::Tilt => (0.25, 400.0),
         Source::Marker(_) | Source::Feature => (0.01, 25.0),
+        // Forces change within a step.
+        Source::Vibration => (1e-5, 1.0),
         _ => MOTION,
     }
 }
 
-/// Figures to begin with: intensities of jerk, variances of gusts and of the thrust's excess.
+/// Figures to begin with: intensities of jerk and of what changes it, variances of gusts and of the thrust's excess.
 pub(crate) fn first(targets: usize, gust_mps2: f64, thrust_mps2: f64) -> Noise {
     let mut noise = Noise::new(targets);
     noise.set(Source::TiltMotion, 3.0);
     noise.set(Source::YawMotion, 0.5);
     noise.set(Source::Gust, gust_mps2.powi(2));
     noise.set(Source::Thrust, thrust_mps2.powi(2));
+    noise.set(Source::Vibration, 0.02f64.powi(2));
     for target in 0..targets {
-        noise.set(Source::Drive(target), 0.5);
-        noise.set(Source::Turn(target), 0.2);
+        noise.set(Source::Drive(target), 6.0);
+        noise.set(Source::Turn(target), 2.0);
     }
     noise
 }

@@ -14,6 +14,8 @@ const STEP_S: f64 = 0.1;
 const NEAR: Span = Span::from_ns(1_000_000);
 /// Without a fix and without a compass reading for longer, what follows is a flight of its own, s.
 const BREAK_S: f64 = 10.0;
+/// Length of a window of time, s: a vehicle drives off, or turns in, within some of them.
+const WINDOW_S: f64 = 1.0;
 /// Ground features that may be open at once.
 pub(crate) const LANDMARKS: usize = 12;
 /// A feature seen in fewer frames says nothing.
@@ -33,12 +35,15 @@ pub(crate) struct Stop {
     pub(crate) t: MonoTime,
     /// Index of the recording.
     pub(crate) flight: usize,
+    /// Number of its window of time: figures of motion are the same in it.
+    pub(crate) window: usize,
     /// Nothing ties it to the knot before.
     pub(crate) begins: bool,
     /// Index of the frame exposed at `t`.
     pub(crate) frame: Option<usize>,
     pub(crate) epochs: Vec<usize>,
     pub(crate) readings: Vec<usize>,
+    pub(crate) positions: Vec<usize>,
     pub(crate) features: Vec<FeatureSeen>,
     /// Places of landmarks that are seen here for the last time, with the landmark.
     pub(crate) closes: Vec<(usize, usize)>,
@@ -55,6 +60,8 @@ pub(crate) struct Plan {
     pub(crate) landmarks: usize,
     /// Places of the front that landmarks take.
     pub(crate) places: usize,
+    /// Windows of time.
+    pub(crate) windows: usize,
 }
 
 impl Plan {
@@ -89,7 +96,11 @@ impl Plan {
         for (i, reading) in recording.readings.iter().enumerate().filter(|(_, r)| inside(r.t_valid)) {
             stops[nearest(stops, reading.t_valid)].readings.push(i);
         }
+        for (i, position) in recording.positions.iter().enumerate().filter(|(_, p)| inside(p.t)) {
+            stops[nearest(stops, position.t)].positions.push(i);
+        }
         self.break_at_silences(begin);
+        self.number_windows(begin);
         self.follow_targets(begin, recording, find, targets, lost_after_s);
         self.follow_features(begin, recording);
     }
@@ -104,10 +115,12 @@ impl Plan {
         let stop = |t: MonoTime, frame: Option<usize>| Stop {
             t,
             flight,
+            window: 0,
             begins: false,
             frame,
             epochs: Vec::new(),
             readings: Vec::new(),
+            positions: Vec::new(),
             features: Vec::new(),
             closes: Vec::new(),
             held: vec![false; targets],
@@ -129,6 +142,18 @@ impl Plan {
             self.stops.push(stop(t, frame));
             last = Some(t);
         }
+    }
+
+    fn number_windows(&mut self, begin: usize) {
+        let mut window = self.windows;
+        let mut since = self.stops[begin].t;
+        for stop in &mut self.stops[begin..] {
+            if (stop.t - since).s() >= WINDOW_S {
+                (window, since) = (window + 1, stop.t);
+            }
+            stop.window = window;
+        }
+        self.windows = window + 1;
     }
 
     /// Takes out knots of long silences, and begins anew behind them.

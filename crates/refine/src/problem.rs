@@ -1,7 +1,7 @@
 //! The least-squares problem: every block of a knot at the present values.
 
 use windhover_base::geo::wrap_angle;
-use windhover_base::msg::MarkerId;
+use windhover_base::msg::{FixKind, GnssEpoch, MarkerId};
 use windhover_estimate::batch::Predictor;
 
 use crate::block::{Block, Noise, Source};
@@ -20,12 +20,15 @@ pub(crate) struct Problem<'a> {
     pub(crate) shape: Shape,
     pub(crate) priors: Vec<Prior>,
     pub(crate) places: Vec<Place>,
+    pub(crate) outside_places: Vec<Place>,
     pub(crate) targets: usize,
     /// Whether each target moves.
     pub(crate) moves: Vec<bool>,
     pub(crate) processes: Processes,
     /// Landmarks that turned out not to be ground.
     pub(crate) dropped: Vec<bool>,
+    /// Variance of the tilt readings' slow error that is not estimated, rad²: of attitude about north and east.
+    pub(crate) considered_tilt_var: f64,
     /// Where the camera is configured to be in the body, m.
     pub(crate) camera_at: nalgebra::Vector3<f64>,
     pub(crate) gates: [f64; 9],
@@ -76,12 +79,12 @@ pub(crate) struct Pass<'a> {
 /// acceleration rad/s², wind m/s².
 const FIRST: [f64; 6] = [1e4, 100.0, 1.0, 2.0, 10.0, 1.5];
 /// Of a target where it is taken up: place m, heading rad, speed m/s, yaw rate rad/s, acceleration m/s², yaw acceleration
-/// rad/s².
-const TAKEN_UP: [f64; knot::TARGET] = [1e4, 1e4, 10.0, 30.0, 5.0, 3.0, 3.0];
+/// rad/s², jerk m/s³, yaw jerk rad/s³.
+const TAKEN_UP: [f64; knot::TARGET] = [1e4, 1e4, 10.0, 30.0, 5.0, 3.0, 3.0, 5.0, 5.0];
 
 impl<'a> Pass<'a> {
     pub(crate) fn new(problem: &'a Problem<'a>, predictor: Predictor) -> Self {
-        let estimated = problem.priors.iter().map(|prior| prior.sigma > 0.0).collect();
+        let estimated = problem.priors.iter().map(Prior::is_estimated).collect();
         let lens = Lens {
             principal_px: predictor.principal_point(),
             height_px: predictor.image_height_px(),
@@ -116,7 +119,7 @@ impl<'a> Pass<'a> {
         let mut cost = 0.0;
         for (i, (prior, value)) in self.problem.priors.iter().zip(&values.constants).enumerate() {
             let column = self.problem.shape.constants_at() + i;
-            if prior.sigma > 0.0 {
+            if prior.is_estimated() {
                 let information = prior.sigma.powi(-2);
                 front.add_prior(column, information, prior.mean - value);
                 cost += (prior.mean - value).powi(2) * information;
@@ -177,6 +180,7 @@ impl<'a> Pass<'a> {
         take: &mut dyn FnMut(Origin, &Block),
     ) {
         self.epochs(k, values, noise, take);
+        self.positions(k, values, take);
         self.readings(k, values, noise, take);
         self.frame(k, values, noise, take);
         self.link(k, values, noise, take);
@@ -195,6 +199,7 @@ impl<'a> Pass<'a> {
             shape: problem.shape,
             places: &problem.places,
             noise,
+            window: stop.window,
             processes: &problem.processes,
         };
         let mut take = |source: Source, block: &Block| take(Origin::of(source), block);
@@ -234,6 +239,35 @@ impl<'a> Pass<'a> {
                 if measure::finish(&self.rows, noise, &residual, factor, &mut self.block) {
                     take(Origin::of(source), &self.block);
                 }
+            }
+        }
+    }
+
+    fn positions(&mut self, k: usize, values: &Values, take: &mut dyn FnMut(Origin, &Block)) {
+        let problem = self.problem;
+        let (stop, places) = (&problem.plan.stops[k], &problem.outside_places[..]);
+        for &index in &stop.positions {
+            let outside = &problem.recordings[stop.flight].positions[index];
+            let dt = (outside.t - stop.t).s();
+            let state = self.state_at(k, values, dt);
+            values.put(&state, [0.0; 2], places, &mut self.means, &mut self.predictor);
+            let epoch = GnssEpoch {
+                fix: FixKind::ThreeD,
+                lat_deg: Some(outside.at.lat_deg),
+                lon_deg: Some(outside.at.lon_deg),
+                alt_msl_m: Some(outside.at.height_m),
+                ..GnssEpoch::default()
+            };
+            let linear = self.predictor.gps_position(&epoch).filter(|linear| linear.is_finite());
+            let Some(linear) = linear else { continue };
+            let mut instant = problem.instant(k, &state, &self.pushed[k], dt, &self.estimated);
+            instant.places = places;
+            instant.write(&linear, &mut self.rows);
+            instant.antenna(&linear, &mut self.rows);
+            let residual: Vec<f64> = (0..linear.len()).map(|i| linear.residual(i)).collect();
+            let var = |a: usize, b: usize| if a == b { outside.sigma_m[a].powi(2) } else { 0.0 };
+            if measure::finish(&self.rows, var, &residual, 1.0, &mut self.block) {
+                take(Origin::of(Source::Outside), &self.block);
             }
         }
     }

@@ -1,5 +1,6 @@
 //! What was recorded of a flight, as values.
 
+use windhover_base::geo::Geodetic;
 use windhover_base::msg::{AttitudeSample, FrameObservations, GnssEpoch, Stamped};
 use windhover_base::time::MonoTime;
 
@@ -13,6 +14,19 @@ pub struct Recording {
     pub readings: Vec<Stamped<AttitudeSample>>,
     /// What the frames showed.
     pub frames: Vec<Stamped<FrameObservations>>,
+    /// Where the antenna was, by something better than the receiver on board.
+    pub positions: Vec<OutsidePosition>,
+}
+
+/// A position of the antenna from outside: of a base station's solution, or a better receiver.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct OutsidePosition {
+    /// When, host time.
+    pub t: MonoTime,
+    /// Where, height above the ellipsoid.
+    pub at: Geodetic,
+    /// One sigma north, east, down, m.
+    pub sigma_m: [f64; 3],
 }
 
 /// One of them.

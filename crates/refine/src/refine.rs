@@ -19,7 +19,7 @@ use crate::problem::{Pass, Problem};
 use crate::recording::Recording;
 use crate::solve::{Unsolved, solve};
 use crate::told::Refined;
-use crate::unknowns::{knot, places, priors};
+use crate::unknowns::{knot, outside_places, places, priors};
 use crate::values::{Knot, Values};
 
 /// Why a flight could not be refined.
@@ -55,11 +55,19 @@ impl From<Unsolved> for RefineError {
 
 /// Rounds of fitting noise and motion at most, and the change of a figure's logarithm that ends them.
 const ROUNDS: usize = 8;
-const SETTLED: f64 = 0.05;
+const SETTLED: f64 = 0.1;
+/// A step that promises less of the sum of squares than this changes nothing by a sigma; while figures still move, by so much a
+/// knot.
+const CONVERGED: f64 = 0.05;
+const NEARLY: f64 = 2e-3;
 /// A ground feature of whose sightings more than this share lies outside the gate is none.
 const MOVING: f64 = 0.25;
 /// Chi-square values that good measurements stay below but for one in a thousand, by number of components.
 const GATES: [f64; 9] = [f64::INFINITY, 10.83, 13.82, 16.27, 18.47, 20.52, 22.46, 24.32, 26.12];
+/// A flight of whose knots fewer than this share have a target is blind.
+const BLIND: f64 = 0.2;
+/// The slow error of tilt readings where it is not estimated, rad.
+const HELD_TILT_ERROR: f64 = 1e-5;
 /// Outliers that are named.
 const NAMED: usize = 200;
 /// Correlation time of the thrust beyond the weight, s.
@@ -96,19 +104,23 @@ pub fn refine(
         done += 1;
         watch((done as f64 / total).min(1.0))
     };
+    let nearly = NEARLY * problem.plan.stops.len() as f64;
+    let mut last = false;
     for round in 0.. {
         let looked = {
             let mut pass = Pass::new(&problem, predictor.clone());
-            let factors = solve(&mut pass, &mut values, &noise, &mut step)?;
+            let factors =
+                solve(&mut pass, &mut values, &noise, if last { CONVERGED } else { nearly }, &mut step)?;
             look(&mut pass, &factors, &values, &noise, site, recordings)
         };
-        let dropped = drop_movers(&mut problem, &looked);
-        let moved = looked.components.fit(problem.targets, &mut noise);
-        if round >= ROUNDS || (moved < SETTLED && dropped == 0) {
+        if last {
             let mut refined = looked.refined;
-            refined.finish(&problem, &firsts, felt);
+            refined.finish(&problem, &firsts, felt, looked.memory.inflation());
             return Ok(refined);
         }
+        let dropped = drop_movers(&mut problem, &looked);
+        let moved = looked.components.fit(problem.targets, &mut noise);
+        last = round + 1 >= ROUNDS || (moved < SETTLED && dropped == 0);
     }
     unreachable!("the loop ends by its rounds")
 }
@@ -151,7 +163,10 @@ pub(crate) fn stated<'a>(
         Some(FeltTilt::Share(share)) => Some(share),
         _ => None,
     };
-    let priors = priors(rig, predictor, share);
+    let seen = plan.stops.iter().filter(|stop| stop.held.contains(&true)).count();
+    let blind = (seen as f64) < BLIND * plan.stops.len() as f64;
+    let priors = priors(rig, predictor, share, blind);
+    let reading = predictor.tilt_error();
     let places = places(predictor, targets, &priors);
     let best_fix = recordings.iter().flat_map(|r| &r.epochs).map(|e| e.value.fix).max();
     let shape = Shape { knot: knot::target(targets), landmarks: plan.places, constants: priors.len() };
@@ -160,6 +175,7 @@ pub(crate) fn stated<'a>(
         dropped: vec![false; plan.landmarks],
         plan,
         shape,
+        outside_places: outside_places(&places),
         places,
         priors,
         targets,
@@ -167,10 +183,12 @@ pub(crate) fn stated<'a>(
         processes: Processes {
             gust_tau_s: estimator.force_tau_s,
             thrust_tau_s: THRUST_TAU_S,
-            tilt_error: predictor.tilt_error(),
+            // Own motion must not explain the reading's slow error either: it is considered, not estimated.
+            tilt_error: if blind { (HELD_TILT_ERROR.powi(2), reading.1) } else { reading },
             gps_bias: predictor.gps_bias(best_fix.unwrap_or(FixKind::ThreeD)),
             slip_q: predictor.slip_q(),
         },
+        considered_tilt_var: if blind { reading.0 } else { 0.0 },
         camera_at: rig.camera.mount.position(),
         gates: GATES,
     }
@@ -257,7 +275,12 @@ fn drop_movers(problem: &mut Problem<'_>, looked: &Looked) -> usize {
 }
 
 impl Refined {
-    fn finish(&mut self, problem: &Problem<'_>, firsts: &[First], felt: Option<FeltTilt>) {
+    fn finish(&mut self, problem: &Problem<'_>, firsts: &[First], felt: Option<FeltTilt>, inflation: f64) {
+        for (constant, prior) in self.constants.iter_mut().zip(&problem.priors) {
+            if prior.is_estimated() {
+                constant.sigma = (constant.sigma * inflation.sqrt()).min(constant.prior_sigma);
+            }
+        }
         self.outliers.sort_by(|a, b| b.ratio.total_cmp(&a.ratio));
         self.outliers.truncate(NAMED);
         self.felt = felt;

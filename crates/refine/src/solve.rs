@@ -5,8 +5,6 @@ use crate::front::{Back, Eliminated, Front, Singular};
 use crate::problem::{Origin, Pass};
 use crate::values::Values;
 
-/// A step that promises less of the sum of squares than this changes nothing by a sigma.
-const CONVERGED: f64 = 0.05;
 /// Steps tried at most, and how the diagonal is raised where one made it worse.
 const STEPS: usize = 25;
 const RAISED: (f64, f64, f64) = (1e-4, 10.0, 1e6);
@@ -88,11 +86,12 @@ pub(crate) fn factorise(
     Ok(Factors { steps, cost })
 }
 
-/// Moves the values until they fit best.
+/// Moves the values until they fit best: until a step promises less of the sum of squares than `enough`.
 pub(crate) fn solve(
     pass: &mut Pass<'_>,
     values: &mut Values,
     noise: &Noise,
+    enough: f64,
     watch: Watch<'_>,
 ) -> Result<Factors, Unsolved> {
     let mut raised = 0.0;
@@ -109,7 +108,7 @@ pub(crate) fn solve(
             }
             return factorise(pass, values, noise, 0.0, watch);
         }
-        if factors.gain() < CONVERGED || step >= STEPS {
+        if factors.gain() < enough || step >= STEPS {
             return if raised == 0.0 { Ok(factors) } else { factorise(pass, values, noise, 0.0, watch) };
         }
         raised = if raised > RAISED.0 { raised / RAISED.1 } else { 0.0 };

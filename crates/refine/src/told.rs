@@ -24,15 +24,19 @@ pub struct Constant {
 /// A flight tells a constant where it makes its sigma smaller than this share of what it was.
 const TOLD: f64 = 0.8;
 
+/// What differs by less than this share of what was expected to be wrong is no reason to change a configuration.
+const MATTERS: f64 = 0.5;
+
 impl Constant {
     /// Whether the flight tells it; else it stays about where it was expected.
     pub fn is_told(&self) -> bool {
         self.prior_sigma > 0.0 && self.sigma < TOLD * self.prior_sigma
     }
 
-    /// Whether the flight tells it to be other than expected, beyond three sigmas.
+    /// Whether the flight tells it to be other than expected, beyond three sigmas and by what matters.
     pub fn is_settled(&self) -> bool {
-        self.is_told() && (self.value - self.prior).abs() > 3.0 * self.sigma
+        let off = (self.value - self.prior).abs();
+        self.is_told() && off > 3.0 * self.sigma && off > MATTERS * self.prior_sigma
     }
 }
 

@@ -30,13 +30,15 @@ pub(crate) mod knot {
     /// The first target's.
     pub(crate) const TARGETS: usize = 25;
 
-    /// Length of a target's part: north, east, heading, speed, yaw rate, acceleration, yaw acceleration.
-    pub(crate) const TARGET: usize = 7;
+    /// Length of a target's part: north, east, heading, speed, yaw rate, acceleration, yaw acceleration, jerk, yaw jerk.
+    pub(crate) const TARGET: usize = 9;
     pub(crate) const HEADING: usize = 2;
     pub(crate) const SPEED: usize = 3;
     pub(crate) const YAW_RATE: usize = 4;
     pub(crate) const ACCELERATION: usize = 5;
     pub(crate) const YAW_ACCELERATION: usize = 6;
+    pub(crate) const JERK: usize = 7;
+    pub(crate) const YAW_JERK: usize = 8;
 
     /// Where a target's part begins.
     pub(crate) const fn target(i: usize) -> usize {
@@ -110,8 +112,17 @@ pub(crate) mod constant {
 pub(crate) struct Prior {
     pub(crate) kind: ConstantKind,
     pub(crate) mean: f64,
-    /// One sigma; zero where it is not estimated.
+    /// One sigma; zero where it is known.
     pub(crate) sigma: f64,
+    /// Whether it stays where it is: nothing in the flight may move it.
+    pub(crate) held: bool,
+}
+
+impl Prior {
+    /// Whether the flight is asked for it.
+    pub(crate) fn is_estimated(&self) -> bool {
+        self.sigma > 0.0 && !self.held
+    }
 }
 
 /// Trim: a tail rotor makes a helicopter hang by some degrees.
@@ -135,22 +146,25 @@ const ANTENNA_AT: f64 = 0.1;
 /// Focal length of a calibrated lens, focused anew: share.
 const FOCAL: f64 = 0.005;
 /// A tag as printed and glued on: share of its size, m, m, rad.
-const TAG: [f64; TAG_COLUMNS] = [0.01, 0.01, 0.01, 0.0175];
+const TAG: [f64; TAG_COLUMNS] = [0.005, 0.01, 0.01, 0.0175];
 
 /// Constants with their priors, in their places.
-pub(crate) fn priors(rig: &Rig, predictor: &Predictor, share: Option<f64>) -> Vec<Prior> {
+///
+/// Of a flight that is blind (hardly a marker in view) only the compass's heading is asked for: a rotorcraft answers gusts with
+/// tilt, so whatever else is left free takes up what the model of its own motion lacks.
+pub(crate) fn priors(rig: &Rig, predictor: &Predictor, share: Option<f64>, blind: bool) -> Vec<Prior> {
     use ConstantKind as Kind;
-    let prior = |kind, sigma| Prior { kind, mean: 0.0, sigma };
+    let prior = |kind, sigma| Prior { kind, mean: 0.0, sigma, held: false };
     let gps_delay = rig.gps.latency_sigma_ms * 1e-3;
     let mut all = vec![
         prior(Kind::Trim(0), TRIM),
         prior(Kind::Trim(1), TRIM),
         prior(Kind::HeadingBias, predictor.heading_bias_var().sqrt()),
-        Prior { kind: Kind::TiltShare, mean: share.unwrap_or(1.0), sigma: share.map_or(0.0, |k| k * SHARE) },
+        Prior { mean: share.unwrap_or(1.0), ..prior(Kind::TiltShare, share.map_or(0.0, |k| k * SHARE)) },
         prior(Kind::TiltBias(0), TILT_BIAS),
         prior(Kind::TiltBias(1), TILT_BIAS),
         prior(Kind::GpsDelay, gps_delay),
-        Prior { kind: Kind::Drag, mean: DRAG.0, sigma: DRAG.1 },
+        Prior { mean: DRAG.0, ..prior(Kind::Drag, DRAG.1) },
     ];
     all.extend((0..4).map(|i| prior(Kind::Iron(i), IRON[i / 2])));
     all.push(prior(Kind::CompassDelay, COMPASS_DELAY));
@@ -169,6 +183,7 @@ pub(crate) fn priors(rig: &Rig, predictor: &Predictor, share: Option<f64>) -> Ve
             prior(Kind::Tag { target, marker, part }, sigma)
         }));
     }
+    all.iter_mut().for_each(|prior| prior.held = blind && prior.kind != Kind::HeadingBias);
     all
 }
 
@@ -194,6 +209,13 @@ pub(crate) enum Place {
     Known(usize),
     /// It is none of the unknowns.
     Nowhere,
+}
+
+/// The same for a position from outside, which has no part in the receiver's errors.
+pub(crate) fn outside_places(places: &[Place]) -> Vec<Place> {
+    let mut places = places.to_vec();
+    columns::GPS_BIAS.chain(columns::GPS_DELAY).for_each(|column| places[column] = Place::Nowhere);
+    places
 }
 
 /// The place of each column.
@@ -237,7 +259,7 @@ pub(crate) fn places(predictor: &Predictor, targets: usize, priors: &[Prior]) ->
     }
     for place in &mut places {
         if let Place::Constant(i) = *place
-            && priors[i].sigma == 0.0
+            && !priors[i].is_estimated()
         {
             *place = Place::Known(i);
         }

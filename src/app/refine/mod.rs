@@ -1,6 +1,7 @@
 //! The flight afterwards: a recorded flight refined as a whole, and written beside it.
 
 mod adopt;
+mod outside;
 mod words;
 mod write;
 
@@ -16,6 +17,7 @@ use crate::config::Config;
 use crate::io::mcap_read::ReadError;
 use crate::io::mcap_write::WriteError;
 use crate::pipeline::{PipelineSettings, site_of};
+use windhover_base::geo::{Geodetic, LocalFrame};
 use windhover_estimate::Site;
 use windhover_refine::{Recording, Refined, refine};
 
@@ -48,6 +50,9 @@ pub enum RefineFlightError {
         /// Why.
         source: windhover_refine::RefineError,
     },
+    /// Positions from outside could not be read.
+    #[error(transparent)]
+    Outside(#[from] outside::OutsideError),
     /// The result could not be written.
     #[error(transparent)]
     Write(#[from] WriteError),
@@ -72,27 +77,57 @@ pub fn beside(flight: &Path) -> PathBuf {
     flight.with_file_name(name)
 }
 
-/// Refines a flight; `watch` gets the share that is done, and says whether to go on.
+/// Refines flights over the same markers together, each with a path of its own and constants that they share, by the
+/// configuration of the first. `positions` are the antenna's from outside. `watch` gets the share that is done, and says
+/// whether to go on.
 ///
 /// # Errors
-/// Why it cannot be refined; nothing is written here.
-pub fn refine_flight(
-    path: &Path,
+/// Why they cannot be refined; nothing is written here.
+pub fn refine_flights(
+    paths: &[PathBuf],
+    positions: Option<&Path>,
     watch: &mut dyn FnMut(f64) -> bool,
-) -> Result<RefinedFlight, RefineFlightError> {
-    let config = config_of(path)?;
-    let flight = Flight::read(path)?;
-    let recording = recording::whole(&flight);
-    let looked_at = !(recording.epochs.is_empty() && recording.readings.is_empty());
-    if !looked_at && flight.reads > 0 {
-        return Err(RefineFlightError::Bare { path: path.to_owned() });
+) -> Result<Vec<RefinedFlight>, RefineFlightError> {
+    let Some(first) = paths.first() else { return Ok(Vec::new()) };
+    let config = config_of(first)?;
+    let flights: Vec<Flight> = paths.iter().map(|path| Flight::read(path)).collect::<Result<_, _>>()?;
+    let mut recordings: Vec<Recording> = flights.iter().map(recording::whole).collect();
+    for ((path, flight), recording) in paths.iter().zip(&flights).zip(&recordings) {
+        if recording.epochs.is_empty() && recording.readings.is_empty() && flight.reads > 0 {
+            return Err(RefineFlightError::Bare { path: path.clone() });
+        }
     }
-    let site = site(path, &config, &flight, &recording)?;
-    let recordings = std::slice::from_ref(&recording);
-    let refined = refine(&config.rig(), &config.filter(), &site, recordings, watch)
-        .map_err(|source| RefineFlightError::Refine { path: path.to_owned(), source })?;
-    let remarks = words::remarks(&flight, &refined);
-    Ok(RefinedFlight { flight, config, refined, remarks })
+    let site = site(first, &config, &flights[0], &recordings[0])?;
+    if let Some(positions) = positions {
+        outside::add_positions(positions, &mut recordings)?;
+    }
+    let refined = refine(&config.rig(), &config.filter(), &site, &recordings, watch)
+        .map_err(|source| RefineFlightError::Refine { path: first.clone(), source })?;
+    let done = flights.into_iter().enumerate().map(|(index, flight)| {
+        let refined = of_flight(&refined, index, flight.datum);
+        let remarks = words::remarks(&flight, &refined);
+        RefinedFlight { flight, config: config.clone(), refined, remarks }
+    });
+    Ok(done.collect())
+}
+
+/// What of several flights is one's, in the frame of its own datum.
+fn of_flight(all: &Refined, flight: usize, datum: Option<Geodetic>) -> Refined {
+    let mut refined = all.clone();
+    refined.own.retain(|(of, _)| *of == flight);
+    refined.targets.retain(|(of, _)| *of == flight);
+    refined.begins.retain(|(of, _)| *of == flight);
+    refined.outliers.retain(|outlier| outlier.flight == flight);
+    let Some(frame) = datum.filter(|_| flight > 0).map(LocalFrame::new) else { return refined };
+    let ned = |lat_deg: f64, lon_deg: f64, height_m: f64| frame.ned(Geodetic { lat_deg, lon_deg, height_m });
+    for (_, own) in &mut refined.own {
+        own.position_ned_m = ned(own.lat_deg, own.lon_deg, own.height_m);
+    }
+    for state in refined.targets.iter_mut().filter_map(|(_, estimate)| estimate.state.as_mut()) {
+        let place = ned(state.lat_deg, state.lon_deg, state.height_m);
+        (state.north_m, state.east_m) = (place.x, place.y);
+    }
+    refined
 }
 
 fn site(

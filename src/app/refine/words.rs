@@ -73,8 +73,10 @@ pub fn source_name(source: Source, targets: &[TargetConfig]) -> String {
         Source::YawMotion => "yaw_motion".into(),
         Source::Gust => "gust".into(),
         Source::Thrust => "thrust".into(),
+        Source::Vibration => "vibration".into(),
         Source::Drive(target) => format!("{}/drive", of(target)),
         Source::Turn(target) => format!("{}/turn", of(target)),
+        Source::Outside => "position_from_outside".into(),
         Source::Known => "known".into(),
     }
 }

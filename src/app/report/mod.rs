@@ -3,6 +3,7 @@
 mod accuracy;
 mod daemon;
 mod pictures;
+mod refined;
 mod fusion;
 mod map;
 mod page;
@@ -77,6 +78,7 @@ pub fn render(path: &Path, flight: &Flight, truth: Option<&Truth>) -> Result<Str
     let sections = [
         summary::section(&context, &pictures),
         accuracy::section(&context),
+        refined::section(&context),
         map::section(&context),
         states::section(&context),
         states::ownship_section(&context),

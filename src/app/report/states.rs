@@ -112,7 +112,7 @@ fn chart_of(context: &Context<'_>, name: &str, track: &Track, q: &Quantity, with
         let held = states.iter().filter(|s| is_held(s));
         held.map(|s| [context.flight.at(s.timestamp.as_ref()), beside(s.frame, (q.of)(s))]).collect()
     };
-    let (smoothed, paper) = (others(&track.smoothed), others(&track.paper));
+    let (smoothed, paper, refined) = (others(&track.smoothed), others(&track.paper), others(&track.refined));
     let title = format!("{name}: {}", q.title);
     let mut chart = context.chart(&title, q.unit).y_range_of(filtered.iter().chain(&smoothed).map(|p| p[1]));
     let step = band.len().div_ceil(super::LINE_POINTS).max(1);
@@ -133,6 +133,9 @@ fn chart_of(context: &Context<'_>, name: &str, track: &Track, q: &Quantity, with
     chart.named("real time, one-sigma band", line(&filtered), Ink::Blue);
     if !smoothed.is_empty() {
         chart.named("smoothed", line(&smoothed), Ink::Green);
+    }
+    if !refined.is_empty() {
+        chart.named("refined", line(&refined), Ink::Violet);
     }
     figure(&chart.render())
 }

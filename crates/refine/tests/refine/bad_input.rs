@@ -2,7 +2,7 @@
 
 use windhover_base::settings::EstimatorConfig;
 use windhover_base::time::Span;
-use windhover_refine::{Recording, RefineError, Refined, refine};
+use windhover_refine::{OutsidePosition, Recording, RefineError, Refined, refine};
 
 use crate::flown::{Flown, fly};
 
@@ -81,6 +81,29 @@ fn several_flights_share_their_constants() {
     for (one, two) in alone.constants.iter().zip(&both.constants) {
         assert!(two.sigma <= 1.05 * one.sigma, "{one:?} {two:?}");
     }
+}
+
+/// A position from outside takes the receiver's error away.
+#[test]
+fn with_positions_from_outside_the_place_is_theirs() {
+    let flown = fly("follow", 8.0, 6, |_| {});
+    let mut recording = flown.recording.clone();
+    let arm = nalgebra::Vector3::from(flown.world.scenario().rig.gps.antenna_position_m);
+    for k in 0..70 {
+        let t = flown.world.time(0.5 + 0.1 * f64::from(k));
+        let own = flown.world.ownship(t);
+        let at = flown.site.frame.geodetic(&(own.position_ned_m + own.ned_from_body * arm));
+        recording.positions.push(OutsidePosition { t, at, sigma_m: [0.02, 0.02, 0.04] });
+    }
+    let refined = of(&flown, &[recording]).expect("a flight");
+    let (_, estimate) = refined.targets[refined.targets.len() / 2];
+    let state = estimate.state.expect("in view");
+    let truth = flown.world.vehicle(0, estimate.t_valid);
+    let reference = truth.reference(flown.world.scenario().rig.target[0].reference_m);
+    let off = nalgebra::Vector2::new(state.north_m - reference.x, state.east_m - reference.y);
+    assert!(off.norm() < 0.3, "off by {off}");
+    let sigma = state.covariance.expect("told")[(0, 0)].sqrt();
+    assert!(sigma < 0.3, "{sigma}");
 }
 
 #[test]

@@ -1,0 +1,63 @@
+//! What a refinement says of the configuration, and which measurements it could not explain.
+
+use super::Context;
+use super::page::{Section, list, paragraph, table};
+use crate::io::proto::windhover as wh;
+
+/// Outliers listed.
+const MOST_OUTLIERS: usize = 20;
+
+/// The section; nothing of a flight that was not refined.
+pub(super) fn section(context: &Context<'_>) -> Option<Section> {
+    let refined = context.flight.refined.as_ref()?;
+    let mut body = paragraph(
+        "From the whole flight at once, afterwards: constants beside what the configuration states, with one sigma. What the \
+         flight does not tell stays about where it was expected.",
+    );
+    let told: Vec<Vec<String>> = refined.constants.iter().filter(|constant| constant.told).map(row).collect();
+    if !told.is_empty() {
+        body += &table(&["constant", "unit", "found", "one sigma", "expected", "one sigma"], &told);
+    }
+    let silent: Vec<&str> =
+        refined.constants.iter().filter(|c| !c.told).map(|constant| constant.name.as_str()).collect();
+    if !silent.is_empty() {
+        body += &paragraph(&format!("Not told by this flight: {}.", silent.join(", ")));
+    }
+    body += &list("", &refined.remarks);
+    let rows: Vec<Vec<String>> = refined.sources.iter().map(source_row).collect();
+    body += &table(&["source", "taken", "not explained", "noise over configured"], &rows);
+    let outliers: Vec<Vec<String>> = refined
+        .outliers
+        .iter()
+        .take(MOST_OUTLIERS)
+        .map(|outlier| {
+            let at = format!("{:.2}", context.flight.at(outlier.timestamp.as_ref()));
+            vec![at, outlier.source.clone(), outlier.marker.clone(), format!("{:.1}", outlier.ratio)]
+        })
+        .collect();
+    if !outliers.is_empty() {
+        body += &table(&["at s", "source", "marker", "square over the gate"], &outliers);
+    }
+    Some(Section { id: "refined", title: "What the flight says of your configuration", body })
+}
+
+fn row(constant: &wh::RefinedConstant) -> Vec<String> {
+    let figure = |value: f64| format!("{value:.3}");
+    vec![
+        constant.name.replace('_', " "),
+        constant.unit.clone(),
+        figure(constant.value),
+        figure(constant.sigma),
+        figure(constant.expected),
+        figure(constant.expected_sigma),
+    ]
+}
+
+fn source_row(source: &wh::RefinedSource) -> Vec<String> {
+    vec![
+        source.name.replace('_', " "),
+        source.taken.to_string(),
+        source.outliers.to_string(),
+        format!("{:.2}", source.noise_factor),
+    ]
+}
