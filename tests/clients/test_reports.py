@@ -189,7 +189,9 @@ class Reports(unittest.TestCase):
         status = {s.labels["status"]: s.value for s in families["windhover_target_status"].samples if s.labels["target"] == "ugv"}
         self.assertEqual(sum(status.values()), 1)
         self.assertEqual(families["windhover_measurements"].type, "counter")
-        station = {family.name: family for family in text_string_to_metric_families(self.fetch(self.web, "metrics"))}
+        said = rig.until(lambda: "windhover_link_up" in (text := self.fetch(self.web, "metrics")) and text, 60,
+                         lambda: self.fetch(self.web, "metrics"))
+        station = {family.name: family for family in text_string_to_metric_families(said)}
         self.assertEqual([(s.labels, s.value) for s in station["windhover_link_up"].samples], [({"payload": "alpha"}, 1)])
 
     def test_prometheus_scrapes_both(self):

@@ -5,7 +5,7 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use nalgebra::Vector2;
+use nalgebra::{Matrix3, Vector2};
 use rand::{Rng, SeedableRng};
 use windhover_base::msg::{FrameObservations, FramePrediction, MarkerId, MarkerPrediction};
 use windhover_base::settings::DetectorConfig;
@@ -15,6 +15,30 @@ use windhover_detect::{Detector, GrayImage, ImageView, Limits, Roi, Simd, TagFam
 #[path = "../tests/detector/common.rs"]
 #[expect(dead_code, reason = "the discs of the tests are not timed")]
 mod common;
+
+#[path = "../tests/detector/bound.rs"]
+mod bound;
+
+/// The least that corners of a tag can err by, in focus: what the detector's page lists, beside which the proof
+/// `corners_beside_the_least_error_that_there_can_be` measures.
+fn bounds(_: &mut Criterion) {
+    let pattern = tag_pattern(TagFamily::Tag36h11, 3);
+    let blur = (0.7f64.powi(2) + 1.0 / 12.0).sqrt();
+    for edge in [16.0, 24.0, 36.0, 60.0, 100.0, 200.0] {
+        let (sin, cos) = 0.3f64.sin_cos();
+        let half = 0.5 * edge;
+        let middle = 150.3;
+        let view =
+            Matrix3::new(half * cos, -half * sin, middle, half * sin, half * cos, middle, 0.0, 0.0, 1.0);
+        let [low, high] = [2.0, 5.0].map(|noise| {
+            let seen = bound::Seen { view: &view, pattern: &pattern, blur, contrast: 135.0, noise };
+            bound::corner_bound(seen)
+        });
+        println!(
+            "least RMS error of a corner, tag of {edge} px: {low:.4} px at noise 2, {high:.4} px at noise 5"
+        );
+    }
+}
 
 fn put_tag(image: &mut GrayImage, id: u32, at: (usize, usize), cell: usize) {
     let pattern = tag_pattern(TagFamily::Tag36h11, id);
@@ -117,5 +141,5 @@ fn tracked(c: &mut Criterion) {
     }
 }
 
-criterion_group!(benches, tags, tracked);
+criterion_group!(benches, bounds, tags, tracked);
 criterion_main!(benches);

@@ -9,6 +9,7 @@ use super::aid::gps_position::GpsPosition;
 use super::blocks::{Block, own};
 use super::core::Core;
 use super::fit::{Fit, WATCHED_POSITION};
+use super::matrix::Shear;
 use super::start::ANYWHERE_VAR;
 use super::state::State;
 
@@ -121,18 +122,19 @@ impl State {
     /// Adds `factor` times the helicopter's horizontal error to that of every target and feature.
     fn tie_places(&mut self, factor: f64) {
         let layout = self.layout();
-        for (slot, place) in layout.places().enumerate() {
-            let in_use = match slot.checked_sub(layout.targets) {
-                Some(feature) => self.features[feature].id.is_some(),
-                None => self.targets[slot].life.is_held(),
-            };
-            if !in_use {
-                continue;
+        let mut shear = Shear::none(layout.len());
+        for axis in 0..2 {
+            shear.begin(own::POSITION.column(axis));
+            for (slot, place) in layout.places().enumerate() {
+                let in_use = match slot.checked_sub(layout.targets) {
+                    Some(feature) => self.features[feature].id.is_some(),
+                    None => self.targets[slot].life.is_held(),
+                };
+                if in_use {
+                    shear.give(place.column(axis), factor);
+                }
             }
-            for axis in 0..2 {
-                let (to, from) = (place.column(axis), own::POSITION.column(axis));
-                self.shear([(to, factor)], from);
-            }
+            self.shear(&shear);
         }
     }
 }

@@ -90,9 +90,11 @@ pub(crate) mod own {
     pub(crate) const GPS_DELAY: Block<1> = Block::after(TILT_BIAS);
     /// Drag: acceleration per metre a second over the ground, 1/s. What the wind adds is [`WIND`].
     pub(crate) const DRAG: Block<1> = Block::after(GPS_DELAY);
+    /// How much older the compass is than configured, against the camera, s.
+    pub(crate) const COMPASS_DELAY: Block<1> = Block::after(DRAG);
 
     /// Constant error of the gyros, body axes, rad/s. From here on only where there is an IMU.
-    pub(crate) const RATE_BIAS: Block<3> = Block::after(DRAG);
+    pub(crate) const RATE_BIAS: Block<3> = Block::after(COMPASS_DELAY);
     /// Constant error of the accelerometers, body axes, m/s².
     pub(crate) const FORCE_BIAS: Block<3> = Block::after(RATE_BIAS);
     /// Heading bias of the second source of attitude, rad. From here on only where there is one.
@@ -107,13 +109,13 @@ pub(crate) mod own {
     /// What has intensities that are fitted in flight: rate, gusts, thrust, error of the tilt reading.
     pub(crate) const MOTION: Block<{ TILT_ERROR.end() - ATTITUDE.end() }> = Block::from_start_of(RATE);
     /// Length of the helicopter's part with GPS and compass only, with an IMU, and with a second source of attitude.
-    pub(crate) const LEN: usize = DRAG.end();
+    pub(crate) const LEN: usize = COMPASS_DELAY.end();
     pub(crate) const WITH_IMU: usize = FORCE_BIAS.end();
     pub(crate) const WITH_SECOND: usize = SECOND_TILT_ERROR.end();
     /// What moves by itself, forces and slow errors: the table of `own.rs`.
     pub(crate) const SLOW: Block<{ WITH_SECOND - RATE.end() }> = Block::after(RATE);
     /// The sensors' slow errors and drag, which outlive a restart.
-    pub(crate) const SENSORS: Block<{ LEN - TRIM.end() }> = Block::after(TRIM);
+    pub(crate) const SENSORS: Block<{ DRAG.end() - TRIM.end() }> = Block::after(TRIM);
 }
 
 /// Length of a target's part.
@@ -235,7 +237,7 @@ mod tests {
         assert_eq!(own::MOTION.range(), own::RATE.column(0)..own::TILT_ERROR.end());
         assert_eq!(layout.slow(), own::GUST.column(0)..own::LEN);
         assert_eq!(own::SLOW.end(), own::WITH_SECOND);
-        assert_eq!(own::SENSORS.range(), own::GPS_BIAS.column(0)..own::LEN);
+        assert_eq!(own::SENSORS.range(), own::GPS_BIAS.column(0)..own::DRAG.end());
         assert_eq!(layout.target(0).all().column(0), own::LEN);
         assert_eq!(layout.target(1).all().column(0), layout.target(0).yaw_rate().end());
         assert_eq!(layout.feature(0).column(0), layout.target(1).all().end());

@@ -181,9 +181,9 @@ impl Estimator {
     /// Takes what a frame showed, and gives one estimate a target and the helicopter's own state at
     /// the frame's exposure.
     pub fn frame(&mut self, frame: &Stamped<FrameObservations>, out: &mut Vec<EstimatorOutput>) {
-        let (t, number) = (frame.t_valid, frame.value.frame);
+        let (t, number) = (self.exposed(frame.t_valid), frame.value.frame);
         let taken = if self.core.state.alive {
-            self.take(stamp_of(frame), FusionSource::Marker, out, |m| {
+            self.take(Stamp { t_valid: t, ..stamp_of(frame) }, FusionSource::Marker, out, |m| {
                 m.kind = Kind::Frame;
                 m.frame.frame = number;
                 m.frame.markers.clone_from(&frame.value.markers);
@@ -213,6 +213,11 @@ impl Estimator {
         self.emit_smoothed(out);
     }
 
+    /// When a frame with this stamp was exposed, by what was found out of the camera's clock.
+    fn exposed(&self, stamp: MonoTime) -> MonoTime {
+        stamp - Span::from_s(self.core.state.camera_late_s)
+    }
+
     /// Lets time pass: gives smoothed estimates that are due, and starts again after a long silence.
     pub fn tick(&mut self, now: MonoTime, out: &mut Vec<EstimatorOutput>) {
         if self.core.state.alive && now - self.core.state.t > SILENCE {
@@ -231,6 +236,7 @@ impl Estimator {
     /// What a frame exposed at `t` should show, into a recycled value.
     pub fn predict(&mut self, t: MonoTime, expected: &mut FramePrediction) {
         expected.clear();
+        let t = self.exposed(t);
         let ahead = t - self.core.state.t;
         if self.core.state.alive && ahead.s() <= FORESIGHT_S {
             self.ahead.copy_present(&self.core.state);
@@ -269,7 +275,7 @@ impl Estimator {
             l.target_q.iter().map(|q| format!("{:.3}/{:.3}", q[0].sqrt(), q[1].sqrt())).collect();
         format!(
             "heading bias {:.2}±{:.2} deg, tilt felt {:?} (slope {:.2}) gain {:.2}±{:.2} error {:.2},{:.2}±{:.2} deg \
-             bias {:.2},{:.2}±{:.2} deg, trim {:.1},{:.1}±{:.1} deg, wind {:.2},{:.2}±{:.2} m/s2, drag {:.2}±{:.2}, delay {:.0}±{:.0} ms, \
+             bias {:.2},{:.2}±{:.2} deg, trim {:.1},{:.1}±{:.1} deg, wind {:.2},{:.2}±{:.2} m/s2, drag {:.2}±{:.2}, delay {:.0}±{:.0} ms, compass {:.1}±{:.1} ms, camera {:.1} ms, \
              sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} gust {:.2} thrust {:.2} targets {} pixels {:.2?} {:.2} tags {}",
             own.heading_bias.to_degrees(),
             cov.sigma(own::HEADING_BIAS, 0).to_degrees(),
@@ -293,6 +299,9 @@ impl Estimator {
             cov.sigma(own::DRAG, 0),
             own.gps_delay_s * 1e3,
             cov.sigma(own::GPS_DELAY, 0) * 1e3,
+            own.compass_delay_s * 1e3,
+            cov.sigma(own::COMPASS_DELAY, 0) * 1e3,
+            self.core.state.camera_late_s * 1e3,
             l.heading_var[0].sqrt().to_degrees(),
             l.tilt_var[0].sqrt().to_degrees(),
             l.tilt_rate_q.sqrt(),

@@ -26,6 +26,7 @@ impl Core {
         self.state.learn_targets(&self.learning);
         self.judge_turns();
         self.state.copy_targets(frame.frame, self.keep_copies);
+        self.judge_camera_clock();
     }
 
     fn fuse_target(&mut self, index: usize, markers: &[MarkerDetection]) {
@@ -52,17 +53,18 @@ impl Core {
     fn fuse_seen(&mut self, index: usize, markers: &[MarkerDetection]) {
         let (before, since_s) =
             (self.state.across(index), (self.state.t - self.state.targets[index].last_seen).s());
-        let (mut accepted, mut beside) = (false, false);
+        let mut accepted = false;
         for detection in markers {
             if let Some((target, marker)) = self.models.find(detection.marker)
                 && target == index
             {
-                let inside = self.fuse_marker(index, marker, detection, accepted);
+                let beside = accepted;
+                let inside = self.fuse_marker(index, marker, detection, beside);
                 accepted |= inside;
+                // Where none of them is inside it is the vehicle that is elsewhere.
                 if beside {
                     self.judge_tag(index, marker, inside);
                 }
-                beside = true;
             }
         }
         let t = self.state.t;
@@ -74,7 +76,10 @@ impl Core {
         } else {
             target.life = target.life.refused();
             match target.life.verdict(self.restart_after, self.models.targets[index].moves()) {
-                Verdict::Keep => self.state.wake(&self.learning, index),
+                Verdict::Keep => {
+                    self.state.wake(&self.learning, index);
+                    self.state.targets[index].slip.open();
+                }
                 Verdict::PlaceAnew if self.place_anew(index, markers) => return,
                 Verdict::PlaceAnew | Verdict::Start => return self.start_target(index, markers, None),
             }

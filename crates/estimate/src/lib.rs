@@ -8,6 +8,7 @@ pub mod batch;
 mod begin;
 mod blocks;
 mod bound;
+mod camera_clock;
 mod coast;
 mod consensus;
 mod consider;

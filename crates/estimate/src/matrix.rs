@@ -7,7 +7,7 @@ use nalgebra::SMatrix;
 use super::blocks::Block;
 
 /// Rows of equal length in one block.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, PartialEq, Debug, Default)]
 pub(crate) struct Grid {
     cols: usize,
     data: Vec<f64>,
@@ -111,12 +111,14 @@ impl Grid {
     }
 
     /// `row[to] += a row[from]`, `from` before `to`.
+    #[inline(always)]
     pub(crate) fn add_row(&mut self, to: usize, a: f64, from: usize) {
         let (head, tail) = self.data.split_at_mut(to * self.cols);
         axpy(&mut tail[..self.cols], a, &head[from * self.cols..(from + 1) * self.cols]);
     }
 
     /// `row[to] += a row[from]`, whichever comes first.
+    #[inline(always)]
     pub(crate) fn add_row_from(&mut self, to: usize, a: f64, from: usize) {
         let (low, high) = (to.min(from), to.max(from));
         let (head, tail) = self.data.split_at_mut(high * self.cols);
@@ -124,11 +126,22 @@ impl Grid {
         if to < from { axpy(low, a, high) } else { axpy(high, a, low) }
     }
 
-    /// `column[to] += a column[from]`
-    pub(crate) fn add_column_from(&mut self, to: usize, a: f64, from: usize) {
-        for row in self.data.chunks_exact_mut(self.cols) {
-            row[to] += a * row[from];
+    /// Carries a covariance over to errors that are sheared.
+    #[inline(always)]
+    pub(crate) fn shear(&mut self, shear: &Shear) {
+        if !shear.some {
+            return;
         }
+        for (to, factor) in shear.by.iter().enumerate().filter(|(_, factor)| **factor != 0.0) {
+            self.add_row_from(to, *factor, shear.from);
+        }
+        self.shear_columns(shear);
+    }
+
+    /// Carries rows over to errors that are sheared.
+    #[inline(always)]
+    pub(crate) fn shear_columns(&mut self, shear: &Shear) {
+        self.data.chunks_exact_mut(self.cols).for_each(|row| shear.carry(row));
     }
 
     /// Copies without allocating where the sizes match.
@@ -163,9 +176,62 @@ impl Grid {
 }
 
 /// `y += a x`
+#[inline(always)]
 pub(crate) fn axpy(y: &mut [f64], a: f64, x: &[f64]) {
     for (y, x) in y.iter_mut().zip(x) {
         *y += a * x;
+    }
+}
+
+/// Multiples of one state's error that are added to those of others.
+#[derive(Clone, Debug)]
+pub(crate) struct Shear {
+    /// The state whose error is added.
+    from: usize,
+    /// How much of it each state gets; the state itself none.
+    by: Vec<f64>,
+    /// Whether any state gets some.
+    some: bool,
+}
+
+impl Shear {
+    /// Of `n` states none gets any.
+    pub(crate) fn none(n: usize) -> Self {
+        Self { from: 0, by: vec![0.0; n], some: false }
+    }
+
+    /// Begins anew with another state whose error is added.
+    pub(crate) fn begin(&mut self, from: usize) {
+        self.from = from;
+        self.by.fill(0.0);
+        self.some = false;
+    }
+
+    /// Gives a state some of it.
+    pub(crate) fn give(&mut self, to: usize, factor: f64) {
+        debug_assert!(to != self.from);
+        self.by[to] = factor;
+        self.some |= factor != 0.0;
+    }
+
+    /// Carries a row over, as far as it goes.
+    #[inline(always)]
+    pub(crate) fn carry(&self, row: &mut [f64]) {
+        let error = row[self.from];
+        if self.some && error != 0.0 {
+            axpy(row, error, &self.by);
+        }
+    }
+}
+
+/// `row −= Σ yᵢ wᵢ`
+#[inline(always)]
+pub(crate) fn subtract_rows<const M: usize>(row: &mut [f64], y: &[f64; M], w: &[&[f64]; M]) {
+    let w = w.map(|w| &w[..row.len()]);
+    for (j, x) in row.iter_mut().enumerate() {
+        for i in 0..M {
+            *x -= y[i] * w[i][j];
+        }
     }
 }
 
@@ -197,8 +263,9 @@ pub(crate) fn cholesky(s: &mut Small, m: usize) -> bool {
 }
 
 /// Solves `L y = b` in place.
-pub(crate) fn forward(l: &Small, m: usize, b: &mut [f64; MAX_MEASURED]) {
-    for i in 0..m {
+#[inline(always)]
+pub(crate) fn forward(l: &Small, b: &mut [f64]) {
+    for i in 0..b.len() {
         for k in 0..i {
             b[i] -= l[i][k] * b[k];
         }
@@ -239,7 +306,7 @@ mod tests {
         assert!(cholesky(&mut s, 2));
         let mut b = [0.0; MAX_MEASURED];
         (b[0], b[1]) = (2.0, 5.0);
-        forward(&s, 2, &mut b);
+        forward(&s, &mut b[..2]);
         // L = [2 0; 1 √2], so y = (1, 4/√2).
         assert!((b[0] - 1.0).abs() < 1e-12 && (b[1] - 4.0 / 2f64.sqrt()).abs() < 1e-12);
         let mut singular = [[0.0; MAX_MEASURED]; MAX_MEASURED];

@@ -40,6 +40,7 @@ pub(crate) struct Own {
     pub(crate) tilt_bias: Vector2<f64>,
     pub(crate) gps_delay_s: f64,
     pub(crate) drag_per_s: f64,
+    pub(crate) compass_delay_s: f64,
     /// Of the gyros, rad/s, and of the accelerometers, m/s², body axes.
     pub(crate) rate_bias: Vector3<f64>,
     pub(crate) force_bias: Vector3<f64>,
@@ -109,6 +110,7 @@ impl Default for Own {
             tilt_bias: Vector2::zeros(),
             gps_delay_s: 0.0,
             drag_per_s: 0.0,
+            compass_delay_s: 0.0,
             rate_bias: Vector3::zeros(),
             force_bias: Vector3::zeros(),
             second: AttitudeErrors::default(),
@@ -167,7 +169,7 @@ struct Slow {
 }
 
 /// The slow states in the order of their columns.
-const SLOW: [Slow; 17] = [
+const SLOW: [Slow; 18] = [
     Slow {
         first: place(own::GUST),
         mean: |own| own.gust.as_mut_slice(),
@@ -238,6 +240,13 @@ const SLOW: [Slow; 17] = [
         mean: |own| std::slice::from_mut(&mut own.drag_per_s),
         // About START_DRAG_PER_S.
         start_var: |_| [0.1f64.powi(2); 3],
+        wander: Wander::Walk(1e-4),
+    },
+    Slow {
+        first: place(own::COMPASS_DELAY),
+        mean: |own| std::slice::from_mut(&mut own.compass_delay_s),
+        // Filters of compasses and drivers of cameras have tens of milliseconds that no data sheet tells.
+        start_var: |_| [0.03f64.powi(2); 3],
         wander: Wander::Walk(1e-4),
     },
     Slow {

@@ -16,6 +16,8 @@ const OVER_S: f64 = 1.5;
 const LEAST_RATIO: f64 = 3.0;
 /// Most, as a factor on the walk configured.
 const MOST: f64 = 50.0;
+/// Factor on its intensity for each frame outside the gate.
+const OPENED: f64 = 30.0;
 /// Least share of the variance that a frame must have found out.
 const LEAST_TOLD: f64 = 0.3;
 
@@ -30,6 +32,11 @@ impl Slip {
     /// Factor on the configured intensity.
     pub(crate) fn factor(self) -> f64 {
         self.growth.exp()
+    }
+
+    /// A vehicle that leaves the gate in all its markers may be sliding: the walk across is what a slide needs at once.
+    pub(crate) fn open(&mut self) {
+        self.growth = (self.growth + OPENED.ln()).min(2.0 * MOST.ln());
     }
 
     /// Takes a frame's d² over what was due.

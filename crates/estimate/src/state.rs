@@ -12,7 +12,7 @@ use super::fitted::Learnt;
 use super::ground::RefusedTracks;
 use super::height::HeightCheck;
 use super::kind::TiltWatch;
-use super::matrix::Grid;
+use super::matrix::{Grid, Shear};
 use super::own::{Own, Senses};
 use super::slip::Slip;
 use super::spin::Spin;
@@ -122,6 +122,8 @@ pub(crate) struct State {
     pub(crate) height: HeightCheck,
     /// By how much lower than configured the ground lies, m: the receiver's heights are over that.
     pub(crate) ground_lower_m: f64,
+    /// By how much earlier than stamped frames are true, as was found out, s.
+    pub(crate) camera_late_s: f64,
     /// When the scene was last anchored anew, and by how much it moved.
     pub(crate) anchored: Option<(MonoTime, Vector3<f64>)>,
 }
@@ -169,7 +171,7 @@ impl State {
         self.t = other.t;
         self.alive = other.alive;
         self.own = other.own;
-        self.ground_lower_m = other.ground_lower_m;
+        (self.ground_lower_m, self.camera_late_s) = (other.ground_lower_m, other.camera_late_s);
         self.own_columns = other.own_columns;
         self.senses = other.senses;
         self.fits = other.fits;
@@ -228,7 +230,7 @@ impl State {
         }
     }
 
-    /// Carries the covariance over to the estimate that an update has just moved by `dx`.
+    /// What carries the covariance over to the estimate that an update has just moved by `dx`.
     ///
     /// What is seen of vehicles and ground says nothing of absolute heading: turning helicopter,
     /// velocity and everything seen about the vertical together changes no pixel. In error states
@@ -237,31 +239,26 @@ impl State {
     /// measured. Adding `e_D × Δ` times the heading error to each horizontal vector's error keeps the
     /// direction where it belongs (the error of an invariant filter, restricted to the vertical axis:
     /// Barrau and Bonnabel 2017).
-    pub(crate) fn keep_heading_unobserved(&mut self, dx: &[f64]) {
-        let turn = own::TURN.column(0);
+    pub(crate) fn keep_heading_unobserved(&self, dx: &[f64], shear: &mut Shear) {
+        shear.begin(own::TURN.column(0));
         let level: [Block<2>; 4] = [own::POSITION.part(0), own::VELOCITY.part(0), own::WIND, own::GUST];
         for block in level.into_iter().chain(self.layout().places()) {
             let moved = block.of(dx);
-            self.shear([(block.column(0), -moved.y), (block.column(1), moved.x)], turn);
+            shear.give(block.column(0), -moved.y);
+            shear.give(block.column(1), moved.x);
         }
     }
 
     /// Adds multiples of one state's error to those of others.
-    pub(crate) fn shear<const N: usize>(&mut self, to: [(usize, f64); N], from: usize) {
-        if to.iter().all(|(_, factor)| *factor == 0.0) {
-            return;
-        }
-        for (to, factor) in to {
-            self.cov.add_row_from(to, factor, from);
-        }
-        for (to, factor) in to {
-            self.cov.add_column_from(to, factor, from);
-        }
-        for copy in self.copies_in_use() {
-            for (to, factor) in to {
-                copy.cross.add_column_from(to, factor, from);
-            }
-        }
+    pub(crate) fn shear(&mut self, shear: &Shear) {
+        self.cov.shear(shear);
+        self.copies_in_use().for_each(|copy| copy.cross.shear_columns(shear));
+    }
+
+    /// The columns that have a variance lie before this one: tags come last, and most are as configured.
+    pub(crate) fn width(&self) -> usize {
+        let uncertain = |column: &usize| self.cov.at(*column, *column) != 0.0;
+        (0..self.cov.rows()).rev().find(uncertain).map_or(0, |last| last + 1)
     }
 
     /// Whether no marker has been seen for so long that own motion stands on GPS and compass alone (or on ground features,

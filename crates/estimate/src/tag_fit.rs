@@ -17,6 +17,7 @@ use windhover_base::time::MonoTime;
 
 use super::blocks::{TAG_FIT, TagFitBlock, own};
 use super::core::Core;
+use super::matrix::Shear;
 use super::measurement::Measurement;
 use super::models::Marker;
 use super::state::State;
@@ -261,30 +262,28 @@ impl State {
         }
     }
 
-    /// Carries the covariance over to the estimate that an update has just moved by `dx`, where scale is open: the direction
+    /// What carries the covariance over to the estimate that an update has just moved by `dx`, where scale is open: the direction
     /// that no pixel shows depends on the estimate, as with heading ([`Self::keep_heading_unobserved`]). What an update moves
     /// by Δ is larger by Δ times the error of scale.
-    pub(crate) fn keep_scale_unobserved(&mut self, dx: &[f64]) {
-        let Some(Scale { column, share }) = self.scale else { return };
+    pub(crate) fn keep_scale_unobserved(&self, dx: &[f64], shear: &mut Shear) {
+        let Some(Scale { column, share }) = self.scale else { return shear.begin(own::TURN.column(0)) };
+        shear.begin(column);
         let layout = self.layout();
-        let mut enlarge = |to: usize, by: f64| self.shear([(to, by)], column);
         let moved = own::POSITION.of(dx);
-        enlarge(own::POSITION.column(2), moved.z);
-        enlarge(own::GPS_BIAS.column(2), -moved.z);
+        shear.give(own::POSITION.column(2), moved.z);
+        shear.give(own::GPS_BIAS.column(2), -moved.z);
         let faster = own::VELOCITY.of(dx);
-        for axis in 0..3 {
-            enlarge(own::VELOCITY.column(axis), share * faster[axis]);
-        }
+        (0..3).for_each(|axis| shear.give(own::VELOCITY.column(axis), share * faster[axis]));
         for (slot, place) in layout.places().enumerate() {
             let scale = if slot < layout.targets { 1.0 } else { share };
             let by = place.of(dx) - moved.xy();
-            (0..2).for_each(|axis| enlarge(place.column(axis), scale * by[axis]));
+            (0..2).for_each(|axis| shear.give(place.column(axis), scale * by[axis]));
         }
-        for i in 0..layout.targets {
-            let (s, c) = self.targets[i].mean[2].sin_cos();
-            let speed = layout.target(i).speed().column(0);
-            let by = dx[speed] - (1.0 - share) * (faster.x * c + faster.y * s);
-            self.shear([(speed, by)], column);
+        for (i, target) in self.targets.iter().enumerate() {
+            let (s, c) = target.mean[2].sin_cos();
+            let by = (faster.x * c + faster.y * s) * (share - 1.0);
+            let speed = layout.target(i).speed();
+            shear.give(speed.column(0), speed.of(dx).x + by);
         }
     }
 

@@ -11,8 +11,8 @@ use windhover_base::msg::Disposition;
 
 use super::blocks::{Block, own};
 use super::delayed::DelayedCopy;
-use super::matrix::{Grid, MAX_MEASURED, Small, axpy, cholesky, forward};
-use super::measurement::Measurement;
+use super::matrix::{Grid, MAX_MEASURED, Shear, Small, axpy, cholesky, forward, subtract_rows};
+use super::measurement::{MAX_COLUMNS, Measurement};
 use super::state::State;
 
 /// Beyond this many times the gate a measurement is refused: no model error explains it.
@@ -67,6 +67,55 @@ pub(crate) struct Workspace {
     gains: Vec<[f64; MAX_MEASURED]>,
     /// Covariance of the helicopter's part between held states, as it was before.
     kept: Grid,
+    /// What the measurement at hand touches of the states that have a variance.
+    touched: Touched,
+    /// What keeps heading and scale unobserved, for the step at hand.
+    shears: [Shear; 2],
+}
+
+/// The part of a Jacobian that belongs to states that have a variance.
+#[derive(Clone, Debug)]
+struct Touched {
+    /// Columns of the state.
+    column: [usize; MAX_COLUMNS],
+    /// The derivatives of all components by each of them.
+    by: [[f64; MAX_MEASURED]; MAX_COLUMNS],
+    len: usize,
+    /// Columns of the state that have a variance lie before this one.
+    width: usize,
+}
+
+impl Touched {
+    const NONE: Self =
+        Self { column: [0; MAX_COLUMNS], by: [[0.0; MAX_MEASURED]; MAX_COLUMNS], len: 0, width: 0 };
+
+    /// Those of `z` before `width` that any of its components moves with.
+    fn find(&mut self, z: &Measurement, width: usize) {
+        (self.len, self.width) = (0, width);
+        for (place, column) in z.columns().iter().enumerate() {
+            let by = std::array::from_fn(|i| if i < z.m { z.row(i)[place] } else { 0.0 });
+            if *column < width && by.iter().any(|d| *d != 0.0) {
+                (self.column[self.len], self.by[self.len]) = (*column, by);
+                self.len += 1;
+            }
+        }
+    }
+
+    /// The columns with the derivatives by them.
+    fn iter(&self) -> impl Iterator<Item = (usize, &[f64; MAX_MEASURED])> {
+        self.column[..self.len].iter().copied().zip(&self.by)
+    }
+
+    /// `H x` of a row of the state's length.
+    #[inline(always)]
+    fn times<const M: usize>(&self, row: &[f64]) -> [f64; M] {
+        let mut product = [0.0; M];
+        for (column, by) in self.iter() {
+            let x = row[column];
+            product.iter_mut().zip(by).for_each(|(sum, d)| *sum += d * x);
+        }
+        product
+    }
 }
 
 impl Workspace {
@@ -76,6 +125,8 @@ impl Workspace {
             dx: vec![0.0; n],
             gains: vec![[0.0; MAX_MEASURED]; n],
             kept: Grid::zeros(own::WITH_SECOND, own::WITH_SECOND),
+            touched: Touched::NONE,
+            shears: [Shear::none(n), Shear::none(n)],
         }
     }
 
@@ -109,7 +160,7 @@ impl Workspace {
             return outcome;
         }
         let mut white = z.residual;
-        forward(&s, m, &mut white);
+        forward(&s, &mut white[..m]);
         let squared: f64 = white[..m].iter().map(|x| x * x).sum();
         outcome.ratio = gate.map_or(0.0, |g| squared / g);
         outcome.misfit = misfit(&s, &z.noise, m, &white);
@@ -125,7 +176,7 @@ impl Workspace {
             s.iter_mut().flatten().for_each(|x| *x *= root);
             white.iter_mut().for_each(|x| *x /= root);
         }
-        self.apply(state, z, &s, &white, held);
+        self.apply(state, &s, &white[..m], held);
         outcome
     }
 
@@ -137,7 +188,7 @@ impl Workspace {
             return None;
         }
         let mut white = z.residual;
-        forward(&s, z.m, &mut white);
+        forward(&s, &mut white[..z.m]);
         Some(white[..z.m].iter().map(|x| x * x).sum())
     }
 
@@ -154,13 +205,13 @@ impl Workspace {
 
     /// `H P` into the workspace.
     fn project(&mut self, state: &State, z: &Measurement) {
+        let width = state.width();
+        self.touched.find(z, width);
         for i in 0..z.m {
-            let out = self.whitened.row_mut(i);
+            let out = &mut self.whitened.row_mut(i)[..width];
             out.fill(0.0);
-            for (h, column) in z.row(i).iter().zip(z.columns()) {
-                if *h != 0.0 {
-                    axpy(out, *h, state.cov.row(*column));
-                }
+            for (column, by) in self.touched.iter() {
+                axpy(out, by[i], &state.cov.row(column)[..width]);
             }
         }
     }
@@ -169,25 +220,51 @@ impl Workspace {
     fn spread(&self, z: &Measurement) -> Small {
         let mut s = [[0.0; MAX_MEASURED]; MAX_MEASURED];
         for i in 0..z.m {
-            let hp = self.whitened.row(i);
+            let row = self.touched.times::<MAX_MEASURED>(self.whitened.row(i));
             for j in 0..=i {
-                let value: f64 = z.row(j).iter().zip(z.columns()).map(|(h, c)| h * hp[*c]).sum();
-                (s[i][j], s[j][i]) = (value, value);
+                (s[i][j], s[j][i]) = (row[j], row[j]);
             }
         }
         s
     }
 
-    fn apply(
-        &mut self,
-        state: &mut State,
-        z: &Measurement,
-        l: &Small,
-        white: &[f64; MAX_MEASURED],
-        held: Held,
-    ) {
-        let m = z.m;
-        for i in 0..m {
+    /// Mean, covariance and copies by what [`Self::project`] left, with the widest arithmetic that the processor has. Only
+    /// the number of components done at once differs, none of them is fused: the bits are the same.
+    fn apply(&mut self, state: &mut State, l: &Small, white: &[f64], held: Held) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            unsafe { self.apply_wide(state, l, white, held) };
+            return;
+        }
+        self.apply_plain(state, l, white, held);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn apply_wide(&mut self, state: &mut State, l: &Small, white: &[f64], held: Held) {
+        self.apply_plain(state, l, white, held);
+    }
+
+    /// By the number of components, so that the compiler lays out the inner loops.
+    #[inline(always)]
+    fn apply_plain(&mut self, state: &mut State, l: &Small, white: &[f64], held: Held) {
+        match white.len() {
+            1 => self.apply_to::<1>(state, l, white, held),
+            2 => self.apply_to::<2>(state, l, white, held),
+            3 => self.apply_to::<3>(state, l, white, held),
+            4 => self.apply_to::<4>(state, l, white, held),
+            5 => self.apply_to::<5>(state, l, white, held),
+            6 => self.apply_to::<6>(state, l, white, held),
+            7 => self.apply_to::<7>(state, l, white, held),
+            _ => self.apply_to::<MAX_MEASURED>(state, l, white, held),
+        }
+    }
+
+    #[inline(always)]
+    fn apply_to<const M: usize>(&mut self, state: &mut State, l: &Small, white: &[f64], held: Held) {
+        let width = self.touched.width;
+        for i in 0..M {
             for k in 0..i {
                 self.whitened.add_row(i, -l[i][k], k);
             }
@@ -195,60 +272,49 @@ impl Workspace {
             self.whitened.row_mut(i).iter_mut().for_each(|x| *x *= scale);
         }
         self.dx.fill(0.0);
-        for (i, white) in white[..m].iter().enumerate() {
-            axpy(&mut self.dx, *white, self.whitened.row(i));
+        for i in 0..M {
+            axpy(&mut self.dx[..width], white[i], &self.whitened.row(i)[..width]);
         }
         for a in held.columns() {
             self.dx[a] = 0.0;
             held.columns().for_each(|b| self.kept.set(a, b, state.cov.at(a, b)));
         }
-        for r in 0..state.cov.rows() {
-            let row = state.cov.row_mut(r);
-            for i in 0..m {
-                let w = self.whitened.row(i);
-                axpy(row, -w[r], w);
-            }
+        let whitened: [&[f64]; M] = std::array::from_fn(|i| &self.whitened.row(i)[..width]);
+        for r in 0..width {
+            subtract_rows(&mut state.cov.row_mut(r)[..width], &whitened.map(|w| w[r]), &whitened);
         }
         for a in held.columns() {
             held.columns().for_each(|b| state.cov.set(a, b, self.kept.at(a, b)));
         }
-        for copy in state.copies_in_use() {
-            self.update_copy(copy, z, l, white);
-        }
         state.inject(&self.dx);
-        state.keep_heading_unobserved(&self.dx);
-        state.keep_scale_unobserved(&self.dx);
+        let [heading, scale] = &mut self.shears;
+        state.keep_heading_unobserved(&self.dx, heading);
+        state.keep_scale_unobserved(&self.dx, scale);
+        self.shears.iter().for_each(|shear| state.cov.shear(shear));
+        for copy in state.copies_in_use() {
+            self.update_copy::<M>(copy, l, white);
+        }
     }
 
     /// Fixed-point smoothing: the copy `c` moves by `P_cx Hᵀ S⁻¹ r`.
-    fn update_copy(
-        &mut self,
-        copy: &mut DelayedCopy,
-        z: &Measurement,
-        l: &Small,
-        white: &[f64; MAX_MEASURED],
-    ) {
-        let m = z.m;
-        let rows = copy.mean.len();
-        for c in 0..rows {
-            let cross = copy.cross.row(c);
-            let mut y = [0.0; MAX_MEASURED];
-            for (i, y) in y[..m].iter_mut().enumerate() {
-                *y = z.row(i).iter().zip(z.columns()).map(|(h, column)| h * cross[*column]).sum();
-            }
-            forward(l, m, &mut y);
-            self.gains[c] = y;
-        }
-        for c in 0..rows {
-            let y = &self.gains[c];
-            let row = copy.cross.row_mut(c);
-            for i in 0..m {
-                axpy(row, -y[i], self.whitened.row(i));
-                copy.mean[c] += y[i] * white[i];
-            }
-            for d in 0..rows {
-                let product: f64 = y[..m].iter().zip(&self.gains[d]).map(|(a, b)| a * b).sum();
+    #[inline(always)]
+    fn update_copy<const M: usize>(&mut self, copy: &mut DelayedCopy, l: &Small, white: &[f64]) {
+        let width = self.touched.width;
+        let whitened: [&[f64]; M] = std::array::from_fn(|i| &self.whitened.row(i)[..width]);
+        for c in 0..copy.mean.len() {
+            let mut y = self.touched.times::<M>(copy.cross.row(c));
+            forward(l, &mut y);
+            let cross = &mut copy.cross.row_mut(c)[..width];
+            subtract_rows(cross, &y, &whitened);
+            self.shears.iter().for_each(|shear| shear.carry(cross));
+            copy.mean[c] += y.iter().zip(white).map(|(y, white)| y * white).sum::<f64>();
+            self.gains[c][..M].copy_from_slice(&y);
+            for d in 0..=c {
+                let product: f64 = y.iter().zip(&self.gains[d]).map(|(a, b)| a * b).sum();
                 copy.cov.add(c, d, -product);
+                if d < c {
+                    copy.cov.add(d, c, -product);
+                }
             }
         }
     }
@@ -284,4 +350,56 @@ fn misfit(l: &Small, noise: &Small, m: usize, white: &[f64; MAX_MEASURED]) -> f6
         }
     }
     (square + m as f64 - trace) / m as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::blocks::Layout;
+    use crate::fitted::Learnt;
+    use crate::kind::TiltWatch;
+    use crate::own::Senses;
+
+    /// A state with some covariance, a delayed copy, and a measurement of `m` components of it.
+    fn example(m: usize) -> (State, Measurement) {
+        let layout = Layout { own: own::LEN, targets: 1, features: 2, tags: 0 };
+        let tilt = std::array::from_fn(|_| TiltWatch::default());
+        let mut state = State::new(layout, 2, Learnt::default(), Senses::default(), tilt);
+        let n = layout.len();
+        let wave = |i: usize, j: usize| ((i * 7 + j * 3) as f64 * 0.37).sin();
+        for i in 0..n {
+            for j in 0..n {
+                let product: f64 = (0..n).map(|k| wave(i, k) * wave(j, k)).sum();
+                state.cov.set(i, j, product + if i == j { 1.0 } else { 0.0 });
+            }
+        }
+        state.copy_targets(7, windhover_base::time::Span::from_ms(400.0));
+        let mut z = Measurement::default();
+        z.begin(m);
+        let (attitude, place) = (z.touch(own::ATTITUDE), z.touch(layout.target(0).pose()));
+        for i in 0..m {
+            z.set(i, attitude, &nalgebra::SMatrix::<f64, 1, 3>::from_fn(|_, k| wave(i, k + 1)));
+            z.set(i, place, &nalgebra::SMatrix::<f64, 1, 3>::from_fn(|_, k| wave(i + 3, k)));
+            (z.residual[i], z.noise[i][i]) = (wave(i, 5), 0.5);
+        }
+        (state, z)
+    }
+
+    #[test]
+    fn the_wide_arithmetic_gives_the_same_bits() {
+        for m in 1..=MAX_MEASURED {
+            let (state, z) = example(m);
+            let updated = |by: fn(&mut Workspace, &mut State, &Small, &[f64], Held)| {
+                let (mut state, mut work) = (state.clone(), Workspace::new(state.layout().len()));
+                work.project(&state, &z);
+                let mut s = work.innovation_covariance(&z);
+                assert!(cholesky(&mut s, m));
+                let mut white = z.residual;
+                forward(&s, &mut white[..m]);
+                by(&mut work, &mut state, &s, &white[..m], Held::NONE.and(own::TRIM));
+                (state.cov, state.copies[0].cross.clone(), state.copies[0].mean.clone())
+            };
+            assert_eq!(updated(Workspace::apply), updated(Workspace::apply_plain));
+        }
+    }
 }

@@ -27,7 +27,13 @@ impl Core {
         });
         let share = state.markers_outside;
         let outside = (share > OUTSIDE_SHARE).then_some((FusionSource::Marker, MisfitCause::Outside, share));
-        height.into_iter().chain(outside).chain(moving).chain(turns).chain(self.tag_misfits())
+        height
+            .into_iter()
+            .chain(self.clock_misfit())
+            .chain(outside)
+            .chain(moving)
+            .chain(turns)
+            .chain(self.tag_misfits())
     }
 }
 

@@ -15,10 +15,10 @@ use windhover_detect::{
 use crate::common;
 
 /// A generated image and where its tag's corners are.
-struct Drawn {
-    image: GrayImage,
-    corners: [Vector2<f64>; 4],
-    id: u32,
+pub struct Drawn {
+    pub image: GrayImage,
+    pub corners: [Vector2<f64>; 4],
+    pub id: u32,
 }
 
 /// Radial distortion of a lens: κ |p|² p is added to a place p off its axis, which is in the image.
@@ -44,7 +44,7 @@ impl Lens {
 }
 
 /// Takes tag coordinates (border square from −1 to 1) to pixels: a tilted square seen in perspective.
-fn random_view(rng: &mut ChaCha8Rng, edge: f64, size: f64) -> Matrix3<f64> {
+pub fn random_view(rng: &mut ChaCha8Rng, edge: f64, size: f64) -> Matrix3<f64> {
     let (turn, tilt, towards) = (
         rng.random_range(0.0..std::f64::consts::TAU),
         rng.random_range(0.0..0.5f64),
@@ -62,7 +62,7 @@ fn random_view(rng: &mut ChaCha8Rng, edge: f64, size: f64) -> Matrix3<f64> {
 }
 
 /// Reflectance at a point of the tag plane: the print, then ground.
-fn reflectance(pattern: &TagPattern, x: f64, y: f64) -> f64 {
+pub fn reflectance(pattern: &TagPattern, x: f64, y: f64) -> f64 {
     let cell = 2.0 / pattern.border as f64;
     let half = pattern.side() as f64 / 2.0;
     let (cx, cy) = (x / cell + half, y / cell + half);
@@ -121,14 +121,14 @@ fn limits(min_px: f64, max_hamming: u8) -> Limits {
     Limits { min_px, max_hamming }
 }
 
-fn found_in(detector: &mut Detector, drawn: &Drawn) -> Option<TagDetection> {
+pub fn found_in(detector: &mut Detector, drawn: &Drawn) -> Option<TagDetection> {
     let found = detector.detect(drawn.image.view());
     found.iter().find(|tag| (tag.family, tag.id) == (TagFamily::Tag36h11, drawn.id)).copied()
 }
 
 /// What corners of many tags come to.
 #[derive(Default)]
-struct Score {
+pub struct Score {
     nes: f64,
     square: f64,
     sum: Vector2<f64>,
@@ -136,7 +136,7 @@ struct Score {
 }
 
 impl Score {
-    fn add(&mut self, found: &TagDetection, drawn: &Drawn) {
+    pub fn add(&mut self, found: &TagDetection, drawn: &Drawn) {
         for (i, (seen, truth)) in found.corners_px.iter().zip(drawn.corners).enumerate() {
             let error = seen - truth;
             let inverse = found.corner_cov_px2[i].try_inverse().expect("a covariance");
@@ -148,7 +148,7 @@ impl Score {
     }
 
     /// Mean normalised error squared, RMS and mean error, pixels.
-    fn means(&self) -> (f64, f64, Vector2<f64>) {
+    pub fn means(&self) -> (f64, f64, Vector2<f64>) {
         (self.nes / self.corners, (self.square / self.corners).sqrt(), self.sum / self.corners)
     }
 }

@@ -1,6 +1,6 @@
 //! A reading of the compass, or of the second source of attitude: heading and tilt as the filter means them.
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, SMatrix, Vector3};
 
 use windhover_base::geo::Tilt;
 use windhover_base::msg::{AttitudeSample, Disposition};
@@ -8,9 +8,11 @@ use windhover_base::msg::{AttitudeSample, Disposition};
 use super::Aid;
 use super::heading::Heading;
 use super::tilt::TiltReading;
+use crate::blocks::own;
 use crate::core::Core;
+use crate::measurement::Measurement;
 use crate::models::Models;
-use crate::own::{COMPASS, SECOND};
+use crate::own::{COMPASS, Own, SECOND};
 
 /// What one compass reading counts in a sliding mean, s: the interval of a 30 Hz compass.
 pub(super) const SAMPLE_GAIN_S: f64 = 1.0 / 30.0;
@@ -18,6 +20,26 @@ pub(super) const SAMPLE_GAIN_S: f64 = 1.0 / 30.0;
 /// True heading of the aircraft from what the compass reports.
 pub(crate) fn true_heading(heading: f64, is_true: bool, models: &Models) -> f64 {
     heading + if is_true { 0.0 } else { models.declination } + models.yaw_offset
+}
+
+/// Makes of `z`, which depends on attitude by `d_attitude`, what it is a delay τ earlier: `z − τ ∂z/∂δ R ω`. Over tens of
+/// milliseconds rates hardly change. Only the compass has a delay beside that configured.
+pub(super) fn set_delay<const M: usize>(
+    z: &mut Measurement,
+    source: usize,
+    own: &Own,
+    d_attitude: &SMatrix<f64, M, 3>,
+) {
+    if source != COMPASS {
+        return;
+    }
+    let (rotation, delay_s): (&Matrix3<f64>, f64) = (own.rotation(), own.compass_delay_s);
+    let change = d_attitude * (rotation * own.rate);
+    z.block(own::COMPASS_DELAY, &-change);
+    z.block(own::RATE, &(d_attitude * rotation * -delay_s));
+    for (residual, change) in z.residual.iter_mut().zip(change.iter()) {
+        *residual += delay_s * change;
+    }
 }
 
 /// Fuses one reading of the compass: heading, then tilt.

@@ -6,7 +6,7 @@ use nalgebra::{Matrix1, RowVector3};
 use windhover_base::geo::wrap_angle;
 use windhover_base::msg::{Disposition, FusionSource};
 
-use super::compass::SAMPLE_GAIN_S;
+use super::compass::{SAMPLE_GAIN_S, set_delay};
 use super::{Aid, counted};
 use crate::blocks::own;
 use crate::core::Core;
@@ -32,10 +32,12 @@ impl<const WHICH: usize> Aid for Heading<WHICH> {
         let x = own.rotation().column(0).into_owned();
         let level2 = x.x * x.x + x.y * x.y;
         z.begin(1);
-        z.block(own::ATTITUDE, &RowVector3::new(-x.x * x.z / level2, -x.y * x.z / level2, 1.0));
+        let turned = RowVector3::new(-x.x * x.z / level2, -x.y * x.z / level2, 1.0);
+        z.block(own::ATTITUDE, &turned);
         z.block(PLACES[WHICH].heading_bias, &Matrix1::new(1.0));
         z.residual[0] = wrap_angle(self.0 - x.y.atan2(x.x) - own.errors_of(WHICH).heading_bias);
         z.noise[0][0] = state.learnt.heading_var[WHICH];
+        set_delay(z, WHICH, own, &turned);
         Ok(())
     }
 }

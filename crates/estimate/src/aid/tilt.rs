@@ -3,12 +3,12 @@
 //! specific force, `u = −Rᵀ f/|f|`, where it feels that. In steady flight the two are the same; only acceleration parts
 //! them. A sensor of unknown kind is taken as one that tells attitude, with an error e that covers the others.
 
-use nalgebra::{Matrix2, Matrix3, SMatrix, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, SMatrix, Vector2, Vector3};
 
 use windhover_base::geo::skew;
 use windhover_base::msg::{Disposition, FusionSource};
 
-use super::compass::SAMPLE_GAIN_S;
+use super::compass::{SAMPLE_GAIN_S, set_delay};
 use super::{Aid, counted};
 use crate::blocks::own;
 use crate::core::Core;
@@ -40,7 +40,7 @@ impl<const WHICH: usize> Aid for TiltReading<WHICH> {
         let (own, places, errors) = (&state.own, &PLACES[WHICH], state.own.errors_of(WHICH));
         let gain = errors.tilt_gain;
         z.begin(2);
-        let felt = match state.tilt[WHICH].felt {
+        let (felt, turned) = match state.tilt[WHICH].felt {
             Felt::Force => set_force(own, gain, z),
             Felt::Undecided | Felt::Attitude | Felt::Share => set_down(own, gain, z),
         };
@@ -52,33 +52,36 @@ impl<const WHICH: usize> Aid for TiltReading<WHICH> {
             z.residual[i] = sign * (self.down[i] - gain * felt[i]) - error;
             z.noise[i][i] = state.learnt.tilt_var[WHICH];
         }
+        set_delay(z, WHICH, own, &turned);
         Ok(())
     }
 }
 
-/// Writes what down in the body frame depends on, and gives it.
-fn set_down(own: &Own, gain: f64, z: &mut Measurement) -> Vector3<f64> {
+/// Writes what down in the body frame depends on, and gives it with the derivative of the reading by attitude.
+fn set_down(own: &Own, gain: f64, z: &mut Measurement) -> (Vector3<f64>, Matrix2x3<f64>) {
     let body_from_ned: Matrix3<f64> = own.rotation().transpose();
-    z.block(own::ATTITUDE, &in_reading(gain, &(body_from_ned * skew(&Vector3::z()))));
-    body_from_ned.column(2).into_owned()
+    let turned = in_reading(gain, &(body_from_ned * skew(&Vector3::z())));
+    z.block(own::ATTITUDE, &turned);
+    (body_from_ned.column(2).into_owned(), turned)
 }
 
-/// Writes what the direction against the specific force depends on, and gives it:
+/// Writes what the direction against the specific force depends on, and gives it with the derivative by attitude:
 /// `∂u = −(I − u uᵀ)/|f| Rᵀ (∂f + f × ∂δ)`.
-fn set_force(own: &Own, gain: f64, z: &mut Measurement) -> Vector3<f64> {
+fn set_force(own: &Own, gain: f64, z: &mut Measurement) -> (Vector3<f64>, Matrix2x3<f64>) {
     let force = Force::of(own);
     let size = force.ned.norm().max(LEAST_FORCE);
     let body_from_ned: Matrix3<f64> = own.rotation().transpose();
     let felt = -(body_from_ned * force.ned) / size;
     let d_force = (felt * felt.transpose() - Matrix3::identity()) / size * body_from_ned;
-    z.block(own::ATTITUDE, &in_reading(gain, &(d_force * (force.d_attitude + skew(&force.ned)))));
+    let turned = in_reading(gain, &(d_force * (force.d_attitude + skew(&force.ned))));
+    z.block(own::ATTITUDE, &turned);
     z.block(own::VELOCITY, &in_reading(gain, &(d_force * -own.drag_per_s)));
     z.block(own::GUST, &in_reading(gain, &(d_force * D_WIND)));
     z.block(own::THRUST, &in_reading(gain, &(d_force * force.d_thrust)));
     z.block(own::WIND, &in_reading(gain, &(d_force * D_WIND)));
     z.block(own::TRIM, &in_reading(gain, &(d_force * force.d_trim)));
     z.block(own::DRAG, &in_reading(gain, &(d_force * force.d_drag)));
-    felt
+    (felt, turned)
 }
 
 /// A force smaller than this has no direction, m/s²: nothing flies so for long.

@@ -89,6 +89,7 @@ pub(crate) mod most {
     /// Thrust over mass, by its derivative toward tilt.
     pub(crate) const FORCE: f64 = 1.3 * (super::GRAVITY + 1.5);
     pub(crate) const DELAY_S: f64 = 0.15;
+    pub(crate) const COMPASS_DELAY_S: f64 = 0.05;
     pub(crate) const DRAG: f64 = 0.4;
     pub(crate) const ARM: f64 = 0.8;
     /// Longest step of the prediction, s.
@@ -143,6 +144,7 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
     own.tilt_bias = Vector2::new(within(0.02), within(0.02));
     own.gps_delay_s = within(most::DELAY_S);
     own.drag_per_s = 0.2 + within(0.2);
+    own.compass_delay_s = within(most::COMPASS_DELAY_S);
     own.ned_from_body = ned_from_body_321(within(3.1), within(0.2), within(0.2));
     own.position.z = core.models.ground.down_m(own.position.x, own.position.y) - 12.0 + within(4.0);
     let below = own.position;

@@ -9,9 +9,10 @@ use windhover_base::msg::{
 };
 use windhover_base::settings::{EstimatorConfig, ImuConfig, TiltKind};
 use windhover_estimate::Estimator;
-use windhover_simulate::{HelicopterPath, Scenario};
+use windhover_simulate::{HelicopterPath, Scenario, World};
 
 use super::filter::{Flight, Heard, fly};
+use super::misfit::{Mover, with_movers};
 
 /// A minute around a circle in wind with gusts, 2.4 m/s² of acceleration; the compass reads a share of the tilt.
 fn circling(seed: u64, kind: TiltKind, share: f64) -> Flight {
@@ -132,4 +133,54 @@ fn rates_and_forces_that_vibrate_do_not_hurt() {
     assert!(fused.count() > 400);
     let (slope, square) = tilt_of(&flight, &out, 15.0);
     assert!((0.95..1.05).contains(&slope) && square < 2.0, "slope {slope}, square {square}");
+}
+
+/// Over a parked vehicle whose tags are not read half of the ground features are on its roof.
+#[test]
+fn features_on_a_parked_vehicle_do_not_bend_own_motion() {
+    let (mut tilt, mut heading, mut heading_blind) = (0.0, 0.0, 0.0);
+    let seeds = 3u32..7;
+    for (seed, kind) in
+        seeds.clone().map(u64::from).flat_map(|seed| [(seed, TiltKind::Inertial), (seed, TiltKind::Auto)])
+    {
+        let hovering = fly("hover10", 30.0, seed, |scenario: &mut Scenario| {
+            scenario.rig.compass.tilt = kind;
+            scenario.camera.feature_noise_px = 0.1;
+        });
+        let roof = |world: &World, _: f64| {
+            let vehicle = world.vehicle(0, world.time(0.0));
+            vec![Mover { at: [vehicle.north_m, vehicle.east_m], height_m: 0.55, spread_m: 0.4, features: 4 }]
+        };
+        let mut flight = with_movers(hovering, roof, true);
+        let without = blind(&flight);
+        for heard in &mut flight.heard {
+            if let Heard::Frame(frame) = heard {
+                frame.value.markers.clear();
+            }
+        }
+        let out = flight.outputs();
+        tilt += tilt_of(&flight, &out, 8.0).1 / (2.0 * seeds.len() as f64);
+        heading += heading_of(&flight, &out, 8.0) / (2.0 * seeds.len() as f64);
+        heading_blind += heading_of(&flight, &without, 8.0) / (2.0 * seeds.len() as f64);
+    }
+    println!("squares of tilt {tilt}, of heading {heading}, blind {heading_blind}");
+    assert!(tilt < 2.0, "square of tilt {tilt}");
+    assert!(
+        heading < f64::max(2.0, 1.2 * heading_blind),
+        "square of heading {heading}, blind {heading_blind}"
+    );
+}
+
+/// Mean square of the heading's error over what is told, from a time on.
+fn heading_of(flight: &Flight, out: &[EstimatorOutput], from_s: f64) -> f64 {
+    let late = ownships(out).filter(|own| flight.world.seconds(own.t_valid) > from_s);
+    let squares: Vec<f64> = late
+        .map(|own| {
+            let truth = flight.world.ownship(own.t_valid);
+            let error =
+                (truth.ned_from_body * own.ned_from_body.to_rotation_matrix().inverse()).scaled_axis();
+            error.z.powi(2) / own.covariance[(8, 8)]
+        })
+        .collect();
+    squares.iter().sum::<f64>() / squares.len() as f64
 }

@@ -10,20 +10,21 @@ use windhover_simulate::{
 };
 
 use super::filter::{Flight, Heard, Score, estimates, fly, score};
+use super::time::errors;
 
 /// Pixels as sharp as rendered ones: what is wrong then shows most.
 fn sharp(scenario: &mut Scenario) {
     (scenario.camera.marker_noise_px, scenario.camera.feature_noise_px) = (0.1, 0.1);
 }
 
-/// Something that goes about with features upon it, at an instant.
-struct Mover {
+/// Something that goes about, or stands, with features upon it, at an instant.
+pub(super) struct Mover {
     /// North, east, m.
-    at: [f64; 2],
+    pub(super) at: [f64; 2],
     /// Metres over the ground, and apart from each other.
-    height_m: f64,
-    spread_m: f64,
-    features: u32,
+    pub(super) height_m: f64,
+    pub(super) spread_m: f64,
+    pub(super) features: u32,
 }
 
 impl Mover {
@@ -36,7 +37,11 @@ impl Mover {
 
 /// The flight with movers' features in the place of the first of the ground's; or, where they are not `followed`, without
 /// those of the ground. Tracks end at the frame's border.
-fn with_movers(mut flight: Flight, movers: impl Fn(&World, f64) -> Vec<Mover>, followed: bool) -> Flight {
+pub(super) fn with_movers(
+    mut flight: Flight,
+    movers: impl Fn(&World, f64) -> Vec<Mover>,
+    followed: bool,
+) -> Flight {
     let world = flight.world.clone();
     let camera = world.scenario().rig.camera.clone();
     let mut noise = Stream::new(77, 0);
@@ -303,6 +308,17 @@ fn a_vehicle_that_turns_on_the_spot_is_let_turn_whatever_its_model() {
     println!("unicycle {unicycle:?}\nackermann {ackermann:?}");
     assert!(ackermann.yaw_rate <= 1.5 * unicycle.yaw_rate, "{ackermann:?}, unicycle {unicycle:?}");
     assert!(told(&out).iter().any(|(cause, _)| matches!(cause, MisfitCause::TargetTurns { target: 0 })));
+}
+
+#[test]
+fn a_vehicle_that_slides_is_no_tag_that_is_turned() {
+    let rolls = errors("follow");
+    for slip_deg in [5, 10] {
+        let slides = errors(&format!("follow+slip={slip_deg}"));
+        for (k, what) in ["heading", "speed"].into_iter().enumerate() {
+            assert!(slides[k] < 1.3 * rolls[k], "{slip_deg}°: {what} {} for {}", slides[k], rolls[k]);
+        }
+    }
 }
 
 #[test]
