@@ -469,3 +469,50 @@ fn check_marker(marker: &MarkerConfig) -> Result<(), ConfigError> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What is said of the shipped configuration with these replacements; `None` where it is taken.
+    fn refusal(replaced: &[(&str, &str)]) -> Option<String> {
+        let mut text = include_str!("../../config/windhover.toml").to_owned();
+        for (from, to) in replaced {
+            assert!(text.contains(from), "{from}");
+            text = text.replacen(from, to, 1);
+        }
+        Config::parse(&text).err().map(|error| error.to_string())
+    }
+
+    #[test]
+    fn a_line_is_shared_with_a_receiver_that_tells_its_heading_and_with_nothing_else() {
+        let shared = ("device = \"/dev/ttyS1\"", "device = \"/dev/ttyS0\"");
+        let format = |name: &'static str| ("format = \"tcm2\"", name);
+        for name in ["format = \"nmea\"", "format = \"ubx\""] {
+            assert_eq!(refusal(&[shared, format(name)]), None, "{name}");
+        }
+        let told = refusal(&[shared]).expect("a TCM2 is another device");
+        assert!(told.contains("compass.device") && told.contains("tcm2"), "{told}");
+        let other_speed = ("baud = 38400\n#", "baud = 9600\n#");
+        let told = refusal(&[shared, format("format = \"ubx\""), other_speed]).expect("one line, two speeds");
+        assert!(told.contains("compass.baud"), "{told}");
+    }
+
+    #[test]
+    fn a_receiver_is_configured_in_one_way() {
+        let on = |key: &'static str, to: &'static str| (key, to);
+        let ublox = on("#configure = false", "configure = true");
+        assert_eq!(refusal(&[ublox]), None);
+        for (more, key) in [
+            (on("#configure_garmin = false", "configure_garmin = true"), "gps.configure"),
+            (on("#format = \"auto\"", "format = \"nmea\""), "gps.configure"),
+            (on("#rate_hz = 5.0", "rate_hz = 100.0"), "gps.rate_hz"),
+            (on("device = \"/dev/ttyS0\"", "device = \"tcp://gps:2000\""), "gps.configure"),
+        ] {
+            let told = refusal(&[ublox, more]).expect(key);
+            assert!(told.contains(key), "{told}");
+        }
+        let imu = refusal(&[on("#imu = false", "imu = true")]).expect("a TCM2 tells no rates");
+        assert!(imu.contains("compass.imu"), "{imu}");
+    }
+}

@@ -67,3 +67,38 @@ impl SourceLine for CompassLine {
         self.decoder.counts()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use windhover_base::settings::CompassFormat;
+    use windhover_decode::framed;
+
+    #[test]
+    fn rates_beside_the_attitude_are_used_where_that_is_asked() {
+        let body =
+            "VNYMR,+085.1,-000.9,+000.8,+01.06,-00.25,+03.06,+00.005,+00.344,-09.758,-0.001,+0.002,-0.003";
+        let line = (framed(body) + "\r\n").into_bytes();
+        for imu in [false, true] {
+            let config = CompassConfig {
+                format: CompassFormat::Vectornav,
+                imu,
+                latency_ms: 20.0,
+                ..CompassConfig::default()
+            };
+            let (mut compass, mut out) = (CompassLine::new(&config, 5.0), Vec::new());
+            compass.push(&line, MonoTime::from_ns(1_000_000_000), 7, &mut out);
+            let [SensorReading::Attitude(attitude), rest @ ..] = &out[..] else { panic!("{out:?}") };
+            match (imu, rest) {
+                (false, []) => {}
+                (true, [SensorReading::Inertial(inertial)]) => {
+                    let rate = inertial.value.rate_rps.expect("told");
+                    assert_eq!((rate.x, rate.y, rate.z), (-0.001, 0.002, -0.003));
+                    // Each has its own latency.
+                    assert_eq!(inertial.t_valid - attitude.t_valid, Span::from_ms(15.0));
+                }
+                _ => panic!("{imu}: {rest:?}"),
+            }
+        }
+    }
+}
