@@ -78,7 +78,10 @@ impl Core {
             match target.life.verdict(self.restart_after, self.models.targets[index].moves()) {
                 Verdict::Keep => {
                     self.state.wake(&self.learning, index);
-                    self.state.targets[index].slip.open();
+                    let target = &mut self.state.targets[index];
+                    if target.life.refusals() > 1 {
+                        target.slip.open();
+                    }
                 }
                 Verdict::PlaceAnew if self.place_anew(index, markers) => return,
                 Verdict::PlaceAnew | Verdict::Start => return self.start_target(index, markers, None),

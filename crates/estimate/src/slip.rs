@@ -34,7 +34,8 @@ impl Slip {
         self.growth.exp()
     }
 
-    /// A vehicle that leaves the gate in all its markers may be sliding: the walk across is what a slide needs at once.
+    /// A vehicle that leaves the gate in all its markers, frame after frame, may be sliding: the walk across is what a slide
+    /// needs at once.
     pub(crate) fn open(&mut self) {
         self.growth = (self.growth + OPENED.ln()).min(2.0 * MOST.ln());
     }
