@@ -40,7 +40,7 @@ const fn size_of(letter: u8) -> Option<usize> {
 }
 
 impl Format {
-    /// Type, length, name[4], letters[16], labels[64].
+    /// Type and length, a name of 4 bytes, letters (16), labels (64).
     fn parse(body: &[u8]) -> Option<(u8, Self)> {
         let text = |from: usize, to: usize| {
             let bytes = body.get(from..to)?;
