@@ -28,8 +28,11 @@ impl Core {
         let sigma_s = state.cov.sigma(own::COMPASS_DELAY, 0);
         let (late_s, receiver_s) = (-state.own.compass_delay_s, -state.own.gps_delay_s);
         let known = sigma_s < WELL_KNOWN_S && late_s > LEAST_S.max(SIGMAS * sigma_s);
-        // The receiver must be nearer to the compass than to the camera, and known well enough to tell.
-        let witnessed = receiver_s > 0.5 * late_s && state.cov.sigma(own::GPS_DELAY, 0) < 0.5 * late_s;
+        // The receiver must agree with the compass, and be known well enough to tell: two that are early by different times
+        // have latencies that are not as configured.
+        let spread_s = state.cov.sigma(own::GPS_DELAY, 0);
+        let agrees = receiver_s > 0.5 * late_s && receiver_s < 1.5 * late_s + 2.0 * spread_s;
+        let witnessed = agrees && spread_s < 0.5 * late_s;
         if known && witnessed {
             self.state.move_camera_clock(late_s);
         }

@@ -85,9 +85,15 @@ fn a_camera_that_is_late_is_found_out_and_its_frames_put_where_they_belong() {
 
 #[test]
 fn another_clock_that_is_late_is_not_taken_for_the_cameras() {
-    for described in
-        ["follow", "follow+compass-late=60", "follow+gps-late=150", "hover20", "follow+stamp-jitter=3"]
-    {
+    for described in [
+        "follow",
+        "follow+compass-late=60",
+        "follow+gps-late=150",
+        // Both early, by different times.
+        "follow+compass-late=-20+gps-late=-100",
+        "hover20",
+        "follow+stamp-jitter=3",
+    ] {
         let (_, out) = flown(described, 24.0, 2);
         assert_eq!(told_late(&out), None, "{described}");
     }
