@@ -15,8 +15,8 @@ use super::state::State;
 const LEAST_S: f64 = 0.004;
 const WELL_KNOWN_S: f64 = 0.005;
 const SIGMAS: f64 = 5.0;
-/// Less than this is not told, s: exposure times and drivers have as much.
-const LEAST_TOLD_S: f64 = 0.01;
+/// Less than this is not reported, s: exposure times and drivers have as much.
+const LEAST_REPORTED_S: f64 = 0.01;
 
 impl Core {
     /// Moves the camera's clock where it is found to be late.
@@ -28,8 +28,8 @@ impl Core {
         let sigma_s = state.cov.sigma(own::COMPASS_DELAY, 0);
         let (late_s, receiver_s) = (-state.own.compass_delay_s, -state.own.gps_delay_s);
         let known = sigma_s < WELL_KNOWN_S && late_s > LEAST_S.max(SIGMAS * sigma_s);
-        // The receiver must agree with the compass, and be known well enough to tell: two that are early by different times
-        // have latencies that are not as configured.
+        // The receiver must agree with the compass, and its delay be known well enough: two that are early by different
+        // times have latencies that are not as configured.
         let spread_s = state.cov.sigma(own::GPS_DELAY, 0);
         let agrees = receiver_s > 0.5 * late_s && receiver_s < 1.5 * late_s + 2.0 * spread_s;
         let witnessed = agrees && spread_s < 0.5 * late_s;
@@ -43,7 +43,11 @@ impl Core {
         let moved_s = self.state.camera_late_s;
         // What was found since it was moved last counts as well.
         let late_s = moved_s - self.state.own.compass_delay_s;
-        (moved_s > 0.0 && late_s > LEAST_TOLD_S).then_some((FusionSource::Marker, MisfitCause::Late, late_s))
+        (moved_s > 0.0 && late_s > LEAST_REPORTED_S).then_some((
+            FusionSource::Marker,
+            MisfitCause::Late,
+            late_s,
+        ))
     }
 }
 

@@ -141,11 +141,10 @@ fn noise_tells_of_a_wrong_speed() {
     assert!(text.contains("38400 baud"), "{text}");
 }
 
-/// A Garmin receiver at the far end of a line, which is deaf and speaks noise at any speed but its own. In its
-/// binary mode it knows packets only.
-fn garmin_at(mut far: File, mut own: u32, mut binary: bool) {
+/// What arrives at the far end of a line, read by a thread of its own.
+fn received_at(far: &File) -> Receiver<Vec<u8>> {
     let mut reader = far.try_clone().expect("a second handle");
-    let (sender, asked) = channel::<Vec<u8>>();
+    let (sender, received) = channel();
     std::thread::spawn(move || {
         let mut buffer = [0; 256];
         while let Ok(count) = reader.read(&mut buffer) {
@@ -154,7 +153,18 @@ fn garmin_at(mut far: File, mut own: u32, mut binary: bool) {
             }
         }
     });
-    let speed = |far: &File| rustix::termios::tcgetattr(far).map_or(0, |line| line.output_speed());
+    received
+}
+
+/// The speed at which a line is driven, bits/s; zero where it cannot be known.
+fn speed(line: &File) -> u32 {
+    rustix::termios::tcgetattr(line).map_or(0, |line| line.output_speed())
+}
+
+/// A Garmin receiver at the far end of a line, which is deaf and speaks noise at any speed but its own. In its
+/// binary mode it knows packets only.
+fn garmin_at(mut far: File, mut own: u32, mut binary: bool) {
+    let asked = received_at(&far);
     std::thread::spawn(move || {
         let (mut heard, mut told) = (String::new(), own);
         loop {
@@ -226,17 +236,7 @@ fn a_receiver_left_in_binary_mode_is_told_to_speak_nmea() {
 
 /// A u-blox receiver at the far end of a line, at its own speed. Of keys, or of messages and ports.
 fn ublox_at(mut far: File, mut own: u32, has_keys: bool) {
-    let mut reader = far.try_clone().expect("a second handle");
-    let (sender, asked) = channel::<Vec<u8>>();
-    std::thread::spawn(move || {
-        let mut buffer = [0; 256];
-        while let Ok(count) = reader.read(&mut buffer) {
-            if sender.send(buffer[..count].to_vec()).is_err() {
-                return;
-            }
-        }
-    });
-    let speed = |far: &File| rustix::termios::tcgetattr(far).map_or(0, |line| line.output_speed());
+    let asked = received_at(&far);
     std::thread::spawn(move || {
         loop {
             let said = asked.recv_timeout(Duration::from_millis(100)).unwrap_or_default();
