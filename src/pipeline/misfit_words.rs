@@ -71,6 +71,21 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
              detector.ground_features = 0"
                 .into(),
         ),
+        MisfitCause::TargetSways { target } => MisfitWords {
+            source: target_name(rig, target),
+            kind,
+            figure: format!("{:.1} cm", 100.0 * figure),
+            cause: "its body rolls, pitches or heaves on its springs".into(),
+            advice: "nothing: the estimate allows for it, with a larger sigma of speed; markers mounted lower move less"
+                .into(),
+        },
+        MisfitCause::TargetSlides { target } => MisfitWords {
+            source: target_name(rig, target),
+            kind,
+            figure: format!("{figure:.0} times"),
+            cause: "it moves across its heading".into(),
+            advice: "nothing where it slides: the estimate allows for it; else check yaw_deg of its markers".into(),
+        },
         MisfitCause::TargetTurns { target } => MisfitWords {
             source: target_name(rig, target),
             kind,
@@ -94,6 +109,8 @@ const fn kind(cause: MisfitCause) -> &'static str {
         MisfitCause::Height => "height",
         MisfitCause::MovingGround => "moving_ground",
         MisfitCause::TargetTurns { .. } => "target_turns",
+        MisfitCause::TargetSways { .. } => "target_sways",
+        MisfitCause::TargetSlides { .. } => "target_slides",
         MisfitCause::Late => "late",
     }
 }

@@ -1,7 +1,7 @@
 //! Which part of the joint state lies in which columns of the error state.
 //!
 //! Order: the helicopter and its sensors' slow errors ([`own`], as many as there are sensors), each target
-//! ([`TargetBlock`]), each ground feature (two columns), each fitted tag ([`TagFitBlock`]). A new state of the helicopter is a
+//! ([`TargetBlock`]), each ground feature (two columns), each fitted tag ([`TagFitBlock`]), the sway of each target. A new state of the helicopter is a
 //! constant of [`own`].
 
 use std::ops::Range;
@@ -123,6 +123,9 @@ pub(crate) const TARGET: usize = 5;
 /// Length of a feature's part: north, east.
 pub(crate) const FEATURE: usize = 2;
 
+/// Length of a vehicle's sway: roll, pitch, heave of its body.
+pub(crate) const SWAY: usize = 3;
+
 /// Length of a tag's part: logarithm of its size, place forward and right, turn, each beside its configuration.
 pub(crate) const TAG_FIT: usize = 4;
 
@@ -197,7 +200,7 @@ pub(crate) struct Layout {
 impl Layout {
     /// Length of the error state.
     pub(crate) const fn len(self) -> usize {
-        self.tag(self.tags).0.0
+        self.sway(self.targets).0
     }
 
     /// The states of the helicopter's part that move by themselves.
@@ -218,6 +221,11 @@ impl Layout {
     /// The fit of tag `i`.
     pub(crate) const fn tag(self, i: usize) -> TagFitBlock {
         TagFitBlock(Block(self.feature(self.features).0 + TAG_FIT * i))
+    }
+
+    /// The sway of target `i`.
+    pub(crate) const fn sway(self, i: usize) -> Block<SWAY> {
+        Block(self.tag(self.tags).0.0 + SWAY * i)
     }
 
     /// Every pair of columns that is a place on the ground: of targets, then of features.
@@ -242,7 +250,8 @@ mod tests {
         assert_eq!(layout.target(1).all().column(0), layout.target(0).yaw_rate().end());
         assert_eq!(layout.feature(0).column(0), layout.target(1).all().end());
         assert_eq!(layout.feature(2).end(), layout.tag(0).all().column(0));
-        assert_eq!(layout.tag(1).all().end(), layout.len());
+        assert_eq!(layout.tag(1).all().end(), layout.sway(0).column(0));
+        assert_eq!(layout.sway(1).end(), layout.len());
         let places: Vec<_> = layout.places().map(Block::range).collect();
         assert_eq!(places.len(), 5);
         assert_eq!(places[4].end, layout.tag(0).all().column(0));

@@ -51,8 +51,7 @@ impl Core {
 
     /// Fuses the markers of a target that is held.
     fn fuse_seen(&mut self, index: usize, markers: &[MarkerDetection]) {
-        let (before, since_s) =
-            (self.state.across(index), (self.state.t - self.state.targets[index].last_seen).s());
+        let before = self.before_fusion(index);
         let mut accepted = false;
         for detection in markers {
             if let Some((target, marker)) = self.models.find(detection.marker)
@@ -72,7 +71,7 @@ impl Core {
         if accepted {
             target.life = target.life.accepted();
             target.last_seen = t;
-            self.learn_slip(index, &before, since_s);
+            self.judge_vehicle(index, &before);
         } else {
             target.life = target.life.refused();
             match target.life.verdict(self.restart_after, self.models.targets[index].moves()) {

@@ -41,6 +41,7 @@ mod spin;
 mod standstill;
 mod start;
 mod state;
+mod sway;
 mod tag_fit;
 mod track;
 mod twins;

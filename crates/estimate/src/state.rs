@@ -17,6 +17,7 @@ use super::own::{Own, Senses};
 use super::slip::Slip;
 use super::spin::Spin;
 use super::standstill::{Standstill, Unrest};
+use super::sway::Sway;
 use super::tag_fit::{Scale, ScaleTest, TagFit};
 use super::track::Life;
 use super::twins::Twin;
@@ -48,6 +49,7 @@ pub(crate) struct Target {
     pub(crate) spin: Spin,
     pub(crate) turn_judged: MonoTime,
     pub(crate) slip: Slip,
+    pub(crate) sway: Sway,
     /// Whether it is about to move again, where it stands.
     pub(crate) unrest: Unrest,
 }
@@ -221,6 +223,7 @@ impl State {
         let add = |mean: &mut [f64], step: &[f64]| mean.iter_mut().zip(step).for_each(|(x, d)| *x += d);
         for (i, target) in self.targets.iter_mut().enumerate() {
             add(&mut target.mean, &dx[layout.target(i).all().range()]);
+            add(&mut target.sway.mean, &dx[layout.sway(i).range()]);
         }
         for (i, feature) in self.features.iter_mut().enumerate() {
             add(&mut feature.mean, &dx[layout.feature(i).range()]);

@@ -267,6 +267,16 @@ pub enum MisfitCause {
         /// Index of the target in the configuration.
         target: usize,
     },
+    /// The body of a vehicle sways on its springs. Figure: standard deviation of its markers' displacement, m.
+    TargetSways {
+        /// Index of the target in the configuration.
+        target: usize,
+    },
+    /// A vehicle slides across its heading. Figure: the walk of its side slip over `slip_mps`.
+    TargetSlides {
+        /// Index of the target in the configuration.
+        target: usize,
+    },
     /// Its measurements are true earlier than their stamps say. Figure: by how much, s.
     Late,
 }

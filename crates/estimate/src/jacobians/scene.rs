@@ -15,6 +15,7 @@ use crate::blocks::{Block, own};
 use crate::core::Core;
 use crate::own::GRAVITY;
 use crate::state::State;
+use crate::sway::Sway;
 use crate::track::{Evidence, Life};
 
 /// A car with a tag and a disc, a rover, a tag on the ground; lever arms, lens and mount as crooked as a real one's.
@@ -160,6 +161,10 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
     for tag in &mut state.tags {
         tag.mean = [within(0.05), within(0.05), within(0.05), within(0.1)];
     }
+    for target in &mut state.targets {
+        target.sway = Sway::presumed();
+        target.sway.mean = [within(0.05), within(0.05), within(0.05)];
+    }
     core
 }
 
@@ -210,6 +215,9 @@ pub(crate) fn difference(to: &State, from: &State) -> Vec<f64> {
     }
     for i in 0..layout.tags {
         put(layout.tag(i).all().range(), &less(&to.tags[i].mean, &from.tags[i].mean));
+    }
+    for i in 0..layout.targets {
+        put(layout.sway(i).range(), &less(&to.targets[i].sway.mean, &from.targets[i].sway.mean));
     }
     dx
 }

@@ -131,6 +131,7 @@ impl State {
                 models.targets[i].motion.model().add_noise(mean, dt, walks, at, &mut self.cov);
             }
         }
+        self.advance_sways(dt, models);
         step.advance(&mut self.own);
         for (target, model) in self.targets.iter_mut().zip(&models.targets) {
             if target.life.is_held() {
@@ -152,5 +153,6 @@ impl State {
             let mut grids = std::iter::once(&mut *cov).chain(crosses.filter(|_| with_copies));
             models.targets[i].motion.model().carry(&target.mean, step.dt(), layout.target(i), &mut grids);
         }
+        self.carry_sways(step.dt(), with_copies);
     }
 }

@@ -10,7 +10,7 @@ use windhover_simulate::{
 };
 
 use super::filter::{Flight, Heard, Score, estimates, fly, score};
-use super::time::errors;
+use super::time::{errors, flown};
 
 /// Pixels as sharp as rendered ones: what is wrong then shows most.
 fn sharp(scenario: &mut Scenario) {
@@ -318,6 +318,24 @@ fn a_vehicle_that_slides_is_no_tag_that_is_turned() {
         for (k, what) in ["heading", "speed"].into_iter().enumerate() {
             assert!(slides[k] < 1.3 * rolls[k], "{slip_deg}°: {what} {} for {}", slides[k], rolls[k]);
         }
+    }
+}
+
+#[test]
+fn a_vehicle_that_sways_on_its_springs_is_no_worse_than_its_sway() {
+    let (world, out) = flown("follow", 25.0, 3);
+    let still = score(&estimates(&out), &world, 6.0);
+    for deviation in ["sway=3+bounce=5", "sway=3", "bounce=5"] {
+        let (world, out) = flown(&format!("follow+{deviation}"), 25.0, 3);
+        let score = score(&estimates(&out), &world, 6.0);
+        println!("{deviation}: {score:?}");
+        assert!(score.coverage >= 0.99 && score.nees <= 4.2, "{deviation}: {score:?}");
+        assert!(
+            score.heading < 1.3 * still.heading && score.speed < 6.0 * still.speed,
+            "{deviation}: {score:?}"
+        );
+        let sways = |(cause, _): &(MisfitCause, f64)| matches!(cause, MisfitCause::TargetSways { target: 0 });
+        assert!(told(&out).iter().any(sways), "{deviation}");
     }
 }
 
