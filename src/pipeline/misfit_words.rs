@@ -71,6 +71,11 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
              detector.ground_features = 0"
                 .into(),
         ),
+        MisfitCause::AntennaPlace => of_source(
+            format!("{figure:.2} m"),
+            "the receiver's antenna is not where gps.antenna_position_m has it, by how it swings in turns".into(),
+            "measure the antenna's place from the body frame's origin again".into(),
+        ),
         MisfitCause::TargetSways { target } => MisfitWords {
             source: target_name(rig, target),
             kind,
@@ -110,6 +115,7 @@ const fn kind(cause: MisfitCause) -> &'static str {
         MisfitCause::MovingGround => "moving_ground",
         MisfitCause::TargetTurns { .. } => "target_turns",
         MisfitCause::TargetSways { .. } => "target_sways",
+        MisfitCause::AntennaPlace => "antenna_place",
         MisfitCause::TargetSlides { .. } => "target_slides",
         MisfitCause::Late => "late",
     }

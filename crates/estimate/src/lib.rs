@@ -4,6 +4,7 @@
 pub mod align;
 mod aid;
 mod anchor;
+mod antenna;
 pub mod batch;
 mod begin;
 mod blocks;

@@ -41,6 +41,8 @@ pub(crate) struct Own {
     pub(crate) gps_delay_s: f64,
     pub(crate) drag_per_s: f64,
     pub(crate) compass_delay_s: f64,
+    /// By how much the antenna is elsewhere than configured, forward and right, m.
+    pub(crate) arm: Vector2<f64>,
     /// Of the gyros, rad/s, and of the accelerometers, m/s², body axes.
     pub(crate) rate_bias: Vector3<f64>,
     pub(crate) force_bias: Vector3<f64>,
@@ -111,6 +113,7 @@ impl Default for Own {
             gps_delay_s: 0.0,
             drag_per_s: 0.0,
             compass_delay_s: 0.0,
+            arm: Vector2::zeros(),
             rate_bias: Vector3::zeros(),
             force_bias: Vector3::zeros(),
             second: AttitudeErrors::default(),
@@ -169,7 +172,7 @@ struct Slow {
 }
 
 /// The slow states in the order of their columns.
-const SLOW: [Slow; 18] = [
+const SLOW: [Slow; 19] = [
     Slow {
         first: place(own::GUST),
         mean: |own| own.gust.as_mut_slice(),
@@ -250,6 +253,12 @@ const SLOW: [Slow; 18] = [
         wander: Wander::Walk(1e-4),
     },
     Slow {
+        first: place(own::ARM),
+        mean: |own| own.arm.as_mut_slice(),
+        start_var: |_| [ARM_SIGMA_M * ARM_SIGMA_M; 3],
+        wander: Wander::Walk(0.0),
+    },
+    Slow {
         first: place(own::RATE_BIAS),
         mean: |own| own.rate_bias.as_mut_slice(),
         start_var: |terms| [terms.models.rate_bias_var; 3],
@@ -288,6 +297,9 @@ const SLOW: [Slow; 18] = [
     },
 ];
 
+/// How well an antenna's place is measured, m.
+pub(crate) const ARM_SIGMA_M: f64 = 0.1;
+
 /// Drag at the start, 1/s: of a small rotorcraft 0.1 to 0.3 is usual, and every one has some.
 pub(crate) const START_DRAG_PER_S: f64 = 0.2;
 
@@ -300,6 +312,11 @@ impl Own {
     /// `ned_from_body` as a matrix.
     pub(crate) fn rotation(&self) -> &Matrix3<f64> {
         self.ned_from_body.matrix()
+    }
+
+    /// Where the antenna is, body axes, by what is configured, m.
+    pub(crate) fn antenna(&self, configured: &Vector3<f64>) -> Vector3<f64> {
+        configured + Vector3::new(self.arm.x, self.arm.y, 0.0)
     }
 
     /// Velocity of a point at `lever_m` in the body frame: `v + R (ω × l)`.

@@ -124,6 +124,8 @@ pub(crate) struct State {
     pub(crate) height: HeightCheck,
     /// By how much lower than configured the ground lies, m: the receiver's heights are over that.
     pub(crate) ground_lower_m: f64,
+    /// Whether the antenna's place was found to be measured wrongly.
+    pub(crate) antenna_anywhere: bool,
     /// By how much earlier than stamped frames are true, as was found out, s.
     pub(crate) camera_late_s: f64,
     /// When the scene was last anchored anew, and by how much it moved.
@@ -174,6 +176,7 @@ impl State {
         self.alive = other.alive;
         self.own = other.own;
         (self.ground_lower_m, self.camera_late_s) = (other.ground_lower_m, other.camera_late_s);
+        self.antenna_anywhere = other.antenna_anywhere;
         self.own_columns = other.own_columns;
         self.senses = other.senses;
         self.fits = other.fits;
@@ -194,6 +197,7 @@ impl State {
         self.features.fill(Feature::default());
         self.tags.fill(TagFit::default());
         self.scale = None;
+        self.antenna_anywhere = false;
         self.cov.fill(0.0);
         self.past_motion.in_use = false;
         self.copies.iter_mut().for_each(|copy| copy.in_use = false);

@@ -39,6 +39,7 @@ impl Core {
         height
             .into_iter()
             .chain(self.clock_misfit())
+            .chain(self.antenna_misfit())
             .chain(outside)
             .chain(moving)
             .chain(turns)
