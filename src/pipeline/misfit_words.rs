@@ -71,6 +71,11 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
              detector.ground_features = 0"
                 .into(),
         ),
+        MisfitCause::Wanders => of_source(
+            format!("{figure:.1} times"),
+            "the receiver's slow error wanders farther than configured, against what is seen of vehicles and ground".into(),
+            "raise gps.bias_sigma_m: positions are allowed to be as far off meanwhile".into(),
+        ),
         MisfitCause::AntennaPlace => of_source(
             format!("{figure:.2} m"),
             "the receiver's antenna is not where gps.antenna_position_m has it, by how it swings in turns".into(),
@@ -116,6 +121,7 @@ const fn kind(cause: MisfitCause) -> &'static str {
         MisfitCause::TargetTurns { .. } => "target_turns",
         MisfitCause::TargetSways { .. } => "target_sways",
         MisfitCause::AntennaPlace => "antenna_place",
+        MisfitCause::Wanders => "wanders",
         MisfitCause::TargetSlides { .. } => "target_slides",
         MisfitCause::Late => "late",
     }

@@ -92,6 +92,7 @@ const fn where_it_fits(cause: MisfitCause) -> f64 {
         MisfitCause::TiltKind(_)
         | MisfitCause::Noise
         | MisfitCause::MarkerSize(_)
+        | MisfitCause::Wanders
         | MisfitCause::TargetTurns { .. }
         | MisfitCause::TargetSlides { .. } => 1.0,
         _ => 0.0,

@@ -33,6 +33,7 @@ mod motion;
 mod output;
 mod own;
 mod paper;
+mod receiver_error;
 mod resume;
 mod senses;
 mod shape;

@@ -112,6 +112,8 @@ pub(crate) struct State {
     pub(crate) copies: Vec<DelayedCopy>,
     /// Rates and forces as they were a moment ago, to fit their intensity from.
     pub(crate) past_motion: DelayedCopy,
+    /// The receiver's horizontal error as it was some seconds ago, likewise.
+    pub(crate) past_bias: DelayedCopy,
     pub(crate) learnt: Learnt,
     /// What the sensors are taken to be.
     pub(crate) senses: Senses,
@@ -149,6 +151,7 @@ impl State {
             cov: Grid::zeros(n, n),
             copies: vec![DelayedCopy::of_targets(layout); copies],
             past_motion: DelayedCopy::of_states(own::MOTION.range().len(), n),
+            past_bias: DelayedCopy::of_states(2, n),
             learnt,
             senses,
             tilt,
@@ -164,6 +167,7 @@ impl State {
             mine.copy_from(theirs);
         }
         self.past_motion.copy_from(&other.past_motion);
+        self.past_bias.copy_from(&other.past_bias);
         self.rejections = other.rejections;
         self.anchored = other.anchored;
         self.height = other.height;
@@ -199,7 +203,7 @@ impl State {
         self.scale = None;
         self.antenna_anywhere = false;
         self.cov.fill(0.0);
-        self.past_motion.in_use = false;
+        (self.past_motion.in_use, self.past_bias.in_use) = (false, false);
         self.copies.iter_mut().for_each(|copy| copy.in_use = false);
     }
 

@@ -214,9 +214,9 @@ impl State {
     /// Carries the covariance of sways on: `row ← row Fᵀ` for all rows of a grid.
     pub(crate) fn carry_sways(&mut self, dt: f64, with_copies: bool) {
         let (decay, layout) = ((-dt / CORRELATION_S).exp(), self.layout());
-        let Self { cov, copies, past_motion, targets, .. } = self;
+        let Self { cov, copies, past_motion, past_bias, targets, .. } = self;
         for (i, _) in targets.iter().enumerate().filter(|(_, target)| target.sway.is_open()) {
-            let crosses = delayed::in_use(copies, past_motion).map(|copy| &mut copy.cross);
+            let crosses = delayed::in_use(copies, [past_motion, past_bias]).map(|copy| &mut copy.cross);
             for grid in std::iter::once(&mut *cov).chain(crosses.filter(|_| with_copies)) {
                 for row in 0..grid.rows() {
                     grid.row_mut(row)[layout.sway(i).range()].iter_mut().for_each(|x| *x *= decay);

@@ -277,6 +277,8 @@ pub enum MisfitCause {
         /// Index of the target in the configuration.
         target: usize,
     },
+    /// The receiver's slow error wanders farther than configured. Figure: how many times as far.
+    Wanders,
     /// The receiver's antenna is elsewhere than configured. Figure: by how much, m.
     AntennaPlace,
     /// Its measurements are true earlier than their stamps say. Figure: by how much, s.

@@ -311,6 +311,29 @@ fn a_vehicle_that_turns_on_the_spot_is_let_turn_whatever_its_model() {
 }
 
 #[test]
+fn a_receiver_that_wanders_farther_than_configured_is_found_out() {
+    let of_flight = |seed: u64| {
+        let (world, out) = flown("follow+gps-wander=3", 40.0, seed);
+        let late = out.iter().filter_map(|output| match output {
+            EstimatorOutput::Estimate(e) if world.seconds(e.t_valid) > 6.0 => Some(e),
+            _ => None,
+        });
+        let squares: Vec<f64> = late
+            .map(|e| {
+                let (state, truth) = (e.state.expect("tracked"), world.vehicle(0, e.t_valid));
+                let covariance = state.covariance.expect("told").fixed_view::<2, 2>(0, 0).into_owned();
+                let error = Vector2::new(state.north_m - truth.north_m, state.east_m - truth.east_m);
+                error.dot(&(covariance.try_inverse().expect("positive definite") * error))
+            })
+            .collect();
+        squares.iter().sum::<f64>() / squares.len() as f64
+    };
+    // Nine times the variance configured: not fitted the mean is 12.
+    let mean = (1..7).map(of_flight).sum::<f64>() / 6.0;
+    assert!(mean < 5.0, "{mean}");
+}
+
+#[test]
 fn a_vehicle_that_slides_is_no_tag_that_is_turned() {
     let rolls = errors("follow");
     for slip_deg in [5, 10] {
