@@ -1,4 +1,4 @@
-//! Device tasks: what a device reports becomes events for the pipeline and lines for the operator.
+//! Device tasks: reports of a device become events for the pipeline and log events for the operator.
 
 use std::sync::Arc;
 
@@ -17,7 +17,7 @@ use super::events::{self, OperatorEvent};
 use super::presence::PartState;
 use super::supervise::Heart;
 
-/// Reads the GPS line until the end is asked for.
+/// Reads the GPS line until a stop is requested.
 pub async fn gps(config: Arc<Config>, context: TaskContext, heart: Heart) {
     let settings = SerialSettings {
         device: config.gps.device.clone(),
@@ -29,7 +29,7 @@ pub async fn gps(config: Arc<Config>, context: TaskContext, heart: Heart) {
     line(Part::Gps, Source::Gps, &settings, context, heart).await;
 }
 
-/// How the receiver is to be configured. Its sentences stay on where they tell the heading.
+/// How the receiver is to be configured. Its NMEA sentences stay enabled where they carry the heading.
 fn setup(config: &Config) -> Option<Setup> {
     let (gps, compass) = (&config.gps, &config.compass);
     let keep_text = shares_line(gps, compass) && compass.format == CompassFormat::Nmea;
@@ -40,7 +40,7 @@ fn setup(config: &Config) -> Option<Setup> {
     }
 }
 
-/// Reads the compass line until the end is asked for.
+/// Reads the compass line until a stop is requested.
 pub async fn compass(config: Arc<Config>, context: TaskContext, heart: Heart) {
     let settings = SerialSettings {
         device: config.compass.device.clone(),
@@ -59,7 +59,7 @@ async fn line(part: Part, source: Source, settings: &SerialSettings, context: Ta
     stop.run_until_cancelled(serial::run(settings, clock, &reports)).await;
 }
 
-/// Hears the autopilot, and sends it what is to be sent, until the end is asked for.
+/// Receives from the autopilot and sends to it, until a stop is requested.
 pub async fn autopilot(config: Arc<Config>, outgoing: ToAutopilot, context: TaskContext, heart: Heart) {
     let Some(autopilot) = &config.autopilot else { return };
     let key = config.mavlink.signing_key.clone();
@@ -86,7 +86,7 @@ pub async fn autopilot(config: Arc<Config>, outgoing: ToAutopilot, context: Task
     stop.run_until_cancelled(autopilot::run(&settings, &outgoing, clock, &reports)).await;
 }
 
-/// Takes frames until the end is asked for.
+/// Takes frames until a stop is requested.
 pub async fn camera(config: Arc<Config>, context: TaskContext, heart: Heart) {
     let settings = CameraSettings {
         device: config.camera.device.clone(),
@@ -101,15 +101,15 @@ pub async fn camera(config: Arc<Config>, context: TaskContext, heart: Heart) {
     stop.run_until_cancelled(camera::run(&settings, clock, &reports)).await;
 }
 
-/// Watches the receiver's pulse until the end is asked for. A pulse line that is missing costs nothing
-/// but accuracy: it is no part that readiness waits for.
+/// Reads the receiver's pulse until a stop is requested. Without the pulse line only accuracy is lost, so readiness
+/// does not wait for it.
 pub async fn pulses(device: String, context: TaskContext, heart: Heart) {
     let reports = |report| plain(report, "pps", &heart);
     let pulse = |t| context.events.put(t, EventBody::Pulse);
     context.stop.run_until_cancelled(pps::run(&device, context.clock, &reports, &pulse)).await;
 }
 
-/// What a device reports that delivers neither bytes nor frames.
+/// Reports of a device that delivers neither bytes nor frames.
 fn plain(report: Report, name: &str, heart: &Heart) {
     heart.beat();
     match report {

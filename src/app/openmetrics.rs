@@ -1,29 +1,30 @@
-//! Health as OpenMetrics, for Prometheus and its kin (<https://github.com/prometheus/OpenMetrics>, version 1.0).
+//! Health as OpenMetrics, for Prometheus and compatible programs (<https://github.com/prometheus/OpenMetrics>, version
+//! 1.0).
 
 use std::fmt::Write as _;
 
 use crate::io::proto::windhover::{Health, TrackStatus};
 
-/// What answers name as their kind.
+/// The content type of answers.
 pub const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
-/// What is told of one payload.
+/// The state of one payload.
 #[derive(Clone, Debug)]
 pub struct Told<'a> {
-    /// Its name; empty where it tells of itself.
+    /// Its name; empty where the payload itself answers.
     pub payload: &'a str,
     /// Its latest health.
     pub health: &'a Health,
-    /// How old that is, where somebody else tells it.
+    /// Its age, where a station answers for the payload.
     pub age_s: Option<f64>,
-    /// Whether it is connected, and the round trip, where there is a link.
+    /// Whether it is connected, and the round-trip time, where there is a link.
     pub link: Option<(bool, f64)>,
 }
 
-/// Labels and a figure.
+/// Labels and a value.
 type Sample = (Vec<(&'static str, String)>, f64);
 
-/// One kind of figure: name, gauge or counter, what it is, where it comes from.
+/// One kind of value: name, gauge or counter, description, source.
 struct Family {
     name: &'static str,
     kind: &'static str,
@@ -32,11 +33,11 @@ struct Family {
 }
 
 const FAMILIES: &[Family] = &[
-    gauge("windhover_health_age_seconds", "Age of all that follows.", |t| one(t.age_s)),
+    gauge("windhover_health_age_seconds", "Age of all values of the payload.", |t| one(t.age_s)),
     gauge("windhover_link_up", "Whether the payload is connected.", |t| {
         one(t.link.map(|(up, _)| f64::from(u8::from(up))))
     }),
-    gauge("windhover_link_round_trip_seconds", "Round trip to the payload.", |t| {
+    gauge("windhover_link_round_trip_seconds", "Round-trip time to the payload.", |t| {
         one(t.link.map(|(_, ms)| ms * 1e-3))
     }),
     gauge("windhover_source_rate_hertz", "Messages of a source in the last second.", |t| {
@@ -52,7 +53,7 @@ const FAMILIES: &[Family] = &[
     counter("windhover_source_dropped", "Messages of a source lost before they were recorded.", |t| {
         sources(t, |s| Some(s.dropped as f64))
     }),
-    counter("windhover_measurements", "Measurements by what became of them in the filter.", |t| {
+    counter("windhover_measurements", "Measurements by their disposition in the filter.", |t| {
         let of = |(what, count): (&String, &u64)| (vec![("disposition", what.clone())], *count as f64);
         t.health.dispositions.iter().map(of).collect()
     }),
@@ -61,7 +62,7 @@ const FAMILIES: &[Family] = &[
     gauge("windhover_clock_sigma_seconds", "One sigma of the fit from UTC to host time.", |t| {
         one(Some(t.health.clock_sigma_ms).filter(|ms| *ms >= 0.0).map(|ms| ms * 1e-3))
     }),
-    gauge("windhover_target_status", "1 for the status that holds.", |t| {
+    gauge("windhover_target_status", "1 for the present status.", |t| {
         let all = [
             (TrackStatus::Lost, "lost"),
             (TrackStatus::Acquiring, "acquiring"),
@@ -76,7 +77,7 @@ const FAMILIES: &[Family] = &[
     }),
     gauge(
         "windhover_target_frames_seen",
-        "Frames of the last second in which a marker of it was seen.",
+        "Frames of the last second in which a marker of the target was seen.",
         |t| {
             let of = |target: &crate::io::proto::windhover::TargetHealth| {
                 (vec![("target", target.name.clone())], f64::from(target.frames_seen))
@@ -85,12 +86,12 @@ const FAMILIES: &[Family] = &[
         },
     ),
     gauge("windhover_target_sigma", "One sigma of a target's state, in metres, radians and seconds.", sigmas),
-    gauge("windhover_misfits", "What does not fit the configuration now.", |t| {
+    gauge("windhover_misfits", "Present misfits of the configuration.", |t| {
         one(Some(t.health.misfits.len() as f64))
     }),
     gauge(
         "windhover_figure",
-        "Figures of the daemon: card, link, temperature, latency; the name tells the unit.",
+        "Values of the daemon: card, link, temperature, latency; the name gives the unit.",
         |t| {
             let of = |(name, figure): (&String, &f64)| (vec![("name", name.clone())], *figure);
             let mut all: Vec<Sample> = t.health.figures.iter().map(of).collect();
@@ -123,7 +124,7 @@ fn sources(
     told.health.sources.iter().filter_map(sample).collect()
 }
 
-/// Of the covariance's diagonal.
+/// One sigmas, from the covariance's diagonal.
 fn sigmas(told: &Told<'_>) -> Vec<Sample> {
     const DIAGONAL: [(usize, &str); 5] =
         [(0, "north_m"), (5, "east_m"), (9, "heading_rad"), (12, "speed_mps"), (14, "yaw_rate_radps")];

@@ -94,7 +94,7 @@ fn the_configuration_is_read_again() {
     // When the file is broken, then the old configuration stays.
     bench.configure(|text| text.replace("baud = 38400", "baud = \"fast\""));
     daemon.signal(Signal::HUP);
-    daemon.wait(&["event=reload_refused", "the old one stays"]);
+    daemon.wait(&["event=reload_refused", "the previous configuration stays"]);
 }
 
 #[test]

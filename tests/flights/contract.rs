@@ -284,7 +284,7 @@ fn a_log_in_which_nothing_is_understood_is_an_error() {
             let run = windhover(&["decode", device, log, "--json"], dir.path());
             assert_eq!(run.status.code(), Some(1), "{device} {log}");
             let said = said(&run);
-            assert!(said.contains(log) && said.contains("nothing in it is understood"), "{said}");
+            assert!(said.contains(log) && said.contains("it has nothing decodable"), "{said}");
             assert!(said.contains("0 used"), "the counts are told all the same: {said}");
         }
     }

@@ -48,7 +48,7 @@ fn own_states_come_at_their_own_rate_in_every_output() {
     blind_capture(dir);
     // When a flight without frames is replayed.
     let said = windhover(dir, &["replay", "blind.mcap", "--out", "flight.mcap"]);
-    assert!(said.contains("0 frames") && said.contains("no frame came"), "{said}");
+    assert!(said.contains("0 frames") && said.contains("no frame was received"), "{said}");
     windhover(dir, &["export", "flight.mcap", "--format", "csv", "--out", "tables"]);
     // Then its table has a row each tenth of a second, without a frame's number.
     let rows = own_rows(dir, "tables");
@@ -69,7 +69,7 @@ fn own_states_come_at_their_own_rate_in_every_output() {
     }
     windhover(dir, &["report", "flight.mcap", "--out", "report.html"]);
     let page = std::fs::read_to_string(dir.join("report.html")).unwrap();
-    assert!(page.contains("No frame came from the camera") && !page.contains("bare capture"));
+    assert!(page.contains("No frame was received from the camera") && !page.contains("it is a capture"));
     assert!(page.contains("Height over the datum"), "the helicopter's own charts are there");
 }
 

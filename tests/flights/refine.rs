@@ -20,8 +20,8 @@ fn a_refined_flight_stands_beside_the_real_one() {
     // When it is refined.
     let text = run(&["refine", "flight.mcap"], dir.path());
     // Then what it tells of its configuration is said, and what it does not.
-    assert!(text.contains("what the flight tells of its configuration"), "{text}");
-    assert!(text.contains("not told by this flight"), "{text}");
+    assert!(text.contains("constants of the configuration"), "{text}");
+    assert!(text.contains("not determined by this flight"), "{text}");
     // And a file beside it has the flight without its pictures, and a refined estimate a frame.
     let (flight, refined) = (
         Flight::read(&dir.path().join("flight.mcap")).expect("a flight"),

@@ -326,7 +326,7 @@ fn a_card_taken_out_is_missed_and_the_next_one_used() {
     expect(&notices, "index_ready");
     slot.take_out();
     let reason = expect(&notices, "recording_stopped");
-    assert!(reason.contains("taken away"), "{reason}");
+    assert!(reason.contains("removed"), "{reason}");
     assert!(matches!(handle.status().recording, Recording::Stopped(_)));
     assert_eq!(std::fs::read_dir(&card).unwrap().count(), 0, "nothing is written to the system card");
     assert!(slot.put_in("size=64m"));

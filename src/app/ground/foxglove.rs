@@ -1,10 +1,9 @@
-//! What arrives, for Foxglove over its WebSocket: every topic of every payload, with the flight's schemas.
+//! Received records for Foxglove over its WebSocket: every topic of every payload, with the flight's schemas.
 //!
-//! The protocol is `foxglove.sdk.v1` (and its older name `foxglove.websocket.v1`): the server tells its name
-//! and its channels as JSON, a client subscribes, messages come as binary frames. Topics are
-//! `/PAYLOAD/TOPIC`; besides the flight's there are `/PAYLOAD/target/NAME/location`, which a map panel
-//! draws, and `/PAYLOAD/camera/thumbnail`. What is sent again is left out where it also comes live: a
-//! viewer of the present takes the latest message for the newest.
+//! The protocol is `foxglove.sdk.v1` (and its older name `foxglove.websocket.v1`): the server sends its name and its
+//! channels as JSON, a client subscribes, messages are binary frames. Topics are `/PAYLOAD/TOPIC`; in addition to the
+//! flight's topics there are `/PAYLOAD/target/NAME/location`, which a map panel draws, and `/PAYLOAD/camera/thumbnail`.
+//! Back-filled records of live topics are left out: a live viewer takes the latest message for the newest.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -36,7 +35,7 @@ const PROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 const MESSAGE_DATA: u8 = 1;
 /// Messages a client may be behind before it misses some.
 const QUEUE: usize = 1_024;
-/// Channels told at most: a payload's topics are not believed without end.
+/// Most channels that are advertised: a payload cannot make an unlimited number of topics.
 const CHANNELS: usize = 4_096;
 /// Subscriptions of one client.
 const SUBSCRIPTIONS: usize = 4_096;
@@ -80,7 +79,7 @@ struct Channels {
     schemas: BTreeMap<String, Arc<[u8]>>,
 }
 
-/// What every client is told.
+/// What every client receives.
 #[derive(Clone)]
 pub struct Scope {
     channels: Arc<Mutex<Channels>>,
@@ -134,20 +133,20 @@ impl Scope {
         self.say(&topic, "foxglove.CompressedImage", &[], t, &image.encode_to_vec());
     }
 
-    /// A message of a topic; an empty schema is the program's own of this name.
+    /// A message of a topic; an empty schema stands for the program's own schema of this name.
     fn say(&self, topic: &str, schema_name: &str, schema: &[u8], t: MonoTime, data: &[u8]) {
         let mut channels = self.channels();
         let Some(channel) = channels.number(topic, schema_name, schema, &self.news) else { return };
         let time_ns = u64::try_from(t.ns()).unwrap_or(0);
         let said = Said { channel, time_ns, data: Bytes::copy_from_slice(data) };
         channels.all[channel as usize - 1].last = Some(said.clone());
-        // Nobody may be looking.
+        // There may be no client.
         let _ = self.news.send(News::Said(said));
     }
 }
 
 impl Channels {
-    /// The number of a topic's channel, made and told where it is new; `None` where there are too many.
+    /// The number of a topic's channel, which is made and advertised where it is new; `None` where there are too many.
     fn number(
         &mut self,
         topic: &str,
@@ -182,12 +181,12 @@ impl Channels {
     }
 }
 
-/// Topics that tell something lasting: the latest counts however it came.
+/// Topics of lasting content: the latest message counts, live or back-filled.
 fn is_kept(topic: &str) -> bool {
     downlink_class(topic) == Some(Class::Event)
 }
 
-/// Where a vehicle is, as a map panel draws it; `None` while it is not known.
+/// A vehicle's place as a map panel draws it; `None` while it is not known.
 fn location(state: &wh::TargetState) -> Option<fox::LocationFix> {
     use fox::location_fix::PositionCovarianceType as Kind;
     // (north, east) in the state, (east, north, up) here.
@@ -206,17 +205,17 @@ fn location(state: &wh::TargetState) -> Option<fox::LocationFix> {
     })
 }
 
-/// What the server needs.
+/// The server's state.
 #[derive(Clone)]
 pub struct Server {
-    /// What is told.
+    /// What clients receive.
     pub scope: Scope,
-    /// What a client must know (`?token=` in its address); without one, only Foxglove and pages of this
-    /// computer may ask.
+    /// The token that a client must send (`?token=` in its address); without one, only Foxglove and pages of this
+    /// computer may connect.
     pub token: Option<Arc<str>>,
 }
 
-/// Whether the page that asks is Foxglove's, or of this computer; programs name none.
+/// Whether the requesting page is Foxglove's or of this computer; programs send no origin.
 fn is_welcome(headers: &HeaderMap) -> bool {
     let Some(origin) = headers.get(header::ORIGIN) else { return true };
     let Some((scheme, rest)) = origin.to_str().ok().and_then(|o| o.split_once("://")) else { return false };
@@ -240,10 +239,10 @@ async fn guard(State(server): State<Server>, request: Request, next: Next) -> Re
 async fn upgrade(State(server): State<Server>, upgrade: WebSocketUpgrade) -> Response {
     let upgrade = upgrade.protocols(PROTOCOLS).max_message_size(CLIENT_LIMIT);
     if upgrade.selected_protocol().is_none() {
-        return (StatusCode::BAD_REQUEST, "ask for foxglove.sdk.v1\n").into_response();
+        return (StatusCode::BAD_REQUEST, "request foxglove.sdk.v1\n").into_response();
     }
     upgrade.on_upgrade(move |socket| async move {
-        // The client is gone, whatever the reason.
+        // The client has left, whatever the reason.
         let _ = Client::new(socket).serve(&server.scope).await;
     })
 }
@@ -278,7 +277,7 @@ impl Client {
                     }
                     Ok(News::Channel(_)) => {}
                     Ok(News::Said(said)) => self.send(&said).await?,
-                    // It missed some; channels must not be among them.
+                    // The client missed some messages; channels must not be among them.
                     Err(broadcast::error::RecvError::Lagged(_)) => told = self.advertise(scope, told).await?,
                     Err(broadcast::error::RecvError::Closed) => return Ok(()),
                 },
@@ -291,7 +290,7 @@ impl Client {
         }
     }
 
-    /// Tells of channels after number `told`; gives the last.
+    /// Advertises channels after number `told`; returns the last.
     async fn advertise(&mut self, scope: &Scope, told: u64) -> Result<u64, axum::Error> {
         let fresh: Vec<_> = {
             let channels = scope.channels();
@@ -318,8 +317,8 @@ impl Client {
         Ok(())
     }
 
-    /// Takes what a client asks for; what is no request of the protocol is passed over. A new subscription
-    /// gets the channel's latest message at once.
+    /// Handles a client's request; a message that is not a request of the protocol is ignored. A new subscription gets
+    /// the channel's latest message at once.
     async fn listen(&mut self, scope: &Scope, text: &str) -> Result<(), axum::Error> {
         for request in requests(text) {
             match request {

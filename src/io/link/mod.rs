@@ -1,6 +1,6 @@
 //! The wireless link: QUIC with certificates on both sides, live datagrams, back-fill on streams.
 //!
-//! `docs/link.md` describes the message format and what is guaranteed.
+//! `docs/link.md` describes the message format and the guarantees.
 
 mod backlog;
 mod dial;

@@ -1,5 +1,4 @@
-//! One function a message: what is told of a vehicle, in the units of MAVLink's definitions (`common.xml`,
-//! `development.xml`).
+//! One function for each message of a vehicle, in the units of MAVLink's definitions (`common.xml`, `development.xml`).
 
 use mavlink::dialects::development::*;
 use nalgebra::{UnitQuaternion, Vector3};
@@ -12,7 +11,7 @@ use crate::config::LandingFrame;
 
 /// Version field of HEARTBEAT.
 const VERSION: u8 = 3;
-/// FOLLOW_TARGET tells position (bit 0), velocity (1), acceleration (2), attitude and rates (3).
+/// FOLLOW_TARGET contains position (bit 0), velocity (1), acceleration (2), attitude and rates (3).
 const FOLLOW_CAPABILITIES: u8 = 0b1111;
 
 /// HEARTBEAT of a vehicle with this track: active while it is seen, critical while it is predicted.
@@ -25,7 +24,7 @@ pub fn heartbeat(status: TrackStatus) -> MavMessage {
     beat(MavType::MAV_TYPE_GROUND_ROVER, MavAutopilot::MAV_AUTOPILOT_GENERIC, system_status)
 }
 
-/// HEARTBEAT of something on board that is no autopilot.
+/// HEARTBEAT of a component that is not an autopilot.
 pub fn heartbeat_of(mavtype: MavType) -> MavMessage {
     beat(mavtype, MavAutopilot::MAV_AUTOPILOT_INVALID, MavState::MAV_STATE_ACTIVE)
 }
@@ -41,7 +40,7 @@ fn beat(mavtype: MavType, autopilot: MavAutopilot, system_status: MavState) -> M
     })
 }
 
-/// GLOBAL_POSITION_INT: altitude of the ground under the vehicle, which is 0 above the ground.
+/// GLOBAL_POSITION_INT: altitude of the ground under the vehicle; its height above the ground is 0.
 pub fn global_position_int(told: &Told) -> MavMessage {
     let v = told.velocity();
     let centi = |mps: f64| (mps * 100.0).round().clamp(-32_768.0, 32_767.0) as i16;
@@ -59,7 +58,7 @@ pub fn global_position_int(told: &Told) -> MavMessage {
     })
 }
 
-/// ATTITUDE: level, as a ground vehicle is taken to be.
+/// ATTITUDE: level, as assumed for a ground vehicle.
 pub fn attitude(told: &Told) -> MavMessage {
     MavMessage::ATTITUDE(ATTITUDE_DATA {
         time_boot_ms: ms(told.now) as u32,
@@ -69,7 +68,7 @@ pub fn attitude(told: &Told) -> MavMessage {
     })
 }
 
-/// FOLLOW_TARGET. `position_cov` is one-sigma of the horizontal place in metres, 0 (the height's is not told), 0.
+/// FOLLOW_TARGET. `position_cov` is the one-sigma of the horizontal position in metres, 0 (no height), 0.
 pub fn follow_target(told: &Told) -> MavMessage {
     MavMessage::FOLLOW_TARGET(FOLLOW_TARGET_DATA {
         timestamp: ms(told.now),
@@ -163,7 +162,7 @@ pub fn odometry(told: &Told, down_m: f64) -> MavMessage {
     let mut pose = [0.0; 21];
     let mut motion = [0.0; 21];
     if let Some(p) = &told.state.covariance {
-        // Upper triangle row by row of (x, y, z, roll, pitch, yaw): x and y stand at 0, 1 and 6, yaw at 5, 10 and 20.
+        // Upper triangle row by row of (x, y, z, roll, pitch, yaw): x and y are at 0, 1 and 6, yaw at 5, 10 and 20.
         for (at, (i, j)) in [(0, (0, 0)), (1, (0, 1)), (6, (1, 1)), (5, (0, 2)), (10, (1, 2)), (20, (2, 2))] {
             pose[at] = p[(i, j)] as f32;
         }

@@ -37,9 +37,9 @@ use crate::ubx::{Piece, Splitter, relative_heading};
 use records::{RecordForm, RecordFramer};
 use together::Together;
 
-/// What a sentence with a sound checksum says.
+/// Reads a sentence with a valid checksum.
 type ReadSentence = fn(&Sentence<'_>) -> Result<Option<CompassReading>, Refusal>;
-/// What a line without `$` says.
+/// Reads a line without `$`.
 type ReadLine = fn(&[u8]) -> Result<Option<CompassReading>, Refusal>;
 
 /// How a format is read.
@@ -47,10 +47,10 @@ type ReadLine = fn(&[u8]) -> Result<Option<CompassReading>, Refusal>;
 enum Reader {
     /// Sentences `$…*HH`.
     Sentences(ReadSentence),
-    /// What a receiver says of the line between its antennas: sentences, long messages `#…*CRC` and packets of u-blox.
+    /// A receiver's reports of the line between its antennas: sentences, long messages `#…*CRC` and packets of u-blox.
     /// Without text: packets alone.
     Receiver { sentence: ReadSentence, has_text: bool },
-    /// Sentences, and lines without frame and checksum of a device that never sends one.
+    /// Sentences, and bare lines without checksum of a device that never sends one.
     SentencesOrBare(ReadSentence, ReadLine),
     /// Binary packets of PNI.
     Packets,
@@ -82,7 +82,7 @@ pub struct CompassDecoder {
     input: Input,
 }
 
-/// Collects bytes into what a format is made of.
+/// Collects bytes into the units of a format.
 #[derive(Clone, Debug)]
 enum Input {
     Text(Box<TextInput>),
@@ -92,7 +92,7 @@ enum Input {
 }
 
 impl Input {
-    /// What puts sentences together, where there are any.
+    /// The part that combines sentences, where the format has them.
     fn together(&mut self) -> Option<&mut Together> {
         match self {
             Self::Text(text) => Some(&mut text.together),
@@ -113,12 +113,12 @@ struct TextInput {
     together: Together,
 }
 
-/// A receiver's line: packets of u-blox, and what is outside them.
+/// A receiver's line: packets of u-blox, and the bytes between them.
 #[derive(Clone, Debug)]
 struct ReceiverInput {
     splitter: Splitter,
     text: TextInput,
-    /// Whether what is outside packets is read.
+    /// Whether the bytes between packets are read.
     has_text: bool,
 }
 
@@ -208,7 +208,7 @@ impl TextInput {
     }
 }
 
-/// Whether a sentence is plain NMEA, which tells an attitude in parts; others are a device's own.
+/// Whether a sentence is plain NMEA, which has an attitude in parts; others are a device's own.
 fn is_part(sentence: &Sentence<'_>) -> bool {
     !sentence.address().starts_with("VN") && sentence.formatter().is_some()
 }
@@ -242,7 +242,7 @@ impl CompassDecoder {
         self
     }
 
-    /// Takes the bytes one read returned at `t_recv`; appends the samples they complete to `out`.
+    /// Takes the bytes that one read returned at `t_recv`; appends the completed samples to `out`.
     pub fn push(&mut self, bytes: &[u8], t_recv: MonoTime, out: &mut Vec<HeardAttitude>) {
         match &mut self.input {
             Input::Text(text) => text.push(bytes, 0, t_recv, &mut self.counts, out),
@@ -252,21 +252,21 @@ impl CompassDecoder {
         }
     }
 
-    /// Time passed: gives out an open reading the device has fallen silent after.
+    /// Time has passed: outputs an open reading after which the device has fallen silent.
     pub fn tick(&mut self, now: MonoTime, out: &mut Vec<HeardAttitude>) {
         if let Some(together) = self.input.together() {
             together.tick(now, &mut self.counts, out);
         }
     }
 
-    /// The stream has ended: gives out what is open.
+    /// The stream has ended: outputs the open reading.
     pub fn flush(&mut self, out: &mut Vec<HeardAttitude>) {
         if let Some(together) = self.input.together() {
             together.close(&mut self.counts, out);
         }
     }
 
-    /// What was made of the bytes so far.
+    /// Counts of the decoded bytes.
     pub const fn counts(&self) -> &DecodeCounts {
         &self.counts
     }

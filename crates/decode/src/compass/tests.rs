@@ -1,4 +1,4 @@
-//! Properties of the compass decoders on any bytes.
+//! Properties of the compass decoders on arbitrary bytes.
 
 use proptest::prelude::*;
 

@@ -1,9 +1,9 @@
-//! One reading of what a device tells in several sentences.
+//! One reading from several sentences of a device.
 //!
-//! Plain NMEA tells heading, pitch and roll apart, and the heading in up to four ways (HDG, HDM, HDT, THS).
-//! Sentences of one burst make one reading: a sentence that is there already begins the next, and so does the
-//! one that was seen to follow the longest silence. A device that tells a whole attitude in a sentence of its
-//! own repeats it in the others: those say nothing more.
+//! Plain NMEA has heading, pitch and roll in separate sentences, and the heading in up to four forms (HDG, HDM, HDT,
+//! THS). The sentences of one burst make one reading. A repeated sentence begins the next reading, and so does the
+//! sentence that was seen to follow the longest silence. A device with a sentence for the whole attitude repeats it in
+//! the others, which then add nothing.
 
 use super::reading::{CompassReading, HeardAttitude, heard};
 use crate::burst::Cycle;
@@ -12,18 +12,18 @@ use crate::lines::LineSpan;
 use crate::sentence::Sentence;
 use windhover_base::time::{MonoTime, Span};
 
-/// Silence after which an open reading is given out.
+/// Silence after which an open reading is output.
 const QUIET: Span = Span::from_ns(300_000_000);
-/// Sentences after a whole attitude that only repeat it: more than any burst has.
+/// Most sentences after a whole attitude that only repeat it: more than any burst has.
 const AFTER_WHOLE: u32 = 16;
-/// Kinds of sentences remembered; no device sends more.
+/// Most kinds of sentences that are remembered; no device sends more.
 const KEYS_MAX: usize = 16;
-/// A mean silence before a burst: at least so long, and so many times that before any other sentence.
+/// A mean silence before a burst: at least this long, and this many times that before any other sentence.
 const BEGIN: (f64, f64) = (5.0, 2.0);
-/// How much one silence counts in the mean.
+/// Weight of one silence in the mean.
 const SILENCE_SHARE: f64 = 0.2;
 
-/// Which sentence a part is of, and of which angles.
+/// The sentence of a part, and its angles.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) struct Key {
     address: [u8; 6],
@@ -39,7 +39,7 @@ impl Key {
     }
 }
 
-/// Which heading is taken where there are several: measured before derived from it.
+/// Which heading is used where there are several: measured ones before derived ones.
 fn rank(sentence: &Sentence<'_>) -> u8 {
     match sentence.formatter() {
         Some("HPR") => 0,
@@ -50,7 +50,7 @@ fn rank(sentence: &Sentence<'_>) -> u8 {
     }
 }
 
-/// A reading being put together.
+/// A reading in progress.
 #[derive(Clone, Debug)]
 struct Draft {
     reading: CompassReading,
@@ -60,11 +60,11 @@ struct Draft {
     last: LineSpan,
 }
 
-/// Puts readings together.
+/// Combines sentences to readings.
 #[derive(Clone, Debug)]
 pub(super) struct Together {
     draft: Option<Draft>,
-    /// Sentences of the reading just given out.
+    /// Sentences of the reading that was output last.
     done: Vec<Key>,
     cycle: Cycle<Key>,
     /// Mean silence before each sentence, milliseconds.
@@ -87,7 +87,7 @@ impl Default for Together {
 }
 
 impl Together {
-    /// A sentence of the device's own: an attitude as it stands.
+    /// A sentence of the device's own: a complete attitude.
     pub(super) fn whole(
         &mut self,
         reading: CompassReading,
@@ -131,7 +131,7 @@ impl Together {
         }
     }
 
-    /// Time passed: gives out an open reading the device has fallen silent after.
+    /// Time has passed: outputs an open reading after which the device has fallen silent.
     pub(super) fn tick(&mut self, now: MonoTime, counts: &mut DecodeCounts, out: &mut Vec<HeardAttitude>) {
         if self.draft.as_ref().is_some_and(|draft| now - draft.last.t_last >= QUIET) {
             self.close(counts, out);

@@ -1,4 +1,4 @@
-//! What an autopilot says over MAVLink.
+//! Measurements of an autopilot over MAVLink.
 
 mod autopilot;
 mod frames;
