@@ -1,5 +1,4 @@
-//! Closed-loop flights: the helicopter follows what is told of the vehicle over MAVLink, and what it is told depends on
-//! how it flies.
+//! Closed-loop flights: the helicopter follows the vehicle's MAVLink messages, which depend on how it flies.
 
 use nalgebra::Vector3;
 

@@ -1,4 +1,4 @@
-//! First values: what the filter makes of the flight.
+//! Initial values: the filter's estimates of the flight.
 
 use nalgebra::{UnitQuaternion, Vector3};
 
@@ -11,12 +11,12 @@ use crate::recording::{Heard, Recording};
 use crate::unknowns::knot;
 use crate::values::Knot;
 
-/// The filter's own state is asked for so often, s.
+/// Period of the filter's own states, s.
 const STEP_S: f64 = 0.1;
-/// And so long before what was heard last: by then late measurements are in.
+/// How far behind the last event they are requested: by then late measurements are included.
 const BEHIND: Span = Span::from_ns(300_000_000);
 
-/// What the filter made of one flight.
+/// The filter's result for one flight.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct First {
     /// In order of time, each instant once.
@@ -24,7 +24,7 @@ pub(crate) struct First {
     /// Of each target, where it was tracked, in order of time.
     pub(crate) targets: Vec<Vec<TargetEstimate>>,
     pub(crate) felt: Option<FeltTilt>,
-    /// Why the filter began again, and when.
+    /// Why and when the filter was reset.
     pub(crate) resets: Vec<(MonoTime, String)>,
 }
 
@@ -73,7 +73,7 @@ impl First {
         }
     }
 
-    /// From when to when the helicopter is known.
+    /// The time span in which the helicopter's state is known.
     pub(crate) fn span(&self) -> Option<(MonoTime, MonoTime)> {
         Some((self.own.first()?.t_valid, self.own.last()?.t_valid))
     }

@@ -1,4 +1,4 @@
-//! What moves in view and is no target: people on foot, other vehicles, vehicles that carry the same markers.
+//! Other moving things in view: people on foot, other vehicles, vehicles with the same markers.
 
 use nalgebra::Vector3;
 
@@ -17,14 +17,14 @@ const BEHIND_S: f64 = 1.5;
 /// Where they drive beside its path, metres ahead and right, one after the other.
 const BESIDE_M: [(f64, f64); 4] = [(-1.0, 2.8), (-1.0, -2.8), (3.5, 3.0), (3.5, -3.0)];
 
-/// What one of them looks like.
+/// The appearance of one of them.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) enum Looks {
     /// A person from above.
     Person,
     /// A vehicle with a painted roof.
     Painted,
-    /// The first target, markers and all.
+    /// The first target, including its markers.
     Double,
 }
 
@@ -44,7 +44,7 @@ enum Way {
 }
 
 impl Companion {
-    /// Everyone in view of a flight.
+    /// All companions of a flight.
     pub(super) fn all(company: &Company, seed: u64) -> Vec<Self> {
         let people = (0..company.people).map(|k| Self { looks: Looks::Person, way: Way::on_foot(k, seed) });
         let drives = |looks: Looks, k: usize| {
@@ -56,7 +56,7 @@ impl Companion {
         people.chain(convoy).chain(doubles).collect()
     }
 
-    /// Where it is, where the first vehicle moves so.
+    /// Its state, given the first vehicle's motion.
     pub(super) fn at(&self, first: &VehicleMotion, t_s: f64) -> VehicleTruth {
         match &self.way {
             Way::Walks { offset_m, stray } => {

@@ -1,4 +1,4 @@
-//! All sensors together, as values in the order in which they are heard.
+//! All sensors together, as values in order of reception.
 
 use std::sync::Arc;
 
@@ -19,8 +19,8 @@ use windhover_base::time::{MonoTime, Span};
 /// Bytes of one epoch's sentences (RMC, GGA, PGRME, PGRMV) and of one compass sentence on the wire.
 const WIRE_BYTES: (f64, f64) = (223.0, 20.0);
 
-/// One measurement with when it was really true. `t_valid` is what the configured latency makes of
-/// it: off by this flight's latency error and the remaining jitter.
+/// One measurement with its true time. `t_valid` is computed with the configured latency: it is off by this flight's
+/// latency error and the remaining jitter.
 #[derive(Clone, Copy, PartialEq, Debug)]
 #[expect(clippy::large_enum_variant, reason = "a value at a time, handed on")]
 pub enum Sample {
@@ -48,7 +48,7 @@ pub enum Sample {
 }
 
 impl Sample {
-    /// When it was heard.
+    /// Its reception.
     pub fn t_recv(&self) -> MonoTime {
         match self {
             Self::Gnss { stamped, .. } => stamped.t_recv,
