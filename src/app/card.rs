@@ -16,7 +16,7 @@ use super::flight_store::{FlightStore, StoreOrders};
 use super::health::CardFigures;
 use super::presence::PartState;
 use super::status::SharedStatus;
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 
 /// How often the task forwards the store's notices and publishes its state.
 const ROUND: Duration = Duration::from_millis(100);
@@ -91,7 +91,7 @@ pub struct StoreTask {
     /// Requests to the store.
     pub orders: StoreOrders,
     /// The task's heartbeat.
-    pub heart: Heart,
+    pub heartbeat: Heartbeat,
 }
 
 /// Runs the store until a stop is requested and the pipeline has handed over its last output.
@@ -99,7 +99,7 @@ pub async fn run(task: StoreTask, mut opened: Option<OpenStore>) {
     if !task.config.store.enabled {
         task.show_state("off");
         task.context.presence.set(Part::Store, PartState::Delivers);
-        return task.heart.while_waiting(task.context.stop.cancelled()).await;
+        return task.heartbeat.while_waiting(task.context.stop.cancelled()).await;
     }
     while let Some(OpenStore { store, mut notices }) = opened.take() {
         let why = task.attend(&store, &mut notices).await;
@@ -118,7 +118,7 @@ pub async fn run(task: StoreTask, mut opened: Option<OpenStore>) {
         let mut power = task.orders.power_going.subscribe();
         let back = async { power.wait_for(|going| !going).await.is_ok() };
         let back = task.context.stop.run_until_cancelled(back);
-        if task.heart.while_waiting(back).await.is_none() {
+        if task.heartbeat.while_waiting(back).await.is_none() {
             return;
         }
         let (config, clock, store) =
@@ -143,7 +143,7 @@ impl StoreTask {
                     return Closing::Power;
                 }
                 _ = round.tick() => {
-                    self.heart.beat();
+                    self.heartbeat.beat();
                     self.report(notices);
                     self.show(&handle.status(), &mut pace);
                 }
@@ -168,7 +168,7 @@ impl StoreTask {
         self.report(&mut closed.await);
         let outcome = handle.status().outcome();
         self.status.with(|status| status.outcome = Some(outcome));
-        self.heart.beat();
+        self.heartbeat.beat();
     }
 
     fn report(&self, notices: &mut Receiver<StoreNotice>) {

@@ -18,7 +18,7 @@ use crate::io::link::{
     Backlog, EarlyRecords, LinkError, LinkEvent, LinkHandle, LinkStatus, PayloadLink, PayloadSettings,
     Picture, StoreBacklog,
 };
-use crate::io::mavlink::{self, MavlinkSender, Station, StationNews};
+use crate::io::mavlink::{self, MavlinkSender, Station, StationChange};
 use crate::io::records::Record;
 use windhover_base::msg::{Event, EventBody, FramePayload, Output};
 use windhover_base::time::UtcTime;
@@ -27,7 +27,7 @@ use super::context::TaskContext;
 use super::events::OperatorEvent;
 use super::flight_store::FlightStore;
 use super::status::SharedStatus;
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 
 /// How often the task publishes the link's state.
 const ROUND: Duration = Duration::from_millis(250);
@@ -125,7 +125,7 @@ pub struct LinkTask {
     /// The pipeline's side of the link.
     pub downlink: Downlink,
     /// The task's heartbeat.
-    pub heart: Heart,
+    pub heartbeat: Heartbeat,
 }
 
 /// Serves stations until a stop is requested.
@@ -142,7 +142,7 @@ pub async fn run(task: LinkTask) {
     while !task.context.stop.is_cancelled() {
         if !task.config.link.enabled {
             task.show("off");
-            task.heart.while_waiting(task.context.stop.cancelled()).await;
+            task.heartbeat.while_waiting(task.context.stop.cancelled()).await;
             continue;
         }
         match task.open().await {
@@ -157,7 +157,7 @@ pub async fn run(task: LinkTask) {
                 task.show("fault");
                 task.fault(&error);
                 let pause = task.context.stop.run_until_cancelled(tokio::time::sleep(AGAIN));
-                task.heart.while_waiting(pause).await;
+                task.heartbeat.while_waiting(pause).await;
             }
         }
     }
@@ -188,7 +188,7 @@ async fn send_mavlink(downlink: Downlink, status: SharedStatus, clock: HostClock
 }
 
 /// Reports a change of a station that receives MAVLink.
-fn tell_mavlink(news: &StationNews) {
+fn tell_mavlink(news: &StationChange) {
     match &news.fault {
         Some(fault) => OperatorEvent::MavlinkFault.emit(&news.name, fault),
         None => OperatorEvent::MavlinkUp.emit(&news.name, "datagrams are sent again"),
@@ -235,10 +235,10 @@ impl LinkTask {
     async fn identity(&self) -> (Option<Arc<dyn Backlog>>, u32, String) {
         let store = tokio::time::timeout(CARD, self.flight_store.opened());
         if self.config.store.enabled
-            && let Ok(store) = self.heart.while_waiting(store).await
+            && let Ok(store) = self.heartbeat.while_waiting(store).await
         {
             let opening = blocking(move || StoreBacklog::open(store));
-            let (backlog, run, flight) = self.heart.while_waiting(opening).await;
+            let (backlog, run, flight) = self.heartbeat.while_waiting(opening).await;
             return (Some(Arc::new(backlog)), run, flight);
         }
         let now = self.context.clock.now().ns();
@@ -258,7 +258,7 @@ impl LinkTask {
                 () = self.context.stop.cancelled() => return,
                 Some(event) = events.recv() => self.tell(&event),
                 _ = round.tick() => {
-                    self.heart.beat();
+                    self.heartbeat.beat();
                     self.show(describe(&handle.status()));
                 }
             }

@@ -9,9 +9,9 @@ use tokio::net::{TcpListener, TcpStream};
 
 use super::context::TaskContext;
 use super::events::OperatorEvent;
-use super::openmetrics::{self, Told};
+use super::openmetrics::{self, PayloadMetrics};
 use super::sinks::LatestHealth;
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 
 /// Time limit of a request and its answer.
 const BRIEFLY: Duration = Duration::from_secs(2);
@@ -21,14 +21,14 @@ const QUESTION: usize = 8 << 10;
 const PAUSE: Duration = Duration::from_secs(5);
 
 /// Answers until a stop is requested.
-pub async fn run(address: SocketAddr, latest: LatestHealth, context: TaskContext, heart: Heart) {
+pub async fn run(address: SocketAddr, latest: LatestHealth, context: TaskContext, heartbeat: Heartbeat) {
     tokio::select! {
         () = context.stop.cancelled() => {}
-        () = serve(address, &latest, &heart) => {}
+        () = serve(address, &latest, &heartbeat) => {}
     }
 }
 
-async fn serve(address: SocketAddr, latest: &LatestHealth, heart: &Heart) {
+async fn serve(address: SocketAddr, latest: &LatestHealth, heartbeat: &Heartbeat) {
     let mut told = false;
     let listener = loop {
         match TcpListener::bind(address).await {
@@ -38,17 +38,17 @@ async fn serve(address: SocketAddr, latest: &LatestHealth, heart: &Heart) {
                     let words = format!("cannot listen on {address}: {error}; tried again");
                     OperatorEvent::LinkFault.emit("metrics", words);
                 }
-                heart.while_waiting(tokio::time::sleep(PAUSE)).await;
+                heartbeat.while_waiting(tokio::time::sleep(PAUSE)).await;
             }
         }
     };
     loop {
-        match heart.while_waiting(listener.accept()).await {
+        match heartbeat.while_waiting(listener.accept()).await {
             Ok((stream, _)) => {
                 // A client that is too slow or leaves gets no answer.
-                let _ = heart.while_waiting(tokio::time::timeout(BRIEFLY, answer(stream, latest))).await;
+                let _ = heartbeat.while_waiting(tokio::time::timeout(BRIEFLY, answer(stream, latest))).await;
             }
-            Err(_) => heart.while_waiting(tokio::time::sleep(PAUSE)).await,
+            Err(_) => heartbeat.while_waiting(tokio::time::sleep(PAUSE)).await,
         }
     }
 }
@@ -79,6 +79,6 @@ async fn answer(mut stream: TcpStream, latest: &LatestHealth) -> std::io::Result
 
 fn text(latest: &LatestHealth) -> String {
     let health = latest.get();
-    let told = health.iter().map(|health| Told { payload: "", health, age_s: None, link: None });
+    let told = health.iter().map(|health| PayloadMetrics { payload: "", health, age_s: None, link: None });
     openmetrics::render(&told.collect::<Vec<_>>())
 }

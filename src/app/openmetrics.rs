@@ -10,7 +10,7 @@ pub const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; cha
 
 /// The state of one payload.
 #[derive(Clone, Debug)]
-pub struct Told<'a> {
+pub struct PayloadMetrics<'a> {
     /// Its name; empty where the payload itself answers.
     pub payload: &'a str,
     /// Its latest health.
@@ -29,7 +29,7 @@ struct Family {
     name: &'static str,
     kind: &'static str,
     help: &'static str,
-    samples: fn(&Told<'_>) -> Vec<Sample>,
+    samples: fn(&PayloadMetrics<'_>) -> Vec<Sample>,
 }
 
 const FAMILIES: &[Family] = &[
@@ -101,11 +101,19 @@ const FAMILIES: &[Family] = &[
     ),
 ];
 
-const fn gauge(name: &'static str, help: &'static str, samples: fn(&Told<'_>) -> Vec<Sample>) -> Family {
+const fn gauge(
+    name: &'static str,
+    help: &'static str,
+    samples: fn(&PayloadMetrics<'_>) -> Vec<Sample>,
+) -> Family {
     Family { name, kind: "gauge", help, samples }
 }
 
-const fn counter(name: &'static str, help: &'static str, samples: fn(&Told<'_>) -> Vec<Sample>) -> Family {
+const fn counter(
+    name: &'static str,
+    help: &'static str,
+    samples: fn(&PayloadMetrics<'_>) -> Vec<Sample>,
+) -> Family {
     Family { name, kind: "counter", help, samples }
 }
 
@@ -114,22 +122,22 @@ fn one(figure: Option<f64>) -> Vec<Sample> {
 }
 
 fn sources(
-    told: &Told<'_>,
+    payload: &PayloadMetrics<'_>,
     of: fn(&crate::io::proto::windhover::SourceHealth) -> Option<f64>,
 ) -> Vec<Sample> {
     let sample = |s| {
         let s: &crate::io::proto::windhover::SourceHealth = s;
         Some((vec![("source", s.name.clone())], of(s)?))
     };
-    told.health.sources.iter().filter_map(sample).collect()
+    payload.health.sources.iter().filter_map(sample).collect()
 }
 
 /// One sigmas, from the covariance's diagonal.
-fn sigmas(told: &Told<'_>) -> Vec<Sample> {
+fn sigmas(payload: &PayloadMetrics<'_>) -> Vec<Sample> {
     const DIAGONAL: [(usize, &str); 5] =
         [(0, "north_m"), (5, "east_m"), (9, "heading_rad"), (12, "speed_mps"), (14, "yaw_rate_radps")];
     let mut all = Vec::new();
-    for target in &told.health.targets {
+    for target in &payload.health.targets {
         let covariance = target.state.as_ref().map_or(&[][..], |state| &state.covariance);
         for (at, figure) in DIAGONAL {
             if let Some(variance) = covariance.get(at).filter(|variance| **variance >= 0.0) {
@@ -142,12 +150,12 @@ fn sigmas(told: &Told<'_>) -> Vec<Sample> {
 }
 
 /// The text of all payloads.
-pub fn render(payloads: &[Told<'_>]) -> String {
+pub fn render(payloads: &[PayloadMetrics<'_>]) -> String {
     let mut text = String::new();
     for Family { name, kind, help, samples } in FAMILIES {
         let mut head = false;
-        for told in payloads {
-            for (mut labels, figure) in samples(told) {
+        for payload in payloads {
+            for (mut labels, figure) in samples(payload) {
                 if !figure.is_finite() {
                     continue;
                 }
@@ -155,8 +163,8 @@ pub fn render(payloads: &[Told<'_>]) -> String {
                     // Writing into a String cannot fail.
                     let _ = write!(text, "# TYPE {name} {kind}\n# HELP {name} {help}\n");
                 }
-                if !told.payload.is_empty() {
-                    labels.insert(0, ("payload", told.payload.to_owned()));
+                if !payload.payload.is_empty() {
+                    labels.insert(0, ("payload", payload.payload.to_owned()));
                 }
                 let suffix = if *kind == "counter" { "_total" } else { "" };
                 let _ = writeln!(text, "{name}{suffix}{} {figure}", braced(&labels));
@@ -192,8 +200,8 @@ mod tests {
         };
         let health =
             Health { sources: vec![source("gps", 120.0), source("a\"b\n", -1.0)], ..Default::default() };
-        let told = |payload| Told { payload, health: &health, age_s: None, link: None };
-        let text = render(&[told("one"), told("two")]);
+        let payload = |payload| PayloadMetrics { payload, health: &health, age_s: None, link: None };
+        let text = render(&[payload("one"), payload("two")]);
         assert_eq!(text.matches("# TYPE windhover_source_rate_hertz gauge\n").count(), 1);
         assert!(
             text.contains("windhover_source_messages_total{payload=\"two\",source=\"gps\"} 7\n"),
@@ -202,6 +210,9 @@ mod tests {
         assert!(text.contains("{payload=\"one\",source=\"a\\\"b\\n\"} 5\n"), "{text}");
         assert_eq!(text.matches("windhover_source_age_seconds{").count(), 2, "{text}");
         assert!(text.ends_with("# EOF\n") && !text.contains("link_up"));
-        assert!(render(&[Told { payload: "", ..told("one") }]).contains("windhover_gps_satellites 0\n"));
+        assert!(
+            render(&[PayloadMetrics { payload: "", ..payload("one") }])
+                .contains("windhover_gps_satellites 0\n")
+        );
     }
 }

@@ -16,7 +16,7 @@ use super::health::HealthLine;
 use super::latencies::Latencies;
 use super::sink::{Outlets, Sink};
 use super::status::SharedStatus;
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 use super::warm_start::{self, Earlier, Origin};
 
 /// Longest time spent on queued events after a stop was requested.
@@ -39,12 +39,12 @@ pub struct Parts {
     /// Requests to the store.
     pub orders: StoreOrders,
     /// The task's heartbeat.
-    pub heart: Heart,
+    pub heartbeat: Heartbeat,
 }
 
 /// Runs the pipeline on the calling thread until a stop is requested and every queued event is handled.
 pub fn run(parts: Parts) {
-    let Parts { config, terrain, context, status, flight_store, outlets, orders, heart } = parts;
+    let Parts { config, terrain, context, status, flight_store, outlets, orders, heartbeat } = parts;
     let mut task = PipelineTask {
         config: &config,
         context: &context,
@@ -57,10 +57,10 @@ pub fn run(parts: Parts) {
         health_line: HealthLine::new(&config),
         outputs: Vec::new(),
     };
-    task.continue_from_earlier(&heart);
+    task.continue_from_earlier(&heartbeat);
     let mut end = None;
     loop {
-        heart.beat();
+        heartbeat.beat();
         let now = context.clock.now();
         if context.stop.is_cancelled() && now - *end.get_or_insert(now) > LAST_CALL {
             break;
@@ -94,12 +94,12 @@ struct PipelineTask<'a> {
 impl PipelineTask<'_> {
     /// Continues from the state that an earlier run left on the card, where it is fresh. The state is an event like
     /// every other, and the first: replay repeats it.
-    fn continue_from_earlier(&mut self, heart: &Heart) {
+    fn continue_from_earlier(&mut self, heartbeat: &Heartbeat) {
         if !self.config.store.enabled {
             return;
         }
         let report = |words: String| OperatorEvent::WarmStart.emit("", words);
-        match warm_start::wait_for(&self.flight_store, &self.origin, self.context, heart) {
+        match warm_start::wait_for(&self.flight_store, &self.origin, self.context, heartbeat) {
             Earlier::Known(state, age) => {
                 report(format!("continues from a state {:.1} s old", age.s()));
                 let body = EventBody::Warm(state);
@@ -107,7 +107,7 @@ impl PipelineTask<'_> {
                 self.handle(&event);
             }
             Earlier::Unusable(stale) => report(format!("the state of an earlier run is not used: {stale}")),
-            Earlier::NotTold(patience) => report(format!(
+            Earlier::NoAnswer(patience) => report(format!(
                 "starts without an earlier state: the card did not answer within {:.0} s",
                 patience.s()
             )),

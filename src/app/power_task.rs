@@ -7,7 +7,7 @@ use tokio::sync::watch;
 
 use super::context::TaskContext;
 use super::events::{self, OperatorEvent};
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 use crate::config::PowerConfig;
 use crate::io::device::{Report, blocking};
 use crate::io::power::{PowerReader, PowerReading};
@@ -54,11 +54,12 @@ pub fn parts(config: &PowerConfig) -> (PowerTask, PowerView) {
 }
 
 /// Reads and waits until a stop is requested.
-pub async fn run(mut task: PowerTask, context: TaskContext, heart: Heart) {
+pub async fn run(mut task: PowerTask, context: TaskContext, heartbeat: Heartbeat) {
     loop {
         let settings = task.settings.borrow_and_update().clone();
-        let watching =
-            async { tokio::join!(read(&settings, &task.supply, &heart), watch_line(&settings, &task.line)) };
+        let watching = async {
+            tokio::join!(read(&settings, &task.supply, &heartbeat), watch_line(&settings, &task.line))
+        };
         // The branch that is dropped ends first: a line can have one reader only.
         tokio::select! {
             () = context.stop.cancelled() => return,
@@ -69,14 +70,14 @@ pub async fn run(mut task: PowerTask, context: TaskContext, heart: Heart) {
 }
 
 /// Reads supply and temperature without end. A sensor on a slow bus blocks, so a blocking thread reads it.
-async fn read(settings: &PowerConfig, supply: &watch::Sender<Supply>, heart: &Heart) {
+async fn read(settings: &PowerConfig, supply: &watch::Sender<Supply>, heartbeat: &Heartbeat) {
     let path = |file: &Option<String>| file.as_ref().map(PathBuf::from);
     let files = (path(&settings.voltage_file), path(&settings.going_file));
     let reader = PowerReader::new(Path::new(&settings.sysfs), files.0, files.1);
     let mut round = tokio::time::interval(READING);
     round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
-        heart.while_waiting(round.tick()).await;
+        heartbeat.while_waiting(round.tick()).await;
         let reader = reader.clone();
         let read = move || Supply { reading: reader.read(), memory_mb: process::resident_mb() };
         supply.send_replace(blocking(read).await);

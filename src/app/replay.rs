@@ -100,7 +100,7 @@ pub fn replay(
     let (sender, receiver) = sync_channel(AHEAD);
     let room = Room::new();
     thread::scope(|scope| {
-        let taker = LastTaker(&room);
+        let taker = RoomGuard(&room);
         scope.spawn(|| read_ahead(reader, want_rgb, sender, &room));
         // By value: a flight that cannot be written also ends the reader, which waits for room.
         run.all(receiver, taker, watch)
@@ -146,9 +146,9 @@ impl Room {
 }
 
 /// Releases the reader, which may wait for room, when the taker ends.
-struct LastTaker<'a>(&'a Room);
+struct RoomGuard<'a>(&'a Room);
 
-impl Drop for LastTaker<'_> {
+impl Drop for RoomGuard<'_> {
     fn drop(&mut self) {
         *self.0.lock() = None;
         self.0.freed.notify_all();
@@ -224,7 +224,7 @@ impl ReplayRun {
     fn all(
         &mut self,
         receiver: Receiver<Ahead>,
-        taker: LastTaker<'_>,
+        taker: RoomGuard<'_>,
         watch: &mut dyn FnMut(ReplayStep<'_>),
     ) -> Result<(), ReplayError> {
         for ahead in receiver {

@@ -11,7 +11,7 @@ use super::context::TaskContext;
 use super::events::{self, OperatorEvent};
 use super::log::{self, Log};
 use super::reload::Reloading;
-use super::signals::{Asked, Signals};
+use super::signals::{SignalRequest, Signals};
 use super::supervise::{Supervisor, running_task};
 use super::topology::{self, Graph};
 use super::watch::Watch;
@@ -121,8 +121,8 @@ async fn first_load(
                 loaded => return loaded.map(Some),
             },
             asked = signals.next() => match asked {
-                Asked::End(_) => return Ok(None),
-                Asked::Reload => reloading.ask(),
+                SignalRequest::End(_) => return Ok(None),
+                SignalRequest::Reload => reloading.ask(),
             },
         }
     }
@@ -154,8 +154,8 @@ async fn fly(
     let (why, result) = loop {
         tokio::select! {
             asked = signals.next() => match asked {
-                Asked::End(signal) => break (signal, Ok(())),
-                Asked::Reload => {
+                SignalRequest::End(signal) => break (signal, Ok(())),
+                SignalRequest::Reload => {
                     watch.reloading();
                     reloading.ask();
                 }

@@ -4,7 +4,7 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 
 /// What a signal requests.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Asked {
+pub enum SignalRequest {
     /// Stop; the signal's name.
     End(&'static str),
     /// Read the configuration again.
@@ -30,11 +30,11 @@ impl Signals {
     }
 
     /// Waits for the next signal.
-    pub async fn next(&mut self) -> Asked {
+    pub async fn next(&mut self) -> SignalRequest {
         tokio::select! {
-            Some(()) = self.terminate.recv() => Asked::End("SIGTERM"),
-            Some(()) = self.interrupt.recv() => Asked::End("SIGINT"),
-            Some(()) = self.hang_up.recv() => Asked::Reload,
+            Some(()) = self.terminate.recv() => SignalRequest::End("SIGTERM"),
+            Some(()) = self.interrupt.recv() => SignalRequest::End("SIGINT"),
+            Some(()) = self.hang_up.recv() => SignalRequest::Reload,
             else => std::future::pending().await,
         }
     }

@@ -45,17 +45,17 @@ const BEAT: Duration = Duration::from_millis(250);
 
 /// A task's heartbeat. Copies share the same heartbeat.
 #[derive(Clone, Debug)]
-pub struct Heart {
+pub struct Heartbeat {
     last_ns: Arc<AtomicI64>,
     clock: HostClock,
 }
 
-impl Heart {
+impl Heartbeat {
     /// A heartbeat with a beat now.
     pub fn new(clock: HostClock) -> Self {
-        let heart = Self { last_ns: Arc::new(AtomicI64::new(0)), clock };
-        heart.beat();
-        heart
+        let heartbeat = Self { last_ns: Arc::new(AtomicI64::new(0)), clock };
+        heartbeat.beat();
+        heartbeat
     }
 
     /// Records that the task answers.
@@ -93,7 +93,7 @@ pub fn running_task() -> String {
 
 struct Task {
     rule: TaskRule,
-    heart: Heart,
+    heartbeat: Heartbeat,
     id: tokio::task::Id,
 }
 
@@ -110,24 +110,24 @@ impl Supervisor {
         Self { clock, running: JoinSet::new(), tasks: Vec::new() }
     }
 
-    /// Starts a task on the runtime; `body` beats the heart that it gets and never blocks.
-    pub fn spawn<F>(&mut self, rule: TaskRule, body: impl FnOnce(Heart) -> F)
+    /// Starts a task on the runtime; `body` beats the heartbeat that it gets and never blocks.
+    pub fn spawn<F>(&mut self, rule: TaskRule, body: impl FnOnce(Heartbeat) -> F)
     where
         F: Future<Output = ()> + Send + 'static,
     {
-        let heart = Heart::new(self.clock);
-        let task = NAME.scope(rule.name, body(heart.clone()));
-        self.keep(rule, heart, task);
+        let heartbeat = Heartbeat::new(self.clock);
+        let task = NAME.scope(rule.name, body(heartbeat.clone()));
+        self.keep(rule, heartbeat, task);
     }
 
-    /// Starts a task that computes or blocks, on its own thread; `body` beats the heart that it gets.
+    /// Starts a task that computes or blocks, on its own thread; `body` beats the heartbeat that it gets.
     pub fn spawn_thread(
         &mut self,
         rule: TaskRule,
-        body: impl FnOnce(Heart) + Send + 'static,
+        body: impl FnOnce(Heartbeat) + Send + 'static,
     ) -> std::io::Result<()> {
-        let heart = Heart::new(self.clock);
-        let beating = heart.clone();
+        let heartbeat = Heartbeat::new(self.clock);
+        let beating = heartbeat.clone();
         // Dropped when the body returns and when it panics.
         let (running, ended) = oneshot::channel::<()>();
         let span = tracing::Span::current();
@@ -135,20 +135,25 @@ impl Supervisor {
             let _running = running;
             span.in_scope(|| body(beating));
         })?;
-        self.keep(rule, heart, async move {
+        self.keep(rule, heartbeat, async move {
             let _ = ended.await;
         });
         Ok(())
     }
 
-    fn keep(&mut self, rule: TaskRule, heart: Heart, task: impl Future<Output = ()> + Send + 'static) {
+    fn keep(
+        &mut self,
+        rule: TaskRule,
+        heartbeat: Heartbeat,
+        task: impl Future<Output = ()> + Send + 'static,
+    ) {
         let id = self.running.spawn(task.in_current_span()).id();
-        self.tasks.push(Task { rule, heart, id });
+        self.tasks.push(Task { rule, heartbeat, id });
     }
 
     /// Tasks that have not answered for longer than `limit`, each with that time.
     pub fn silent(&self, limit: Span) -> Vec<(&'static str, Span)> {
-        let silences = self.tasks.iter().map(|task| (task.rule.name, task.heart.silence()));
+        let silences = self.tasks.iter().map(|task| (task.rule.name, task.heartbeat.silence()));
         silences.filter(|(_, silence)| *silence > limit).collect()
     }
 
@@ -185,8 +190,8 @@ mod tests {
         let mut tasks = Supervisor::new(HostClock::start());
         let (sender, receiver) = std::sync::mpsc::channel::<()>();
         tasks
-            .spawn_thread(RULE, move |heart| {
-                heart.beat();
+            .spawn_thread(RULE, move |heartbeat| {
+                heartbeat.beat();
                 let _ = receiver.recv();
             })
             .expect("a thread");

@@ -134,44 +134,44 @@ pub fn start(loaded: Loaded, clock: HostClock) -> std::io::Result<Graph> {
     let metrics = LatestHealth::default();
     let mut tasks = Supervisor::new(clock);
 
-    tasks.spawn(LINK, |heart| {
+    tasks.spawn(LINK, |heartbeat| {
         let (config, context, status) = (Arc::clone(&config), context.clone(), status.clone());
         let (flight_store, downlink) = (flight_store.clone(), downlink.clone());
-        downlink::run(LinkTask { config, context, status, flight_store, downlink, heart })
+        downlink::run(LinkTask { config, context, status, flight_store, downlink, heartbeat })
     });
     let opened = card::open(&config, clock, &flight_store);
-    tasks.spawn(STORE, |heart| {
+    tasks.spawn(STORE, |heartbeat| {
         let (config, context, status) = (Arc::clone(&config), context.clone(), status.clone());
         let (flight_store, orders) = (flight_store.clone(), orders.clone());
-        card::run(StoreTask { config, context, status, flight_store, orders, heart }, opened)
+        card::run(StoreTask { config, context, status, flight_store, orders, heartbeat }, opened)
     });
     tasks.spawn_thread(PIPELINE, {
         let (config, context, status) = (Arc::clone(&config), context.clone(), status.clone());
         let outlets = outlets::of_daemon(&config, &flight_store, &downlink, &metrics);
         let orders = orders.clone();
-        move |heart| {
-            let parts = Parts { config, terrain, context, status, flight_store, outlets, orders, heart };
+        move |heartbeat| {
+            let parts = Parts { config, terrain, context, status, flight_store, outlets, orders, heartbeat };
             pipeline_task::run(parts);
         }
     })?;
     let (readings, power) = power_task::parts(&config.power);
-    tasks.spawn(POWER, |heart| power_task::run(readings, context.clone(), heart));
+    tasks.spawn(POWER, |heartbeat| power_task::run(readings, context.clone(), heartbeat));
     if let Some(device) = config.gps.pps_device.clone() {
-        tasks.spawn(PPS, |heart| devices::pulses(device, context.clone(), heart));
+        tasks.spawn(PPS, |heartbeat| devices::pulses(device, context.clone(), heartbeat));
     }
     if config.gps.is_there() {
-        tasks.spawn(GPS, |heart| devices::gps(Arc::clone(&config), context.clone(), heart));
+        tasks.spawn(GPS, |heartbeat| devices::gps(Arc::clone(&config), context.clone(), heartbeat));
     }
     if config.compass.is_there() && !shares_line(&config.gps, &config.compass) {
-        tasks.spawn(COMPASS, |heart| devices::compass(Arc::clone(&config), context.clone(), heart));
+        tasks.spawn(COMPASS, |heartbeat| devices::compass(Arc::clone(&config), context.clone(), heartbeat));
     }
     if config.autopilot.is_some() {
         let (config, context, to_autopilot) = (Arc::clone(&config), context.clone(), to_autopilot.clone());
-        tasks.spawn(AUTOPILOT, |heart| devices::autopilot(config, to_autopilot, context, heart));
+        tasks.spawn(AUTOPILOT, |heartbeat| devices::autopilot(config, to_autopilot, context, heartbeat));
     }
     if let Some(address) = config.daemon.metrics {
-        tasks.spawn(METRICS, |heart| metrics_task::run(address, metrics, context.clone(), heart));
+        tasks.spawn(METRICS, |heartbeat| metrics_task::run(address, metrics, context.clone(), heartbeat));
     }
-    tasks.spawn(CAMERA, |heart| devices::camera(Arc::clone(&config), context.clone(), heart));
+    tasks.spawn(CAMERA, |heartbeat| devices::camera(Arc::clone(&config), context.clone(), heartbeat));
     Ok(Graph { context, status, orders, power, tasks })
 }

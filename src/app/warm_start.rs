@@ -6,7 +6,7 @@ use prost::Message as _;
 
 use super::context::TaskContext;
 use super::flight_store::FlightStore;
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 use crate::config::Config;
 use crate::io::clock::HostClock;
 use crate::io::process;
@@ -37,7 +37,7 @@ pub enum Earlier {
     /// None: there was none, nothing is recorded, or a stop was requested.
     Nothing,
     /// The card did not answer within this time.
-    NotTold(Span),
+    NoAnswer(Span),
 }
 
 /// Identity of this process: boot, program and configuration. A state must agree with it.
@@ -126,11 +126,11 @@ pub fn wait_for(
     flight_store: &FlightStore,
     origin: &Origin,
     context: &TaskContext,
-    heart: &Heart,
+    heartbeat: &Heartbeat,
 ) -> Earlier {
     let end = context.clock.now() + PATIENCE;
     while !context.stop.is_cancelled() && context.clock.now() < end {
-        heart.beat();
+        heartbeat.beat();
         if let Some(store) = flight_store.get() {
             if let Some(index) = store.index() {
                 let kept = index.state(STATE).map(|kept| origin.take_back(&kept, context.clock.now()));
@@ -146,7 +146,7 @@ pub fn wait_for(
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    if context.stop.is_cancelled() { Earlier::Nothing } else { Earlier::NotTold(PATIENCE) }
+    if context.stop.is_cancelled() { Earlier::Nothing } else { Earlier::NoAnswer(PATIENCE) }
 }
 
 #[cfg(test)]

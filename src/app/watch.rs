@@ -42,7 +42,7 @@ pub(super) struct Watch {
 const SETTLING: Span = Span::from_ns(3_000_000_000);
 
 /// A change from the power task.
-pub(super) enum PowerNews {
+pub(super) enum PowerChange {
     /// A new reading of supply and temperature.
     Supply(Supply),
     /// The line that signals a power failure may have changed.
@@ -117,20 +117,20 @@ impl Watch {
     }
 
     /// Waits for a change from the power task.
-    pub(super) async fn power_news(&mut self) -> PowerNews {
+    pub(super) async fn power_news(&mut self) -> PowerChange {
         tokio::select! {
             Ok(()) = self.power.supply.changed() => {
-                PowerNews::Supply(self.power.supply.borrow_and_update().clone())
+                PowerChange::Supply(self.power.supply.borrow_and_update().clone())
             }
-            Ok(()) = self.power.line.changed() => PowerNews::Line,
+            Ok(()) = self.power.line.changed() => PowerChange::Line,
             // The power task has ended, which ends the process.
             else => std::future::pending().await,
         }
     }
 
     /// Handles a change from the power task.
-    pub(super) fn power(&mut self, news: PowerNews) {
-        if let PowerNews::Supply(supply) = news {
+    pub(super) fn power(&mut self, news: PowerChange) {
+        if let PowerChange::Supply(supply) = news {
             self.supply(&supply);
         }
         let line_set = *self.power.line.borrow_and_update();

@@ -12,7 +12,7 @@ use windhover_base::msg::GnssEpoch;
 use windhover_base::settings::{CompassFormat, GpsFormat};
 use windhover_base::time::{MonoTime, NS_PER_S, UtcTime};
 use windhover_decode::{
-    CompassDecoder, CompassReading, DecodeCounts, GnssDecoder, HeardAttitude, HeardEpoch,
+    CompassDecoder, CompassReading, DecodeCounts, GnssDecoder, ReceivedAttitude, ReceivedEpoch,
 };
 
 /// Decode a raw serial log: the values of the receiver or compass, and what was refused.
@@ -190,7 +190,7 @@ fn decode_gps(bytes: &[u8], args: &GpsArgs, out: &mut impl Write) -> std::io::Re
             "hdop"
         )?;
     }
-    for HeardEpoch { epoch, .. } in &heard {
+    for ReceivedEpoch { epoch, .. } in &heard {
         if json {
             let line = serde_json::to_string(&EpochJson::of(epoch)).map_err(std::io::Error::other)?;
             writeln!(out, "{line}")?;
@@ -254,7 +254,7 @@ fn decode_compass(bytes: &[u8], args: &CompassArgs, out: &mut impl Write) -> std
             "heading_deg", "pitch_deg", "roll_deg", "true", "valid"
         )?;
     }
-    for HeardAttitude { reading, .. } in &heard {
+    for ReceivedAttitude { reading, .. } in &heard {
         let CompassReading { heading_deg, pitch_deg, roll_deg, heading_is_true, .. } = *reading;
         let valid = reading.is_valid();
         if json {
@@ -269,7 +269,7 @@ fn decode_compass(bytes: &[u8], args: &CompassArgs, out: &mut impl Write) -> std
     Ok(counts)
 }
 
-fn decode_as(bytes: &[u8], format: CompassFormat, required: bool) -> (Vec<HeardAttitude>, DecodeCounts) {
+fn decode_as(bytes: &[u8], format: CompassFormat, required: bool) -> (Vec<ReceivedAttitude>, DecodeCounts) {
     let (mut decoder, mut heard) = (CompassDecoder::new(format).checksums_required(required), Vec::new());
     decoder.push(bytes, MonoTime::default(), &mut heard);
     decoder.flush(&mut heard);
@@ -278,9 +278,9 @@ fn decode_as(bytes: &[u8], format: CompassFormat, required: bool) -> (Vec<HeardA
 
 /// The decoding in the format that decodes most: first by complete attitudes, then by any readings. A device's own
 /// format takes precedence over plain NMEA.
-fn likeliest(bytes: &[u8], required: bool) -> (Vec<HeardAttitude>, DecodeCounts) {
+fn likeliest(bytes: &[u8], required: bool) -> (Vec<ReceivedAttitude>, DecodeCounts) {
     let own = CompassFormat::ALL.into_iter().filter(|format| *format != CompassFormat::Nmea);
-    let understood = |heard: &[HeardAttitude]| {
+    let understood = |heard: &[ReceivedAttitude]| {
         let angles = |r: &CompassReading| [r.heading_deg, r.pitch_deg, r.roll_deg].iter().flatten().count();
         heard.iter().map(|heard| angles(&heard.reading)).sum::<usize>()
     };

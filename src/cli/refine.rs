@@ -105,7 +105,7 @@ fn print_found(done: &RefinedFlight) -> CliResult {
     let targets = &done.config.target[..];
     let estimated = || done.refined.constants.iter().filter(|constant| constant.prior_sigma > 0.0);
     outln!("constants of the configuration                  value  one sigma  expected")?;
-    for constant in estimated().filter(|constant| constant.is_told()) {
+    for constant in estimated().filter(|constant| constant.is_determined()) {
         let words = constant_words(constant.kind, targets);
         let [value, sigma, prior, prior_sigma] =
             [constant.value, constant.sigma, constant.prior, constant.prior_sigma].map(|x| x / words.scale);
@@ -117,7 +117,7 @@ fn print_found(done: &RefinedFlight) -> CliResult {
         )?;
     }
     let silent: Vec<String> = estimated()
-        .filter(|constant| !constant.is_told())
+        .filter(|constant| !constant.is_determined())
         .map(|constant| constant_words(constant.kind, targets).name)
         .collect();
     if !silent.is_empty() {

@@ -24,7 +24,7 @@ const READ_BYTES: usize = 4096;
 
 /// How the autopilot is reached.
 #[derive(Clone, PartialEq, Eq, Debug)]
-pub enum Reached {
+pub enum AutopilotAddress {
     /// Over a serial line.
     Serial {
         /// Its device.
@@ -40,7 +40,7 @@ pub enum Reached {
 #[derive(Clone, Debug)]
 pub struct AutopilotSettings {
     /// How it is reached.
-    pub reached: Reached,
+    pub reached: AutopilotAddress,
     /// Its system id; where `None`, the first system that is received.
     pub system_id: Option<u8>,
     /// Whether the messages that are used are requested from it.
@@ -112,9 +112,9 @@ enum Port {
 }
 
 impl Port {
-    async fn open(reached: &Reached) -> Result<Self, Fault> {
+    async fn open(reached: &AutopilotAddress) -> Result<Self, Fault> {
         match reached {
-            Reached::Serial { device, baud } => {
+            AutopilotAddress::Serial { device, baud } => {
                 let settings = SerialSettings {
                     device: device.clone(),
                     baud: *baud,
@@ -125,7 +125,7 @@ impl Port {
                 let line = Line::open(&settings).await?;
                 Ok(Self::Serial(line, format!("{device} at {baud} baud")))
             }
-            Reached::Udp(address) => {
+            AutopilotAddress::Udp(address) => {
                 let socket = UdpSocket::bind(address).await.map_err(|e| Fault::from_io(address, &e))?;
                 Ok(Self::Udp { socket, address: address.clone(), peer: None, from: None })
             }
@@ -263,7 +263,7 @@ mod tests {
         let port = UdpSocket::bind("127.0.0.1:0").await.expect("a port").local_addr().expect("an address");
         let autopilot = UdpSocket::bind("127.0.0.1:0").await.expect("a socket");
         let settings = AutopilotSettings {
-            reached: Reached::Udp(port.to_string()),
+            reached: AutopilotAddress::Udp(port.to_string()),
             system_id: None,
             configure: false,
             key,

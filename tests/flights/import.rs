@@ -1,4 +1,4 @@
-//! Import: recordings people already have become one capture in order of time.
+//! Import: existing recordings become one capture in order of time.
 
 use std::path::Path;
 

@@ -1,4 +1,5 @@
-//! A flight without a camera: the helicopter's own state goes on, in every output, and the program says what is missing.
+//! A flight without a camera: the helicopter's own state continues, in every output, and the program reports what is
+//! missing.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -59,7 +60,7 @@ fn own_states_come_at_their_own_rate_in_every_output() {
     windhover(dir, &["replay", "flight.mcap", "--out", "again.mcap"]);
     windhover(dir, &["export", "again.mcap", "--format", "csv", "--out", "again"]);
     assert_eq!(rows, own_rows(dir, "again"));
-    // And map, track and page show the helicopter, and the page says that no frame came.
+    // And map, track and page show the helicopter, and the page states that no frame was received.
     for (format, file, words) in
         [("kml", "flight.kml", "<name>helicopter</name>"), ("geojson", "flight.geojson", "\"helicopter\"")]
     {

@@ -15,7 +15,7 @@ use windhover_base::time::{MonoTime, Span};
 
 /// An epoch and the arrival of its burst.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub struct HeardEpoch {
+pub struct ReceivedEpoch {
     /// The receiver's report of one instant.
     pub epoch: GnssEpoch,
     /// When the read returned that held the first byte of its burst.
@@ -144,7 +144,7 @@ impl GnssDecoder {
     }
 
     /// Takes the bytes that one read returned at `t_recv`; appends the completed epochs to `out`.
-    pub fn push(&mut self, bytes: &[u8], t_recv: MonoTime, out: &mut Vec<HeardEpoch>) {
+    pub fn push(&mut self, bytes: &[u8], t_recv: MonoTime, out: &mut Vec<ReceivedEpoch>) {
         let Self { format, splitter, framer, counts, assembler } = self;
         let mut piece = |piece: Piece<'_>, counts: &mut DecodeCounts| match piece {
             Piece::Outside(bytes, _) if *format == GpsFormat::Ubx => counts.noise_bytes += bytes.len() as u64,
@@ -161,13 +161,13 @@ impl GnssDecoder {
     }
 
     /// Time has passed: outputs an open epoch after which the receiver has fallen silent.
-    pub fn tick(&mut self, now: MonoTime, out: &mut Vec<HeardEpoch>) {
+    pub fn tick(&mut self, now: MonoTime, out: &mut Vec<ReceivedEpoch>) {
         self.assembler.tick(now, out);
         self.note_dates();
     }
 
     /// The stream has ended: outputs the open epoch.
-    pub fn flush(&mut self, out: &mut Vec<HeardEpoch>) {
+    pub fn flush(&mut self, out: &mut Vec<ReceivedEpoch>) {
         self.assembler.close(out);
         self.assembler.close_aside(None, out);
         self.note_dates();
@@ -186,7 +186,7 @@ impl GnssDecoder {
 }
 
 impl Assembler {
-    fn line(&mut self, line: &Line<'_>, counts: &mut DecodeCounts, out: &mut Vec<HeardEpoch>) {
+    fn line(&mut self, line: &Line<'_>, counts: &mut DecodeCounts, out: &mut Vec<ReceivedEpoch>) {
         let sentence = match self.checksums.sentence(line.text) {
             Ok(sentence) => sentence,
             Err(why) => return counts.refuse(why),
@@ -206,7 +206,7 @@ impl Assembler {
         packet: &[u8],
         span: LineSpan,
         counts: &mut DecodeCounts,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) {
         let address = ubx::address(packet);
         self.order.heard(&address, span);
@@ -219,7 +219,7 @@ impl Assembler {
         address: &str,
         span: LineSpan,
         counts: &mut DecodeCounts,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) {
         let placed = match read {
             Ok(None) => return counts.ignored += 1,
@@ -240,7 +240,7 @@ impl Assembler {
         report: Report,
         address: &str,
         span: LineSpan,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) -> Result<(), Refusal> {
         if report.kind == Kind::Zda {
             self.place_date(report, span, out);
@@ -275,7 +275,7 @@ impl Assembler {
         report: Report,
         address: &str,
         span: LineSpan,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) -> Result<(), Refusal> {
         let time = report.time_of_day_ns;
         if self.is_open(time) {
@@ -307,7 +307,7 @@ impl Assembler {
     }
 
     /// A ZDA has a date and never opens an epoch: in some receivers it is of another second.
-    fn place_date(&mut self, report: Report, span: LineSpan, out: &mut Vec<HeardEpoch>) {
+    fn place_date(&mut self, report: Report, span: LineSpan, out: &mut Vec<ReceivedEpoch>) {
         let Some(time) = report.time_of_day_ns else { return };
         if self.is_open(Some(time)) {
             self.order.same_burst();
@@ -340,7 +340,7 @@ impl Assembler {
         report: &Report,
         time: i64,
         span: LineSpan,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) -> Result<(), Refusal> {
         let open = self.draft.as_ref();
         if !self.is_told_again(report.kind, span) {
@@ -374,7 +374,7 @@ impl Assembler {
         &mut self,
         report: &Report,
         span: LineSpan,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) -> Result<(), Refusal> {
         match (&self.draft, &self.done) {
             (Some(draft), _) if !draft.kinds.contains(&report.kind) => {}
@@ -398,7 +398,7 @@ impl Assembler {
         &mut self,
         report: &Report,
         span: LineSpan,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) -> Result<(), Refusal> {
         if let Some(draft) = &self.draft {
             let one_of_several = report.kind == Kind::Gsa && draft.kinds.last() == Some(&Kind::Gsa);
@@ -422,7 +422,7 @@ impl Assembler {
         }
     }
 
-    fn merge(&mut self, report: &Report, span: LineSpan, out: &mut Vec<HeardEpoch>) {
+    fn merge(&mut self, report: &Report, span: LineSpan, out: &mut Vec<ReceivedEpoch>) {
         let Some(draft) = &mut self.draft else {
             return;
         };
@@ -433,7 +433,7 @@ impl Assembler {
     }
 
     /// Opens the epoch of a new time, with the GLL before it and the sentences that led its burst.
-    fn open(&mut self, time: i64, out: &mut Vec<HeardEpoch>) {
+    fn open(&mut self, time: i64, out: &mut Vec<ReceivedEpoch>) {
         self.close_aside(Some(time), out);
         let date = self.date_of_burst(time);
         let begin = self.order.new_burst(date.as_ref().map(|(_, span)| *span));
@@ -457,7 +457,7 @@ impl Assembler {
     }
 
     /// The open epoch ends because another begins.
-    fn close(&mut self, out: &mut Vec<HeardEpoch>) {
+    fn close(&mut self, out: &mut Vec<ReceivedEpoch>) {
         if let Some(draft) = &self.draft {
             self.cycle.ended(&draft.kinds);
             self.give_out(out);
@@ -465,13 +465,13 @@ impl Assembler {
     }
 
     /// Outputs the GLL that was kept apart, unless it has the time of the new epoch.
-    fn close_aside(&mut self, time: Option<i64>, out: &mut Vec<HeardEpoch>) {
+    fn close_aside(&mut self, time: Option<i64>, out: &mut Vec<ReceivedEpoch>) {
         if let Some(aside) = self.aside.take_if(|aside| time.is_none() || aside.time_of_day_ns != time) {
             out.push(heard(&aside, &mut self.calendar));
         }
     }
 
-    fn give_out(&mut self, out: &mut Vec<HeardEpoch>) {
+    fn give_out(&mut self, out: &mut Vec<ReceivedEpoch>) {
         if let Some(draft) = self.draft.take() {
             out.push(heard(&draft, &mut self.calendar));
             let (time_of_day_ns, t_last) = (draft.time_of_day_ns, draft.end.t_last);
@@ -479,7 +479,7 @@ impl Assembler {
         }
     }
 
-    fn tick(&mut self, now: MonoTime, out: &mut Vec<HeardEpoch>) {
+    fn tick(&mut self, now: MonoTime, out: &mut Vec<ReceivedEpoch>) {
         let (low, high) = QUIET_BOUNDS_NS;
         let quiet = self.period.map_or(QUIET_FIRST, |p| Span::from_ns((p.ns() / 2).clamp(low, high)));
         if self.draft.as_ref().is_some_and(|draft| now - draft.end.t_last >= quiet) {
@@ -516,8 +516,8 @@ impl Draft {
     }
 }
 
-fn heard(draft: &Draft, calendar: &mut Calendar) -> HeardEpoch {
-    HeardEpoch {
+fn heard(draft: &Draft, calendar: &mut Calendar) -> ReceivedEpoch {
+    ReceivedEpoch {
         epoch: draft.finish(calendar),
         t_first_byte: draft.begin.t_first,
         bytes_before_end: draft.begin.first_read_bytes,

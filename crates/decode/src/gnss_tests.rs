@@ -2,7 +2,7 @@
 
 use proptest::prelude::*;
 
-use super::gnss::{GnssDecoder, HeardEpoch};
+use super::gnss::{GnssDecoder, ReceivedEpoch};
 use super::sentence::framed;
 use super::{DecodeCounts, Refusal};
 use windhover_base::msg::FixKind;
@@ -35,14 +35,14 @@ fn garmin(second: u32) -> String {
         + &line(&format!("PGRMV,{value},-1.0,0.5"))
 }
 
-fn decode(mut decoder: GnssDecoder, text: &str) -> (Vec<HeardEpoch>, DecodeCounts) {
+fn decode(mut decoder: GnssDecoder, text: &str) -> (Vec<ReceivedEpoch>, DecodeCounts) {
     let mut out = Vec::new();
     decoder.push(text.as_bytes(), MonoTime::default(), &mut out);
     decoder.flush(&mut out);
     (out, decoder.counts().clone())
 }
 
-fn seconds(epochs: &[HeardEpoch]) -> Vec<Option<i64>> {
+fn seconds(epochs: &[ReceivedEpoch]) -> Vec<Option<i64>> {
     epochs.iter().map(|e| e.epoch.time_of_day_ns.map(|ns| ns / 1_000_000_000 % 60)).collect()
 }
 
@@ -172,7 +172,7 @@ fn zda(time: &str) -> String {
 }
 
 /// Pushes each line of the text at its time, bursts 1 s apart, lines 20 ms, and ticks between them.
-fn live(bursts: &[String]) -> (Vec<HeardEpoch>, DecodeCounts) {
+fn live(bursts: &[String]) -> (Vec<ReceivedEpoch>, DecodeCounts) {
     let (mut decoder, mut out) = (GnssDecoder::new(), Vec::new());
     for (second, burst) in bursts.iter().enumerate() {
         let begin = MonoTime::from_ns(HOST_NS) + Span::from_s(second as f64);
@@ -217,7 +217,7 @@ fn a_zda_dates_and_never_opens_an_epoch() {
             }
         }
         // Its burst begins with the ZDA only where the ZDA leads it.
-        let begins = |heard: &HeardEpoch| (heard.t_first_byte.ns() - HOST_NS) % 1_000_000_000 / 1_000_000;
+        let begins = |heard: &ReceivedEpoch| (heard.t_first_byte.ns() - HOST_NS) % 1_000_000_000 / 1_000_000;
         let late = if leads && ahead != 0 { 20 } else { 0 };
         let settled = live(&bursts).0;
         assert!(
@@ -401,7 +401,7 @@ proptest! {
             cut.push(read, MonoTime::default(), &mut in_pieces);
             rest = after;
         }
-        let epochs = |heard: &[HeardEpoch]| heard.iter().map(|h| h.epoch).collect::<Vec<_>>();
+        let epochs = |heard: &[ReceivedEpoch]| heard.iter().map(|h| h.epoch).collect::<Vec<_>>();
         prop_assert_eq!(epochs(&at_once), epochs(&in_pieces));
         prop_assert_eq!(whole.counts(), cut.counts());
     }

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 use proptest::prelude::*;
 
-use super::gnss::{GnssDecoder, HeardEpoch};
+use super::gnss::{GnssDecoder, ReceivedEpoch};
 use super::sentence::framed;
 use super::ubx::ubx_framed;
 use super::{DecodeCounts, Refusal};
@@ -37,7 +37,7 @@ fn pvt(second: u8, nanoseconds: i32, fix: u8, flags: u8) -> Vec<u8> {
     ubx_framed(1, 7, &payload)
 }
 
-fn decode(format: GpsFormat, bytes: &[u8]) -> (Vec<HeardEpoch>, DecodeCounts) {
+fn decode(format: GpsFormat, bytes: &[u8]) -> (Vec<ReceivedEpoch>, DecodeCounts) {
     let (mut decoder, mut out) = (GnssDecoder::patient().of_format(format), Vec::new());
     decoder.push(bytes, MonoTime::default(), &mut out);
     decoder.flush(&mut out);

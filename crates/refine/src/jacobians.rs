@@ -12,7 +12,7 @@ use windhover_estimate::batch::Predictor;
 use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 
 use crate::block::{Block, Noise, Source};
-use crate::first::filtered;
+use crate::initial::filtered;
 use crate::problem::{Origin, Pass, Problem};
 use crate::recording::Recording;
 use crate::refine::{first_values, planned, stated};

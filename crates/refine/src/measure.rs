@@ -19,7 +19,7 @@ pub(crate) struct Instant<'a> {
     /// Acceleration at the knot.
     pub(crate) pushed: &'a Pushed,
     pub(crate) dt: f64,
-    /// First column of the knot, and of the landmark.
+    /// InitialValues column of the knot, and of the landmark.
     pub(crate) at: usize,
     pub(crate) landmark_at: usize,
     pub(crate) shape: Shape,

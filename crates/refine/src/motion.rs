@@ -51,7 +51,7 @@ pub(crate) struct Link<'a> {
     pub(crate) to: &'a Knot,
     pub(crate) pushed: (&'a Pushed, &'a Pushed),
     pub(crate) h: f64,
-    /// First columns of the two.
+    /// InitialValues columns of the two.
     pub(crate) at: (usize, usize),
     pub(crate) shape: Shape,
     pub(crate) places: &'a [Place],

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use windhover_base::msg::MarkerId;
 use windhover_base::time::{MonoTime, Span};
 
-use crate::first::First;
+use crate::initial::InitialValues;
 use crate::recording::Recording;
 
 /// Largest distance of two knots, s.
@@ -71,7 +71,7 @@ impl Plan {
         &mut self,
         flight: usize,
         recording: &Recording,
-        first: &First,
+        first: &InitialValues,
         find: &dyn Fn(MarkerId) -> Option<usize>,
         targets: usize,
         lost_after_s: f64,

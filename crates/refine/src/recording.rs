@@ -31,13 +31,13 @@ pub struct OutsidePosition {
 
 /// One measurement.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum Heard<'a> {
+pub(crate) enum Measured<'a> {
     Epoch(&'a Stamped<GnssEpoch>),
     Reading(&'a Stamped<AttitudeSample>),
     Frame(&'a Stamped<FrameObservations>),
 }
 
-impl Heard<'_> {
+impl Measured<'_> {
     pub(crate) fn t_recv(&self) -> MonoTime {
         match self {
             Self::Epoch(m) => m.t_recv,
@@ -49,12 +49,12 @@ impl Heard<'_> {
 
 impl Recording {
     /// All measurements, in order of reception.
-    pub(crate) fn in_order(&self) -> Vec<Heard<'_>> {
-        let epochs = self.epochs.iter().map(Heard::Epoch);
-        let readings = self.readings.iter().map(Heard::Reading);
-        let mut all: Vec<Heard<'_>> =
-            epochs.chain(readings).chain(self.frames.iter().map(Heard::Frame)).collect();
-        all.sort_by_key(Heard::t_recv);
+    pub(crate) fn in_order(&self) -> Vec<Measured<'_>> {
+        let epochs = self.epochs.iter().map(Measured::Epoch);
+        let readings = self.readings.iter().map(Measured::Reading);
+        let mut all: Vec<Measured<'_>> =
+            epochs.chain(readings).chain(self.frames.iter().map(Measured::Frame)).collect();
+        all.sort_by_key(Measured::t_recv);
         all
     }
 }

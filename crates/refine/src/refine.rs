@@ -9,16 +9,16 @@ use windhover_base::time::MonoTime;
 use windhover_estimate::Site;
 use windhover_estimate::batch::Predictor;
 
-use crate::first::{First, filtered};
+use crate::covariance_pass::{PassResult, look};
 use crate::front::Shape;
-use crate::look::{Looked, look};
+use crate::initial::{InitialValues, filtered};
 use crate::motion::Processes;
 use crate::noise::first as first_noise;
 use crate::plan::Plan;
 use crate::problem::{Pass, Problem};
 use crate::recording::Recording;
+use crate::result::Refined;
 use crate::solve::{Unsolved, solve};
-use crate::told::Refined;
 use crate::unknowns::{knot, outside_places, places, priors};
 use crate::values::{Knot, Values};
 
@@ -86,7 +86,7 @@ pub fn refine(
     recordings: &[Recording],
     watch: &mut dyn FnMut(f64) -> bool,
 ) -> Result<Refined, RefineError> {
-    let firsts: Vec<First> =
+    let firsts: Vec<InitialValues> =
         recordings.iter().map(|recording| filtered(rig, estimator, site, recording)).collect();
     let felt = firsts.iter().find_map(|first| first.felt);
     let mut predictor = Predictor::new(rig, estimator, site);
@@ -138,7 +138,7 @@ fn why_not_started(recordings: &[Recording]) -> RefineError {
 pub(crate) fn planned(
     predictor: &Predictor,
     recordings: &[Recording],
-    firsts: &[First],
+    firsts: &[InitialValues],
     targets: usize,
     lost_after_s: f64,
 ) -> Plan {
@@ -196,7 +196,7 @@ pub(crate) fn stated<'a>(
 
 pub(crate) fn first_values(
     problem: &Problem<'_>,
-    firsts: &[First],
+    firsts: &[InitialValues],
     predictor: &Predictor,
     rig: &Rig,
     site: &Site,
@@ -264,7 +264,7 @@ fn place_landmarks(problem: &Problem<'_>, rig: &Rig, site: &Site, values: &mut V
 }
 
 /// Drops landmarks that were too often outside the gate; returns how many.
-fn drop_movers(problem: &mut Problem<'_>, looked: &Looked) -> usize {
+fn drop_movers(problem: &mut Problem<'_>, looked: &PassResult) -> usize {
     let mut more = 0;
     for (dropped, (seen, outside)) in problem.dropped.iter_mut().zip(&looked.landmarks) {
         let moves = *outside as f64 > MOVING * *seen as f64;
@@ -275,7 +275,13 @@ fn drop_movers(problem: &mut Problem<'_>, looked: &Looked) -> usize {
 }
 
 impl Refined {
-    fn finish(&mut self, problem: &Problem<'_>, firsts: &[First], felt: Option<FeltTilt>, inflation: f64) {
+    fn finish(
+        &mut self,
+        problem: &Problem<'_>,
+        firsts: &[InitialValues],
+        felt: Option<FeltTilt>,
+        inflation: f64,
+    ) {
         for (constant, prior) in self.constants.iter_mut().zip(&problem.priors) {
             if prior.is_estimated() {
                 constant.sigma = (constant.sigma * inflation.sqrt()).min(constant.prior_sigma);

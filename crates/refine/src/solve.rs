@@ -13,7 +13,7 @@ const LANDMARK: f64 = 1e-8;
 
 /// The kind of eliminated unknowns.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(crate) enum What {
+pub(crate) enum EliminatedKind {
     Knot(usize),
     Landmark(usize),
     Constants,
@@ -21,7 +21,7 @@ pub(crate) enum What {
 
 /// The factorised normal equations at some values.
 pub(crate) struct Factors {
-    pub(crate) steps: Vec<(What, Eliminated)>,
+    pub(crate) steps: Vec<(EliminatedKind, Eliminated)>,
     pub(crate) cost: f64,
 }
 
@@ -72,17 +72,17 @@ pub(crate) fn factorise(
             cost += loss.cost;
             front.add(&block.columns, &block.rows, &block.right, loss.weight);
         });
-        steps.push((What::Knot(k), front.eliminate(shape.knot_at(k), shape.knot, raised)?));
+        steps.push((EliminatedKind::Knot(k), front.eliminate(shape.knot_at(k), shape.knot, raised)?));
         for (place, landmark) in &stop.closes {
             let first = shape.landmark_at(*place);
             (0..2).for_each(|i| front.hold(first + i, LANDMARK));
-            steps.push((What::Landmark(*landmark), front.eliminate(first, 2, raised)?));
+            steps.push((EliminatedKind::Landmark(*landmark), front.eliminate(first, 2, raised)?));
         }
         if !watch(k) {
             return Err(Unsolved::Stopped);
         }
     }
-    steps.push((What::Constants, front.eliminate(shape.constants_at(), shape.constants, raised)?));
+    steps.push((EliminatedKind::Constants, front.eliminate(shape.constants_at(), shape.constants, raised)?));
     Ok(Factors { steps, cost })
 }
 
@@ -128,11 +128,11 @@ fn apply(pass: &Pass<'_>, factors: &Factors, values: &mut Values) {
 }
 
 impl Values {
-    fn step(&mut self, what: What, dx: &[f64]) {
+    fn step(&mut self, what: EliminatedKind, dx: &[f64]) {
         match what {
-            What::Knot(k) => self.knots[k].step(dx),
-            What::Landmark(l) => self.landmarks[l].iter_mut().zip(dx).for_each(|(x, d)| *x += d),
-            What::Constants => self.constants.iter_mut().zip(dx).for_each(|(x, d)| *x += d),
+            EliminatedKind::Knot(k) => self.knots[k].step(dx),
+            EliminatedKind::Landmark(l) => self.landmarks[l].iter_mut().zip(dx).for_each(|(x, d)| *x += d),
+            EliminatedKind::Constants => self.constants.iter_mut().zip(dx).for_each(|(x, d)| *x += d),
         }
     }
 }

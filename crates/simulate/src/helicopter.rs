@@ -10,7 +10,7 @@ use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use super::instant::{OwnshipTruth, STEP_S};
 use super::ode::{Table, rk4};
-use super::random::{Purpose, Stream, Wander};
+use super::random::{Purpose, SmoothNoise, Stream};
 use super::scenario::{Helicopter, HelicopterPath, Wind};
 use super::vehicle::VehicleMotion;
 use windhover_base::geo::{euler_321, ned_from_body_321, wrap_angle};
@@ -29,7 +29,7 @@ pub(super) struct HelicopterMotion {
     trace: Trace,
     air: Air,
     drag_per_s: f64,
-    heading: (f64, Wander),
+    heading: (f64, SmoothNoise),
     /// Rotates the body into the frame whose z axis is the rotor's, where they differ.
     rotor_from_body: Option<Rotation3<f64>>,
 }
@@ -44,14 +44,14 @@ enum Trace {
 #[derive(Clone, Debug)]
 struct Air {
     mean: Vector3<f64>,
-    gusts: [Wander; 3],
+    gusts: [SmoothNoise; 3],
 }
 
 struct Pilot<'a> {
     plan: &'a Helicopter,
     vehicles: &'a [VehicleMotion],
     air: Air,
-    agitation: [Wander; 3],
+    agitation: [SmoothNoise; 3],
     offset: Vector3<f64>,
     phase: f64,
 }
@@ -63,7 +63,7 @@ impl Air {
         let toward = wind.toward_deg.unwrap_or(random).to_radians();
         let mean = Vector3::new(toward.cos(), toward.sin(), 0.0) * wind.mean_mps;
         let gust = wind.gust_mps;
-        let gusts = [gust, gust, 0.4 * gust].map(|rms| Wander::new(rms, 1.5, 15.0, &mut stream));
+        let gusts = [gust, gust, 0.4 * gust].map(|rms| SmoothNoise::new(rms, 1.5, 15.0, &mut stream));
         Self { mean, gusts }
     }
 
@@ -83,13 +83,13 @@ impl HelicopterMotion {
         let mut stream = Stream::of(seed, Purpose::Flight);
         let random_heading = stream.uniform(-180.0, 180.0);
         let heading = plan.heading_deg.unwrap_or(random_heading).to_radians();
-        let wander = Wander::new(plan.heading_wander_deg.to_radians(), 5.0, 30.0, &mut stream);
+        let wander = SmoothNoise::new(plan.heading_wander_deg.to_radians(), 5.0, 30.0, &mut stream);
         let pilot = Pilot {
             plan,
             vehicles,
             air: Air::new(wind, seed),
             agitation: [1.0, 1.0, 0.6]
-                .map(|share| Wander::new(share * plan.agitation_mps2, 1.0, 6.0, &mut stream)),
+                .map(|share| SmoothNoise::new(share * plan.agitation_mps2, 1.0, 6.0, &mut stream)),
             offset: Vector3::new(stream.uniform(-0.7, 0.7), stream.uniform(-0.7, 0.7), 0.0),
             phase: stream.uniform(0.0, std::f64::consts::TAU),
         };
@@ -109,7 +109,7 @@ impl HelicopterMotion {
         let mut stream = Stream::of(seed, Purpose::Flight);
         let random_heading = stream.uniform(-180.0, 180.0);
         let heading = plan.heading_deg.unwrap_or(random_heading).to_radians();
-        let wander = Wander::new(plan.heading_wander_deg.to_radians(), 5.0, 30.0, &mut stream);
+        let wander = SmoothNoise::new(plan.heading_wander_deg.to_radians(), 5.0, 30.0, &mut stream);
         let air = Air::new(wind, seed);
         let thrust = -Vector3::z() * GRAVITY - air.mean * plan.drag_per_s;
         let y = [start.x, start.y, start.z, 0.0, 0.0, 0.0, thrust.x, thrust.y, thrust.z, 0.0, 0.0, 0.0];

@@ -2,10 +2,10 @@
 
 use nalgebra::Rotation3;
 
-use super::company::{Companion, Looks};
+use super::company::{Appearance, Companion};
 use super::helicopter::HelicopterMotion;
 use super::instant::{OwnshipTruth, VehicleTruth};
-use super::random::{Purpose, Stream, Wander};
+use super::random::{Purpose, SmoothNoise, Stream};
 use super::scenario::Scenario;
 use super::vehicle::VehicleMotion;
 use windhover_base::geo::{LocalFrame, ned_from_body_321};
@@ -30,7 +30,7 @@ pub struct World {
     companions: Vec<Companion>,
     helicopter: HelicopterMotion,
     /// Turns of the camera about its axes, radians.
-    vibration: Option<[Wander; 3]>,
+    vibration: Option<[SmoothNoise; 3]>,
 }
 
 impl World {
@@ -156,7 +156,7 @@ impl World {
     }
 
     /// The target it is or, of a companion, what it looks like.
-    pub(super) fn looks(&self, index: usize) -> (&TargetConfig, Option<Looks>) {
+    pub(super) fn looks(&self, index: usize) -> (&TargetConfig, Option<Appearance>) {
         match index.checked_sub(self.vehicles.len()) {
             None => (&self.rig.target[index], None),
             Some(companion) => (&self.rig.target[0], Some(self.companions[companion].looks)),
@@ -171,8 +171,8 @@ impl World {
     }
 }
 
-fn vibration(rms_deg: f64, seed: u64) -> Option<[Wander; 3]> {
+fn vibration(rms_deg: f64, seed: u64) -> Option<[SmoothNoise; 3]> {
     let mut stream = Stream::of(seed, Purpose::Vibration);
-    let mut axis = || Wander::new(rms_deg.to_radians(), VIBRATION_S.0, VIBRATION_S.1, &mut stream);
+    let mut axis = || SmoothNoise::new(rms_deg.to_radians(), VIBRATION_S.0, VIBRATION_S.1, &mut stream);
     (rms_deg != 0.0).then(|| [axis(), axis(), axis()])
 }

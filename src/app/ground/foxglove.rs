@@ -21,7 +21,7 @@ use prost::Message as _;
 use serde_json::{Value, json};
 use tokio::sync::broadcast;
 
-use super::door::Door;
+use super::listener::ClientListener;
 use super::web::{query_token, same};
 use crate::io::link::{Arrival, Class, downlink_class};
 use crate::io::proto::link::Thumbnail;
@@ -44,7 +44,7 @@ const CLIENT_LIMIT: usize = 256 << 10;
 
 /// One message of a channel.
 #[derive(Clone)]
-struct Said {
+struct ChannelMessage {
     channel: u64,
     time_ns: u64,
     data: Bytes,
@@ -54,7 +54,7 @@ struct FoxgloveChannel {
     topic: String,
     schema_name: String,
     schema: Arc<[u8]>,
-    last: Option<Said>,
+    last: Option<ChannelMessage>,
 }
 
 impl FoxgloveChannel {
@@ -68,7 +68,7 @@ impl FoxgloveChannel {
 #[derive(Clone)]
 enum News {
     Channel(u64),
-    Said(Said),
+    Message(ChannelMessage),
 }
 
 #[derive(Default)]
@@ -105,12 +105,12 @@ impl Scope {
             return;
         }
         let name = format!("/{}{}", arrival.payload, channel.topic);
-        self.say(&name, &channel.schema_name, &channel.schema, arrival.publish_time, &arrival.data);
+        self.publish(&name, &channel.schema_name, &channel.schema, arrival.publish_time, &arrival.data);
         let is_state = channel.schema_name == "windhover.TargetState" && topic::is_target_now(&channel.topic);
         let state = is_state.then(|| wh::TargetState::decode(&arrival.data[..]).ok()).flatten();
         if let Some(fix) = state.as_ref().and_then(location) {
             let target = name.rsplit_once('/').map_or(&*name, |(target, _)| target);
-            self.say(
+            self.publish(
                 &format!("{target}/location"),
                 "foxglove.LocationFix",
                 &[],
@@ -130,18 +130,18 @@ impl Scope {
             format: "jpeg".into(),
         };
         let topic = format!("/{payload}/camera/thumbnail");
-        self.say(&topic, "foxglove.CompressedImage", &[], t, &image.encode_to_vec());
+        self.publish(&topic, "foxglove.CompressedImage", &[], t, &image.encode_to_vec());
     }
 
     /// A message of a topic; an empty schema stands for the program's own schema of this name.
-    fn say(&self, topic: &str, schema_name: &str, schema: &[u8], t: MonoTime, data: &[u8]) {
+    fn publish(&self, topic: &str, schema_name: &str, schema: &[u8], t: MonoTime, data: &[u8]) {
         let mut channels = self.channels();
         let Some(channel) = channels.number(topic, schema_name, schema, &self.news) else { return };
         let time_ns = u64::try_from(t.ns()).unwrap_or(0);
-        let said = Said { channel, time_ns, data: Bytes::copy_from_slice(data) };
+        let said = ChannelMessage { channel, time_ns, data: Bytes::copy_from_slice(data) };
         channels.all[channel as usize - 1].last = Some(said.clone());
         // There may be no client.
-        let _ = self.news.send(News::Said(said));
+        let _ = self.news.send(News::Message(said));
     }
 }
 
@@ -276,7 +276,7 @@ impl Client {
                         told = self.advertise(scope, told).await?;
                     }
                     Ok(News::Channel(_)) => {}
-                    Ok(News::Said(said)) => self.send(&said).await?,
+                    Ok(News::Message(said)) => self.send(&said).await?,
                     // The client missed some messages; channels must not be among them.
                     Err(broadcast::error::RecvError::Lagged(_)) => told = self.advertise(scope, told).await?,
                     Err(broadcast::error::RecvError::Closed) => return Ok(()),
@@ -308,7 +308,7 @@ impl Client {
         self.socket.send(Message::text(message.to_string())).await
     }
 
-    async fn send(&mut self, said: &Said) -> Result<(), axum::Error> {
+    async fn send(&mut self, said: &ChannelMessage) -> Result<(), axum::Error> {
         let wanted: Vec<u32> =
             self.subscriptions.iter().filter(|(_, c)| **c == said.channel).map(|(id, _)| *id).collect();
         for id in wanted {
@@ -322,7 +322,7 @@ impl Client {
     async fn listen(&mut self, scope: &Scope, text: &str) -> Result<(), axum::Error> {
         for request in requests(text) {
             match request {
-                Asked::Subscribe { id, channel } if self.subscriptions.len() < SUBSCRIPTIONS => {
+                SignalRequest::Subscribe { id, channel } if self.subscriptions.len() < SUBSCRIPTIONS => {
                     self.subscriptions.insert(id, channel);
                     let at = usize::try_from(channel).ok().and_then(|n| n.checked_sub(1));
                     let last = at.and_then(|at| scope.channels().all.get(at)?.last.clone());
@@ -330,8 +330,8 @@ impl Client {
                         self.socket.send(Message::Binary(frame(id, &last))).await?;
                     }
                 }
-                Asked::Subscribe { .. } => {}
-                Asked::Unsubscribe { id } => {
+                SignalRequest::Subscribe { .. } => {}
+                SignalRequest::Unsubscribe { id } => {
                     self.subscriptions.remove(&id);
                 }
             }
@@ -341,23 +341,24 @@ impl Client {
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-enum Asked {
+enum SignalRequest {
     Subscribe { id: u32, channel: u64 },
     Unsubscribe { id: u32 },
 }
 
-fn requests(text: &str) -> Vec<Asked> {
+fn requests(text: &str) -> Vec<SignalRequest> {
     let Ok(message) = serde_json::from_str::<Value>(text) else { return Vec::new() };
     let id = |value: &Value| u32::try_from(value.as_u64()?).ok();
     let list = |name: &str| message[name].as_array().cloned().unwrap_or_default();
     match message["op"].as_str() {
         Some("subscribe") => {
-            let one =
-                |s: &Value| Some(Asked::Subscribe { id: id(&s["id"])?, channel: s["channelId"].as_u64()? });
+            let one = |s: &Value| {
+                Some(SignalRequest::Subscribe { id: id(&s["id"])?, channel: s["channelId"].as_u64()? })
+            };
             list("subscriptions").iter().filter_map(one).collect()
         }
         Some("unsubscribe") => {
-            let one = |s: &Value| Some(Asked::Unsubscribe { id: id(s)? });
+            let one = |s: &Value| Some(SignalRequest::Unsubscribe { id: id(s)? });
             list("subscriptionIds").iter().filter_map(one).collect()
         }
         _ => Vec::new(),
@@ -365,7 +366,7 @@ fn requests(text: &str) -> Vec<Asked> {
 }
 
 /// The binary frame of a message: kind, subscription, time, little-endian, then the message.
-fn frame(subscription: u32, said: &Said) -> Bytes {
+fn frame(subscription: u32, said: &ChannelMessage) -> Bytes {
     let mut bytes = BytesMut::with_capacity(13 + said.data.len());
     bytes.put_u8(MESSAGE_DATA);
     bytes.put_u32_le(subscription);
@@ -380,7 +381,7 @@ pub async fn serve(listener: tokio::net::TcpListener, server: Server) -> std::io
         .route("/", get(upgrade))
         .layer(axum::middleware::from_fn_with_state(server.clone(), guard))
         .with_state(server);
-    axum::serve(Door::new(listener, "foxglove"), router).await
+    axum::serve(ClientListener::new(listener, "foxglove"), router).await
 }
 
 #[cfg(test)]
@@ -419,10 +420,10 @@ mod tests {
     #[test]
     fn requests_are_read_and_everything_else_is_passed_over() {
         let two = r#"{"op":"subscribe","subscriptions":[{"id":7,"channelId":2},{"id":-1,"channelId":2}]}"#;
-        assert_eq!(requests(two), [Asked::Subscribe { id: 7, channel: 2 }]);
+        assert_eq!(requests(two), [SignalRequest::Subscribe { id: 7, channel: 2 }]);
         assert_eq!(
             requests(r#"{"op":"unsubscribe","subscriptionIds":[7,"x"]}"#),
-            [Asked::Unsubscribe { id: 7 }]
+            [SignalRequest::Unsubscribe { id: 7 }]
         );
         for other in ["", "[]", "{", "7", r#"{"op":"subscribe"}"#, r#"{"op":7}"#, r#"{"op":"advertise"}"#] {
             assert_eq!(requests(other), [], "{other}");

@@ -8,7 +8,7 @@
 //! ```
 
 mod cot;
-mod door;
+mod listener;
 mod feeds;
 #[cfg(feature = "zenoh")]
 pub mod fleet;
@@ -36,8 +36,8 @@ use crate::io::clock::HostClock;
 use crate::io::link::{
     Arrival, FromPayload, LinkError, LinkEvent, StationHandle, StationLink, StationSettings,
 };
-use door::Door;
 use foxglove::Scope;
+use listener::ClientListener;
 use mirror::{Mirror, MirrorError};
 use terminal::Terminal;
 use view::View;
@@ -191,7 +191,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     if let Some(address) = settings.nmea {
         let listener = listen(address).await?;
         terminal.line(format_args!("NMEA at tcp://{}", listener.local_addr()?));
-        tasks.spawn(nmea_port::serve(Door::new(listener, "nmea"), Arc::clone(&view)));
+        tasks.spawn(nmea_port::serve(ClientListener::new(listener, "nmea"), Arc::clone(&view)));
     }
     if !settings.cot.is_empty() {
         let over_tls = settings.cot.iter().any(|to| matches!(to, CotTo::Tls(_)));

@@ -8,7 +8,7 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::sync::broadcast;
 use tokio::time::Instant;
 
-use super::door::{Door, Visitor};
+use super::listener::{ClientListener, ClientStream};
 use super::view::View;
 use super::{feeds, lock};
 
@@ -20,11 +20,11 @@ const PATIENCE: Duration = Duration::from_secs(10);
 const QUEUE: usize = 64;
 
 /// Sends sentences of every vehicle whose state is new, and once a second of one that is lost, to every plotter.
-pub(super) async fn serve(mut door: Door, view: Arc<Mutex<View>>) -> std::io::Result<()> {
+pub(super) async fn serve(mut listener: ClientListener, view: Arc<Mutex<View>>) -> std::io::Result<()> {
     let sentences = broadcast::Sender::<Arc<str>>::new(QUEUE);
     let accept = async {
         loop {
-            let (mut plotter, _) = door.next().await;
+            let (mut plotter, _) = listener.next().await;
             plotter.listens();
             tokio::spawn(attend(plotter, sentences.subscribe()));
         }
@@ -53,7 +53,7 @@ async fn produce(sentences: &broadcast::Sender<Arc<str>>, view: &Mutex<View>) {
 }
 
 /// Serves one plotter until it leaves or stops reading. What it sends is ignored.
-async fn attend(mut plotter: Visitor, mut news: broadcast::Receiver<Arc<str>>) {
+async fn attend(mut plotter: ClientStream, mut news: broadcast::Receiver<Arc<str>>) {
     let mut ignored = [0; 256];
     loop {
         tokio::select! {

@@ -7,7 +7,7 @@ use prost::Message as _;
 use serde_json::{Value, json};
 use tokio::time::Instant;
 
-use crate::app::openmetrics::{self, Told};
+use crate::app::openmetrics::{self, PayloadMetrics};
 use crate::io::link::{Arrival, PayloadStatus};
 use crate::io::proto::{foxglove, host_time, link::Thumbnail, windhover as wh};
 use crate::io::records::topic;
@@ -277,7 +277,7 @@ impl View {
         let told = self.payloads.iter().filter_map(|(payload, p)| {
             let health = p.health_told.as_ref()?;
             let age_s = Some(p.clock.age(host_time(health.timestamp.as_ref()), now).s());
-            Some(Told { payload, health, age_s, link: p.linked })
+            Some(PayloadMetrics { payload, health, age_s, link: p.linked })
         });
         openmetrics::render(&told.collect::<Vec<_>>())
     }

@@ -18,8 +18,8 @@ use axum::routing::get;
 use tokio::sync::broadcast;
 use tokio::time::Instant;
 
-use super::door::Door;
 use super::feeds;
+use super::listener::ClientListener;
 use super::view::View;
 use crate::app::openmetrics;
 
@@ -238,7 +238,7 @@ fn deepest_tiles(dir: &std::path::Path) -> u32 {
 
 /// Serves until the program ends.
 pub async fn serve(listener: tokio::net::TcpListener, web: Web) -> std::io::Result<()> {
-    axum::serve(Door::new(listener, "page"), web.router()).await
+    axum::serve(ClientListener::new(listener, "page"), web.router()).await
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 
 use super::autopilot::{SimulatedAutopilot, follow_target};
 use crate::config::Config;
-use crate::io::mavlink::Teller;
+use crate::io::mavlink::MavlinkEncoder;
 use crate::io::mavlink::companion::Companion;
 use crate::pipeline::{Pipeline, PipelineSettings};
 use windhover_base::msg::{Event, EventBody, Source};
@@ -52,7 +52,7 @@ pub struct Moment {
 pub struct ClosedLoop {
     flight: ClosedFlight,
     pipeline: Pipeline,
-    teller: Teller,
+    encoder: MavlinkEncoder,
     companion: Companion,
     autopilot: SimulatedAutopilot,
     follower: Follower,
@@ -87,7 +87,13 @@ impl ClosedLoop {
                 if settings.truth { 0 } else { settings.threads.max(1) },
             ),
             pipeline: Pipeline::new(PipelineSettings::from(&config)),
-            teller: Teller::new(&config.mavlink, &config.target, &config.ground, &config.camera, None),
+            encoder: MavlinkEncoder::new(
+                &config.mavlink,
+                &config.target,
+                &config.ground,
+                &config.camera,
+                None,
+            ),
             companion: Companion::new(None, true),
             autopilot: SimulatedAutopilot::new(settings.receiver_m),
             follower: Follower::new(tuning),
@@ -171,13 +177,13 @@ impl ClosedLoop {
             self.seq += 1;
             self.pipeline.handle(event, &mut outputs);
         }
-        outputs.iter().for_each(|output| self.teller.output(&output.output));
+        outputs.iter().for_each(|output| self.encoder.output(&output.output));
         if t < self.next_tell {
             return None;
         }
-        self.next_tell += self.teller.every();
+        self.next_tell += self.encoder.every();
         let mut frames = Vec::new();
-        self.teller.tell(t, &mut frames);
+        self.encoder.tell(t, &mut frames);
         let scenario = world.scenario();
         let origin_msl_m = scenario.origin.height_m - scenario.geoid_m;
         frames.iter().find_map(|frame| follow_target(frame, self.system_id, world.frame(), origin_msl_m))
@@ -188,7 +194,7 @@ impl ClosedLoop {
         if t < self.next_tell {
             return None;
         }
-        self.next_tell += self.teller.every();
+        self.next_tell += self.encoder.every();
         let velocity = |t: MonoTime| {
             let vehicle = world.vehicle(0, t);
             let (s, c) = vehicle.heading_rad.sin_cos();

@@ -113,7 +113,7 @@ impl FrameSocket {
 
 /// Renders and sends frames in its own thread: lines keep their timing however long a frame takes.
 #[derive(Debug)]
-pub struct Darkroom {
+pub struct FrameRenderer {
     exposed: SyncSender<FrameTruth>,
 }
 
@@ -121,7 +121,7 @@ pub struct Darkroom {
 /// late.
 const WAITING: usize = 2;
 
-impl Darkroom {
+impl FrameRenderer {
     /// Renders frames of a world for the client of a socket.
     pub fn open(
         world: Arc<World>,

@@ -9,7 +9,7 @@ use std::time::Duration;
 use nalgebra::Vector3;
 
 use super::autopilot::{SimulatedAutopilot, follow_target};
-use super::devices::{Darkroom, FrameSocket, PtyLine};
+use super::devices::{FrameRenderer, FrameSocket, PtyLine};
 use super::score::Score;
 use super::{Moment, closed_loop::LoopSettings};
 use crate::config::{AUTOPILOT, Config};
@@ -96,7 +96,7 @@ pub struct LiveFlight {
     compass: PtyLine,
     to_daemon: PtyLine,
     heard: MavlinkFrames,
-    camera: Darkroom,
+    camera: FrameRenderer,
     system_id: u8,
     moments: Vec<Moment>,
 }
@@ -133,7 +133,8 @@ impl LiveFlight {
         let socket = folder.at("camera.sock");
         let frames = FrameSocket::open(&socket, clock.less_monotonic()).map_err(io(&socket))?;
         let drawing = Arc::clone(&world);
-        let camera = Darkroom::open(drawing, frames, clock, settings.threads.max(1)).map_err(io(&socket))?;
+        let camera =
+            FrameRenderer::open(drawing, frames, clock, settings.threads.max(1)).map_err(io(&socket))?;
         Ok(Self {
             flight: ClosedFlight::new(Arc::clone(&world), settings.lateness, 0),
             autopilot: SimulatedAutopilot::new(settings.receiver_m),

@@ -34,7 +34,7 @@ use tracing_subscriber::{Registry, reload};
 
 use self::file::RotatingFile;
 use self::journal::Journal;
-use self::sink::{Format, JournalWriter, Sink, Way};
+use self::sink::{Destination, Format, JournalWriter, Sink};
 use self::span::KeepSpanFields;
 use self::throttle::Throttle;
 use super::events::{self, TARGET};
@@ -78,8 +78,11 @@ pub fn start(config: &LogConfig, clock: HostClock) -> (Log, LogEnd) {
         queues.push((format, queue));
         ends.push(end);
     }
-    let sink =
-        |(format, queue): &(Format, Queue)| Sink { format: *format, way: Way::Queue(queue.clone()), clock };
+    let sink = |(format, queue): &(Format, Queue)| Sink {
+        format: *format,
+        way: Destination::Queue(queue.clone()),
+        clock,
+    };
     let level = install(queues.iter().map(sink).collect(), config.level, Some(Throttle::new(clock)));
     let queues = queues.into_iter().map(|(_, queue)| queue).collect();
     let log = Log { level, reopen, queues, clock };
@@ -90,14 +93,14 @@ pub fn start(config: &LogConfig, clock: HostClock) -> (Log, LogEnd) {
 /// them.
 pub fn start_plain(clock: HostClock) -> LogEnd {
     let (queue, end) = queue("stderr", Stream::Error);
-    let sink = Sink { format: Format::Plain, way: Way::Queue(queue.clone()), clock };
+    let sink = Sink { format: Format::Plain, way: Destination::Queue(queue.clone()), clock };
     let level = install(vec![sink], LogLevel::Info, Some(Throttle::new(clock)));
     LogEnd { log: Log { level, reopen: Arc::default(), queues: vec![queue], clock }, _ends: vec![end] }
 }
 
 /// Starts the log of a command that prints lines while it runs and waits for its reader.
 pub fn start_direct(writer: impl Write + Send + 'static, clock: HostClock) {
-    let sink = Sink { format: Format::Text, way: Way::Direct(Mutex::new(Box::new(writer))), clock };
+    let sink = Sink { format: Format::Text, way: Destination::Direct(Mutex::new(Box::new(writer))), clock };
     install(vec![sink], LogLevel::Info, None);
 }
 
@@ -231,7 +234,7 @@ pub(super) mod tests {
     }
 
     fn sink(format: Format, text: &Text, clock: HostClock) -> Sink {
-        Sink { format, way: Way::Direct(Mutex::new(Box::new(text.clone()))), clock }
+        Sink { format, way: Destination::Direct(Mutex::new(Box::new(text.clone()))), clock }
     }
 
     /// The lines of logfmt that `emit` makes, without a throttle.

@@ -39,7 +39,7 @@ impl Format {
 }
 
 /// Where lines go.
-pub(super) enum Way {
+pub(super) enum Destination {
     /// A queue: nothing waits for it, and lines may be lost.
     Queue(Queue),
     /// A writer: the command waits for it, as for all that it prints.
@@ -49,7 +49,7 @@ pub(super) enum Way {
 /// The layer.
 pub(super) struct Sink {
     pub(super) format: Format,
-    pub(super) way: Way,
+    pub(super) way: Destination,
     pub(super) clock: HostClock,
 }
 
@@ -60,8 +60,8 @@ where
     fn on_event(&self, event: &Event<'_>, context: Context<'_, S>) {
         let line = self.format.render(&Line::of(event, &context, self.clock));
         match &self.way {
-            Way::Queue(queue) => queue.put(&line),
-            Way::Direct(writer) => {
+            Destination::Queue(queue) => queue.put(&line),
+            Destination::Direct(writer) => {
                 let mut writer = writer.lock().unwrap_or_else(PoisonError::into_inner);
                 // A line that cannot be printed is lost, as with everything that a command prints.
                 let _ = writer.write_all(&line);

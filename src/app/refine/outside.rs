@@ -4,9 +4,9 @@
 //! |---|---|---|
 //! | RTKLIB's `.pos` (`lat lon height`) | GPST or UTC as its header states, as dates or as week and seconds | `sdn sde
 //! sdu` |
-//! | GPX (`trkpt lat lon`, `ele`, `time`) | UTC | [`UNSAID_M`] |
+//! | GPX (`trkpt lat lon`, `ele`, `time`) | UTC | [`DEFAULT_SIGMA_M`] |
 //! | CSV with `time_ns` (host time) or `utc`, `lat_deg`, `lon_deg`, `height_m`; `sigma_m` or `sigma_n_m`, `sigma_e_m`,
-//! `sigma_d_m` | as named | as given, else [`UNSAID_M`] |
+//! `sigma_d_m` | as named | as given, else [`DEFAULT_SIGMA_M`] |
 
 use std::path::{Path, PathBuf};
 
@@ -17,7 +17,7 @@ use windhover_base::time::{MonoTime, Span};
 use windhover_refine::{OutsidePosition, Recording};
 
 /// Sigma north, east, down, where a track gives none, m.
-const UNSAID_M: [f64; 3] = [0.5, 0.5, 1.0];
+const DEFAULT_SIGMA_M: [f64; 3] = [0.5, 0.5, 1.0];
 /// GPS time minus UTC, leap seconds (since 2017).
 const GPS_LEAP_S: f64 = 18.0;
 /// UTC of the start of GPS weeks, s since 1970.
@@ -160,7 +160,7 @@ fn rtklib_row(fields: &[&str], is_gpst: bool) -> Result<Row, String> {
     let told = [figure(5), figure(6), figure(7)];
     let sigma_m = std::array::from_fn(|i| match &told[i] {
         Ok(sigma) if *sigma > 0.0 => *sigma,
-        _ => UNSAID_M[i],
+        _ => DEFAULT_SIGMA_M[i],
     });
     Ok(Row { t_ns: seconds - leap_ns, is_host: false, at, sigma_m })
 }
@@ -185,7 +185,7 @@ fn gpx(text: &str) -> Parsed {
             let time = element("time").and_then(parse_time).ok_or("a point without a time")?;
             let height_m = text::number(element("ele").ok_or("a point without ele")?)?;
             let at = Geodetic { lat_deg: attribute("lat")?, lon_deg: attribute("lon")?, height_m };
-            Ok(Row { t_ns: time.ns(), is_host: false, at, sigma_m: UNSAID_M })
+            Ok(Row { t_ns: time.ns(), is_host: false, at, sigma_m: DEFAULT_SIGMA_M })
         };
         rows.push(row().map_err(|reason| (line, reason))?);
     }
@@ -223,7 +223,7 @@ fn csv(text: &str) -> Parsed {
                 (None, None) => return Err("it has no time".to_owned()),
             };
             let at = Geodetic { lat_deg: number(lat)?, lon_deg: number(lon)?, height_m: number(height)? };
-            let mut sigma_m = UNSAID_M;
+            let mut sigma_m = DEFAULT_SIGMA_M;
             for (sigma, c) in sigma_m.iter_mut().zip(sigmas) {
                 if let Some(c) = c {
                     *sigma = number(c)
@@ -252,7 +252,7 @@ mod tests {
         let rows = rtklib(text).expect("well formed");
         assert_eq!(rows[0].t_ns, UTC_NS);
         assert_eq!((rows[0].at.lat_deg, rows[0].sigma_m), (30.069_604_785, [0.01, 0.02, 0.03]));
-        assert_eq!((rows[1].t_ns, rows[1].sigma_m), (UTC_NS, UNSAID_M));
+        assert_eq!((rows[1].t_ns, rows[1].sigma_m), (UTC_NS, DEFAULT_SIGMA_M));
         let utc = "%  UTC  latitude(deg)\n2026/11/18 15:04:05.200 30 -85 26 1 12 0.1 0.1 0.1\n";
         assert_eq!(rtklib(utc).expect("well formed")[0].t_ns, UTC_NS);
         assert_eq!(rtklib("%  GPST  x-ecef(m)\n").expect_err("not a place").0, 1);

@@ -96,7 +96,7 @@ fn summary(done: &RefinedFlight, end: MonoTime) -> wh::Refined {
             .map(|constant| {
                 let words = constant_words(constant.kind, targets);
                 let [value, sigma, expected, expected_sigma] = in_unit(constant, &words);
-                let (name, unit, told) = (words.name, words.unit.into(), constant.is_told());
+                let (name, unit, told) = (words.name, words.unit.into(), constant.is_determined());
                 wh::RefinedConstant { name, unit, value, sigma, expected, expected_sigma, told }
             })
             .collect(),

@@ -100,14 +100,14 @@ impl MeasuredLog {
     /// Converts them to frames of an autopilot that started with the first measurement.
     pub(super) fn into_packets(mut self, format: &str) -> ImportedLog {
         self.measured.sort_by_key(|(t, _)| *t);
-        let mut teller = Teller::default();
+        let mut builder = FrameBuilder::default();
         let mut packets = Vec::with_capacity(self.measured.len() + 16);
         let mut counts = [0; 3];
         let began = self.measured.first().map_or(MonoTime::default(), |(t, _)| *t);
         let mut beat = began;
         for (t, what) in self.measured {
             if t >= beat {
-                packets.push((t, teller.beat(t, t - began, self.is_utc)));
+                packets.push((t, builder.beat(t, t - began, self.is_utc)));
                 beat = t + Span::from_ns(NS_PER_S);
             }
             counts[match what {
@@ -115,7 +115,7 @@ impl MeasuredLog {
                 Measured::Attitude(_) => 1,
                 Measured::Inertial(..) => 2,
             }] += 1;
-            packets.push((t, teller.frame(&message(&what, t - began))));
+            packets.push((t, builder.frame(&message(&what, t - began))));
         }
         let used: Vec<&str> = self.used.iter().map(String::as_str).collect();
         let made_of = format!("{format}: {}", used.join(", "));
@@ -125,11 +125,11 @@ impl MeasuredLog {
 
 /// Makes numbered frames.
 #[derive(Default)]
-struct Teller {
+struct FrameBuilder {
     sequence: u8,
 }
 
-impl Teller {
+impl FrameBuilder {
     fn frame(&mut self, message: &MavMessage) -> Vec<u8> {
         const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
         self.sequence = self.sequence.wrapping_add(1);

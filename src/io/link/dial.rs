@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-use super::door::{CALL, Door};
+use super::endpoint::{CALL, LinkEndpoint};
 use super::link_events::LinkEvent;
 use super::peer::Peer;
 use super::quic::transport;
@@ -21,7 +21,7 @@ const PAUSE: Duration = Duration::from_millis(300);
 /// A connection that ends within this time ended early.
 const YOUNG: Duration = Duration::from_secs(10);
 
-impl Door {
+impl LinkEndpoint {
     /// Connects to a peer, and again whenever the connection is lost or silent, until the port is closed.
     pub(super) async fn dial(self, address: String) {
         let mut current: Option<Peer> = None;

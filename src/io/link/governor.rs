@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-use super::pace::{Bucket, Way};
+use super::pace::{Bucket, Priority};
 use super::sense::{CLASSES, Noted};
 
 /// Standing delay in the path above which the rate is reduced. Well below the 150 ms that live data may be late; above
@@ -151,10 +151,10 @@ impl Governor {
     }
 
     /// Time until sending is allowed.
-    pub fn delay(&mut self, way: Way, now: Instant) -> Duration {
+    pub fn delay(&mut self, way: Priority, now: Instant) -> Duration {
         let delay = self.bucket.delay(way, now);
         // Half of the debt is an early sign: the first record that waits for the rate would be late.
-        self.limited |= !delay.is_zero() || (way == Way::Live && self.bucket.debt_used(now) > 0.5);
+        self.limited |= !delay.is_zero() || (way == Priority::Live && self.bucket.debt_used(now) > 0.5);
         delay
     }
 

@@ -24,7 +24,7 @@ fn run(capacity: f64, rtt_ms: f64, seconds: u64, start: Instant) -> (f64, f64) {
         let now = at(start, tick * 100);
         // Everything that the bucket allows is sent, in messages of 240 bytes.
         let mut offered = 0.0_f64;
-        while governor.delay(Way::Low, now).is_zero() && offered < 1e6 {
+        while governor.delay(Priority::Low, now).is_zero() && offered < 1e6 {
             governor.charge(240.0);
             offered += 240.0;
         }
@@ -69,7 +69,7 @@ fn a_third_of_the_packets_lost_does_not_throttle_a_path() {
             let fate = if random.random_bool(0.3) { &mut lost } else { &mut acked };
             *fate += 240;
         }
-        assert!(!governor.delay(Way::Low, now).is_zero(), "the rate is the limit");
+        assert!(!governor.delay(Priority::Low, now).is_zero(), "the rate is the limit");
         governor.update(noted(acked, lost, rtt), now);
         early = if tick == 50 { governor.rate() } else { early };
     }
@@ -93,7 +93,7 @@ fn what_a_cut_lost_does_not_slow_the_path_down_after_it() {
     // When: the first acknowledgement declares everything sent meanwhile lost, the next some more.
     for (tick, lost) in [(71, 45_000), (72, 2_000), (73, 0), (74, 0)] {
         governor.charge(10.0 * before);
-        assert!(!governor.delay(Way::Low, at(start, tick * 100)).is_zero(), "the rate is the limit");
+        assert!(!governor.delay(Priority::Low, at(start, tick * 100)).is_zero(), "the rate is the limit");
         governor.update(Noted { lost, ..up }, at(start, tick * 100));
     }
     // Then: the rate grows at once.
@@ -141,7 +141,7 @@ fn line(capacity: f64, seconds: u64, start: Instant) -> (Vec<u64>, Vec<f64>) {
         if ms % 1_000 * 30 % 1_000 < 30 {
             waits = Some(ms);
         }
-        let live = waits.filter(|_| governor.delay(Way::Live, now).is_zero());
+        let live = waits.filter(|_| governor.delay(Priority::Live, now).is_zero());
         for (born, bytes) in
             [live.map(|born| (born, 241)), (ms % 150 == 20).then_some((ms, 90))].into_iter().flatten()
         {

@@ -4,7 +4,7 @@
 
 mod backlog;
 mod dial;
-mod door;
+mod endpoint;
 mod link_events;
 mod governor;
 pub mod keys;

@@ -18,7 +18,7 @@ const SAVED_S: f64 = 0.004;
 
 /// The priority class of data.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Way {
+pub enum Priority {
     /// Live data.
     Live,
     /// Back-fill, and pictures.
@@ -53,11 +53,11 @@ impl Bucket {
     }
 
     /// Time until sending is allowed; zero when it is.
-    pub fn delay(&mut self, way: Way, now: Instant) -> Duration {
+    pub fn delay(&mut self, way: Priority, now: Instant) -> Duration {
         self.fill(now);
         let debt = match way {
-            Way::Live => self.live_debt(),
-            Way::Low => 0.0,
+            Priority::Live => self.live_debt(),
+            Priority::Low => 0.0,
         };
         Duration::from_secs_f64(((-debt - self.balance) / self.rate).max(0.0))
     }
@@ -105,7 +105,7 @@ mod tests {
         let mut bucket = Bucket::new(6_000.0, start);
         let mut sent = 0.0;
         for ms in 0..10_000 {
-            if bucket.delay(Way::Low, at(start, ms)).is_zero() {
+            if bucket.delay(Priority::Low, at(start, ms)).is_zero() {
                 bucket.charge(240.0);
                 sent += 240.0;
             }
@@ -121,12 +121,12 @@ mod tests {
         let (mut live, mut low) = (0.0, 0.0);
         for ms in 0..10_000 {
             let now = at(start, ms);
-            if bucket.delay(Way::Low, now).is_zero() {
+            if bucket.delay(Priority::Low, now).is_zero() {
                 bucket.charge(300.0);
                 low += 300.0;
             }
             if ms % 10 == 0 {
-                assert!(bucket.delay(Way::Live, now).is_zero(), "it waits after {ms} ms");
+                assert!(bucket.delay(Priority::Live, now).is_zero(), "it waits after {ms} ms");
                 bucket.charge(80.0);
                 live += 80.0;
             }
@@ -136,11 +136,11 @@ mod tests {
         let (mut live, mut low) = (0.0, 0.0);
         for ms in 10_000..20_000 {
             let now = at(start, ms);
-            while bucket.delay(Way::Live, now).is_zero() {
+            while bucket.delay(Priority::Live, now).is_zero() {
                 bucket.charge(80.0);
                 live += 80.0;
             }
-            if bucket.delay(Way::Low, now).is_zero() {
+            if bucket.delay(Priority::Low, now).is_zero() {
                 low += 300.0;
             }
         }

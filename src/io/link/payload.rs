@@ -9,7 +9,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 
 use super::backlog::{Backlog, MemoryBacklog};
-use super::door::Door;
+use super::endpoint::LinkEndpoint;
 use super::keys::Role;
 use super::link_events::{Events, LinkError, LinkEvent};
 use super::live::downlink_class;
@@ -131,7 +131,7 @@ impl LinkHandle {
 
 /// The payload's side of the link, opened.
 pub struct PayloadLink {
-    door: Door,
+    link_endpoint: LinkEndpoint,
     dial: Vec<String>,
     shared: Arc<PayloadShared>,
     arrivals: mpsc::Receiver<Peer>,
@@ -148,7 +148,8 @@ impl PayloadLink {
     ) -> Result<(Self, LinkHandle, mpsc::Receiver<LinkEvent>), LinkError> {
         let (event_sender, event_receiver) = mpsc::channel(256);
         let events = Events::new(event_sender);
-        let (door, arrivals) = Door::open(Role::Payload, &settings.files, settings.listen, events.clone())?;
+        let (link_endpoint, arrivals) =
+            LinkEndpoint::open(Role::Payload, &settings.files, settings.listen, events.clone())?;
         let shared = Arc::new(PayloadShared {
             recent: MemoryBacklog::new(run, flight, settings.backlog_bytes),
             deep,
@@ -161,19 +162,19 @@ impl PayloadLink {
             events,
         });
         let handle = LinkHandle { shared: Arc::clone(&shared) };
-        let link = Self { door, dial: settings.dial.clone(), shared, arrivals };
+        let link = Self { link_endpoint, dial: settings.dial.clone(), shared, arrivals };
         Ok((link, handle, event_receiver))
     }
 
     /// The local UDP address.
     pub fn local_addr(&self) -> std::io::Result<SocketAddr> {
-        self.door.local_addr()
+        self.link_endpoint.local_addr()
     }
 
     /// Serves stations until `stop` is set (or its sender is gone).
     pub async fn run(self, stop: watch::Receiver<bool>) {
         let shared = self.shared;
-        self.door.run(self.dial, self.arrivals, stop, |peer| welcome(&shared, peer)).await;
+        self.link_endpoint.run(self.dial, self.arrivals, stop, |peer| welcome(&shared, peer)).await;
     }
 }
 

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 use quinn::VarInt;
 use tokio::sync::{mpsc, watch};
 
-use super::door::Door;
+use super::endpoint::LinkEndpoint;
 use super::keys::Role;
 use super::link_events::{Events, LinkError, LinkEvent};
 use super::peer::{Peer, close};
@@ -93,7 +93,7 @@ impl StationHandle {
 
 /// The station's side of the link, opened.
 pub struct StationLink {
-    door: Door,
+    link_endpoint: LinkEndpoint,
     dial: Vec<String>,
     shared: Arc<StationShared>,
     arrivals: mpsc::Receiver<Peer>,
@@ -107,7 +107,8 @@ impl StationLink {
     pub fn open(settings: &StationSettings, recall: Recall) -> Result<OpenStation, LinkError> {
         let (event_sender, event_receiver) = mpsc::channel(256);
         let events = Events::new(event_sender);
-        let (door, arrivals) = Door::open(Role::Station, &settings.files, settings.listen, events.clone())?;
+        let (link_endpoint, arrivals) =
+            LinkEndpoint::open(Role::Station, &settings.files, settings.listen, events.clone())?;
         let (records, record_receiver) = mpsc::channel(1_024);
         let shared = Arc::new(StationShared {
             payloads: Mutex::default(),
@@ -118,19 +119,19 @@ impl StationLink {
             events,
         });
         let handle = StationHandle { shared: Arc::clone(&shared) };
-        let link = Self { door, dial: settings.dial.clone(), shared, arrivals };
+        let link = Self { link_endpoint, dial: settings.dial.clone(), shared, arrivals };
         Ok((link, handle, record_receiver, event_receiver))
     }
 
     /// The local UDP address.
     pub fn local_addr(&self) -> std::io::Result<SocketAddr> {
-        self.door.local_addr()
+        self.link_endpoint.local_addr()
     }
 
     /// Receives until `stop` is set (or its sender is gone).
     pub async fn run(self, stop: watch::Receiver<bool>) {
         let shared = self.shared;
-        self.door.run(self.dial, self.arrivals, stop, |peer| welcome(&shared, peer)).await;
+        self.link_endpoint.run(self.dial, self.arrivals, stop, |peer| welcome(&shared, peer)).await;
     }
 }
 

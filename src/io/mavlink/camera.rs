@@ -7,8 +7,8 @@ use windhover_base::msg::MarkerDetection;
 use windhover_base::settings::CameraConfig;
 use windhover_base::time::Span;
 
+use super::encoder::CAMERA;
 use super::packet::Sender;
-use super::teller::CAMERA;
 
 /// The content of the camera's messages.
 #[derive(Clone, Debug)]

@@ -1,6 +1,6 @@
 //! MAVLink 2 over UDP: the vehicles for ground stations, and for autopilots that follow or land.
 //!
-//! [`Teller`] makes the frames from the pipeline's outputs, [`MavlinkSender`] sends them. Received frames are checked
+//! [`MavlinkEncoder`] makes the frames from the pipeline's outputs, [`MavlinkSender`] sends them. Received frames are checked
 //! for three things: commands to the camera, other systems with our ids, and signatures where a key is set.
 
 mod camera;
@@ -10,12 +10,12 @@ pub mod messages;
 mod motion;
 pub mod packet;
 mod stations;
-mod teller;
-mod told;
+mod encoder;
+mod report;
 mod vehicle;
 
-pub use stations::{Found, Station, StationNews, look_up};
-pub use teller::Teller;
+pub use encoder::MavlinkEncoder;
+pub use stations::{Found, Station, StationChange, look_up};
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
@@ -73,7 +73,7 @@ impl MavlinkCounts {
 
 /// Sends the vehicles. No call blocks.
 pub struct MavlinkSender {
-    teller: Teller,
+    encoder: MavlinkEncoder,
     stations: Stations,
     targets: usize,
     key: Option<SigningKey>,
@@ -82,7 +82,7 @@ pub struct MavlinkSender {
     sent: VecDeque<u32>,
     frames: Vec<Vec<u8>>,
     counts: MavlinkCounts,
-    news: Vec<StationNews>,
+    news: Vec<StationChange>,
 }
 
 /// The configured signing key, if any. Reads a file.
@@ -99,7 +99,13 @@ impl MavlinkSender {
         let key = signing_key(mavlink.signing_key.as_deref())?;
         Ok(Self {
             stations: Stations::open(&mavlink.send_to, to_autopilot).map_err(MavlinkError::Socket)?,
-            teller: Teller::new(mavlink, &config.target, &config.ground, &config.camera, key.clone()),
+            encoder: MavlinkEncoder::new(
+                mavlink,
+                &config.target,
+                &config.ground,
+                &config.camera,
+                key.clone(),
+            ),
             targets: config.target.len(),
             key,
             heard_stamp: 0,
@@ -112,7 +118,7 @@ impl MavlinkSender {
 
     /// Takes the outputs that it needs.
     pub fn output(&mut self, output: &Output) {
-        self.teller.output(output);
+        self.encoder.output(output);
     }
 
     /// Counts of received frames so far.
@@ -126,7 +132,7 @@ impl MavlinkSender {
     }
 
     /// Changes of stations since the last call.
-    pub fn news(&mut self) -> Vec<StationNews> {
+    pub fn news(&mut self) -> Vec<StationChange> {
         let mut news = std::mem::take(&mut self.news);
         news.extend(self.stations.news());
         news
@@ -144,14 +150,14 @@ impl MavlinkSender {
 
     /// Period for calls of [`Self::send`].
     pub fn every(&self) -> Span {
-        self.teller.every()
+        self.encoder.every()
     }
 
     /// Handles received frames and sends what is due.
     pub fn send(&mut self, now: MonoTime) {
         let mut frames = std::mem::take(&mut self.frames);
         self.listen(now, &mut frames);
-        self.teller.tell(now, &mut frames);
+        self.encoder.tell(now, &mut frames);
         for frame in frames.drain(..) {
             if self.sent.len() == OWN_FRAMES {
                 self.sent.pop_front();
@@ -164,7 +170,7 @@ impl MavlinkSender {
 
     /// Reads the sockets until they are empty.
     fn listen(&mut self, now: MonoTime, answers: &mut Vec<Vec<u8>>) {
-        let utc = self.teller.utc(now);
+        let utc = self.encoder.utc(now);
         let mut buffer = [0; 2048];
         for _ in 0..64 {
             let Some(length) = self.stations.receive(&mut buffer) else { return };
@@ -199,19 +205,19 @@ impl MavlinkSender {
     }
 
     fn frame(&mut self, frame: &MavlinkFrame, now: MonoTime, answers: &mut Vec<Vec<u8>>) {
-        if let Some(index) = (0..self.targets).find(|&k| self.teller.system_id(k) == frame.system) {
+        if let Some(index) = (0..self.targets).find(|&k| self.encoder.system_id(k) == frame.system) {
             self.counts.foreign += 1;
-            self.teller.stand_back(index, now + STANDS_BACK);
+            self.encoder.stand_back(index, now + STANDS_BACK);
             let fault = format!(
                 "another system uses id {}: its target is not sent for {:.0} s; set mavlink.system_id",
                 frame.system,
                 STANDS_BACK.s()
             );
             let name = format!("system {}", frame.system);
-            self.news.push(StationNews { name, fault: Some(fault) });
+            self.news.push(StationChange { name, fault: Some(fault) });
         }
         let from = Sender { system: frame.system, component: frame.component };
-        self.teller.asked(from, &frame.message, now, answers);
+        self.encoder.asked(from, &frame.message, now, answers);
     }
 }
 

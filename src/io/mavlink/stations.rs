@@ -43,7 +43,7 @@ impl Station {
 
 /// A change of a station, for the operator.
 #[derive(Clone, PartialEq, Eq, Debug)]
-pub struct StationNews {
+pub struct StationChange {
     /// Which station.
     pub name: String,
     /// The fault; `None` where it is over.
@@ -83,7 +83,7 @@ pub struct Stations {
     to_autopilot: ToAutopilot,
     all: Vec<Station>,
     asked: Option<MonoTime>,
-    news: Vec<StationNews>,
+    news: Vec<StationChange>,
 }
 
 impl Stations {
@@ -102,7 +102,7 @@ impl Stations {
     }
 
     /// Changes since the last call.
-    pub fn news(&mut self) -> Vec<StationNews> {
+    pub fn news(&mut self) -> Vec<StationChange> {
         std::mem::take(&mut self.news)
     }
 
@@ -163,11 +163,11 @@ impl Stations {
     }
 }
 
-fn report(station: &mut Station, fault: Option<String>, news: &mut Vec<StationNews>) {
+fn report(station: &mut Station, fault: Option<String>, news: &mut Vec<StationChange>) {
     // A repeated fault of the same kind is no change, and neither is success from the first datagram on.
     if station.fault != fault {
         station.fault.clone_from(&fault);
-        news.push(StationNews { name: station.name.clone(), fault });
+        news.push(StationChange { name: station.name.clone(), fault });
     }
 }
 

@@ -17,7 +17,7 @@ pub struct Limits {
 
 /// The state of a vehicle for its messages.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub enum Said {
+pub enum Reportable {
     /// It is seen, in this state.
     Seen(MonoTime, TargetState),
     /// It was seen a moment ago; this state is predicted.
@@ -57,19 +57,19 @@ impl Vehicle {
     }
 
     /// Its state for messages at `now`.
-    pub fn said(&self, now: MonoTime, limits: &Limits) -> Said {
+    pub fn reportable(&self, now: MonoTime, limits: &Limits) -> Reportable {
         let Some(TargetEstimate { t_valid, status, state: Some(state), .. }) = self.latest else {
-            return Said::Nothing;
+            return Reportable::Nothing;
         };
         let fresh = (now - t_valid).abs() <= limits.max_age;
         // A sigma that cannot be compared does not pass.
         let sure = state.relative_sigma_m.is_some_and(|sigma_m| sigma_m <= limits.max_sigma_m);
         let lately = self.seen.is_some_and(|seen| now.max(t_valid) - seen <= limits.coast);
         match status {
-            _ if !(fresh && sure) => Said::Nothing,
-            TrackStatus::Tracking => Said::Seen(t_valid, state),
-            TrackStatus::Coasting if lately => Said::Predicted(t_valid, state),
-            TrackStatus::Coasting | TrackStatus::Acquiring | TrackStatus::Lost => Said::Nothing,
+            _ if !(fresh && sure) => Reportable::Nothing,
+            TrackStatus::Tracking => Reportable::Seen(t_valid, state),
+            TrackStatus::Coasting if lately => Reportable::Predicted(t_valid, state),
+            TrackStatus::Coasting | TrackStatus::Acquiring | TrackStatus::Lost => Reportable::Nothing,
         }
     }
 }
@@ -109,10 +109,10 @@ pub(super) mod tests {
     fn after(estimates: &[TargetEstimate], s: f64) -> &'static str {
         let mut vehicle = Vehicle::default();
         estimates.iter().for_each(|estimate| vehicle.take(estimate));
-        match vehicle.said(at(s), &LIMITS) {
-            Said::Seen(..) => "seen",
-            Said::Predicted(..) => "predicted",
-            Said::Nothing => "nothing",
+        match vehicle.reportable(at(s), &LIMITS) {
+            Reportable::Seen(..) => "seen",
+            Reportable::Predicted(..) => "predicted",
+            Reportable::Nothing => "nothing",
         }
     }
 

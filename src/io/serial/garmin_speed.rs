@@ -6,8 +6,8 @@
 
 use std::borrow::Cow;
 
+use super::dialogue::Dialogue;
 use super::garmin::{bodies, sentence};
-use super::talk::Talk;
 use crate::io::device::Fault;
 
 /// Speeds that a receiver may have and their codes in PGRMC, factory settings first.
@@ -23,7 +23,7 @@ const SPEAK_NMEA: [u8; 8] = [0x10, 0x0A, 0x02, 0x26, 0x00, 0xCE, 0x10, 0x03];
 const RESET: &str = "PGRMI,,,,,,,R";
 
 /// Sets the line, and where possible the receiver, to the configured speed.
-pub(super) async fn settle(mut talk: Talk<'_>) -> Result<(), Fault> {
+pub(super) async fn settle(mut talk: Dialogue<'_>) -> Result<(), Fault> {
     let wanted = talk.settings.baud;
     if speaks(&mut talk).await? {
         return Ok(());
@@ -48,7 +48,7 @@ pub(super) async fn settle(mut talk: Talk<'_>) -> Result<(), Fault> {
 }
 
 /// Whether sentences arrive at the line's present speed, also after leaving binary mode.
-async fn speaks(talk: &mut Talk<'_>) -> Result<bool, Fault> {
+async fn speaks(talk: &mut Dialogue<'_>) -> Result<bool, Fault> {
     send(talk, QUERY).await?;
     if talk.listen(|bytes| holds_a_sentence(&text(bytes))).await? {
         return Ok(true);
@@ -62,7 +62,7 @@ async fn speaks(talk: &mut Talk<'_>) -> Result<bool, Fault> {
     Ok(speaks)
 }
 
-async fn send(talk: &mut Talk<'_>, body: &str) -> Result<(), Fault> {
+async fn send(talk: &mut Dialogue<'_>, body: &str) -> Result<(), Fault> {
     talk.send(sentence(body).as_bytes()).await
 }
 

@@ -6,7 +6,7 @@ mod garmin;
 mod garmin_speed;
 mod line;
 mod network;
-mod talk;
+mod dialogue;
 mod ublox;
 mod ublox_speed;
 
@@ -15,10 +15,10 @@ use std::time::Duration;
 
 use super::clock::HostClock;
 use super::device::{Backoff, Fault, FaultKind, NoteKind, Report, Reports, wait_for};
+use dialogue::Dialogue;
 use garbled::TextShare;
 use garmin::GarminSetup;
 pub(super) use line::Line;
-use talk::Talk;
 use ublox::UbloxSetup;
 use windhover_base::settings::Framing;
 use windhover_base::time::{MonoTime, Span};
@@ -98,7 +98,7 @@ impl Reader<'_> {
         let mut setup = None;
         if let Some(kind) = self.settings.setup {
             let (settings, clock, reports) = (self.settings, self.clock, self.reports);
-            let talk = Talk { line: &mut self.line, settings, clock, reports };
+            let talk = Dialogue { line: &mut self.line, settings, clock, reports };
             setup = Some(match kind {
                 Setup::Garmin => {
                     garmin_speed::settle(talk).await?;

@@ -4,8 +4,8 @@
 //! Over USB any speed is the right one. Source: u-blox's interface descriptions (UBX-CFG-VALSET from the ninth
 //! generation on, UBX-CFG-PRT for older ones).
 
+use super::dialogue::Dialogue;
 use super::garmin::bodies;
-use super::talk::Talk;
 use crate::io::device::Fault;
 use windhover_decode::{ubx_framed, ubx_packets};
 
@@ -19,7 +19,7 @@ const MON_VER: (u8, u8) = (0x0A, 0x04);
 const KEY_UART1_BAUDRATE: u32 = 0x4052_0001;
 
 /// Sets the line, and where possible the receiver, to the configured speed.
-pub(super) async fn settle(mut talk: Talk<'_>) -> Result<(), Fault> {
+pub(super) async fn settle(mut talk: Dialogue<'_>) -> Result<(), Fault> {
     let wanted = talk.settings.baud;
     if speaks(&mut talk).await? {
         return Ok(());
@@ -48,7 +48,7 @@ pub(super) async fn settle(mut talk: Talk<'_>) -> Result<(), Fault> {
 }
 
 /// Whether a valid packet or sentence arrives at the line's present speed.
-async fn speaks(talk: &mut Talk<'_>) -> Result<bool, Fault> {
+async fn speaks(talk: &mut Dialogue<'_>) -> Result<bool, Fault> {
     talk.send(&ubx_framed(MON_VER.0, MON_VER.1, &[])).await?;
     talk.listen(|bytes| {
         ubx_packets(bytes).next().is_some() || bodies(&String::from_utf8_lossy(bytes)).next().is_some()

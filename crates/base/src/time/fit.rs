@@ -77,7 +77,7 @@ struct Last {
 }
 
 /// The interpretation of an arrival off the line.
-enum Astray {
+enum OffLine {
     /// UTC was corrected by whole seconds: this many nanoseconds of host time later.
     Seconds(i64),
     /// The receiver's time was corrected by some other amount.
@@ -131,14 +131,14 @@ impl GnssClock {
             self.restart(&[(arrival, offset_ns)]);
             return;
         };
-        if self.is_astray(t, x) {
-            match self.told_by(t, x, offset_ns, before) {
-                Astray::Seconds(ns) => {
+        if self.is_off_line(t, x) {
+            match self.interpret(t, x, offset_ns, before) {
+                OffLine::Seconds(ns) => {
                     self.step(ns);
                     x -= Span::from_ns(ns).ms();
                 }
-                Astray::Anew => return self.restart(&[(arrival, offset_ns)]),
-                Astray::Unknown => return self.stray(arrival, offset_ns),
+                OffLine::Anew => return self.restart(&[(arrival, offset_ns)]),
+                OffLine::Unknown => return self.stray(arrival, offset_ns),
             }
         }
         self.astray.clear();
@@ -183,7 +183,7 @@ impl GnssClock {
     /// The interpretation of an arrival off the line. Arrivals are never early, and a time of day never goes back:
     /// where they seem to, the receiver has corrected its time (it learns leap seconds some minutes after its start). A
     /// late arrival is just late, unless the next is equally late.
-    fn told_by(&self, t: f64, x: f64, offset_ns: i64, before: Option<Last>) -> Astray {
+    fn interpret(&self, t: f64, x: f64, offset_ns: i64, before: Option<Last>) -> OffLine {
         let (late_ms, gate_ms) = (x - self.fit.at(t).0, self.gate_ms(t));
         let seconds = (late_ms / 1e3).round();
         let is_whole = seconds != 0.0 && (late_ms - seconds * 1e3).abs() <= gate_ms;
@@ -198,9 +198,9 @@ impl GnssClock {
                 apart.ns() <= (last.arrival - b.arrival).ns() / 4
             });
         if is_whole && (late_ms < 0.0 || went_back || as_late_before) {
-            return Astray::Seconds(seconds as i64 * NS_PER_S);
+            return OffLine::Seconds(seconds as i64 * NS_PER_S);
         }
-        if went_back { Astray::Anew } else { Astray::Unknown }
+        if went_back { OffLine::Anew } else { OffLine::Unknown }
     }
 
     /// Host time at which an epoch of this time of day, received at `heard`, was valid, with one-sigma. `None` before
@@ -257,7 +257,7 @@ impl GnssClock {
     }
 
     /// Whether the jitter so far does not explain this point.
-    fn is_astray(&self, t: f64, x: f64) -> bool {
+    fn is_off_line(&self, t: f64, x: f64) -> bool {
         let late = x - self.fit.at(t).0;
         late > self.gate_ms(t) || -late > self.gate_early_ms(t)
     }

@@ -97,7 +97,7 @@ fn nmea_headings_and_transducers() {
     assert_eq!(said(CompassFormat::Nmea, "GPRMC,1,2"), Ok(None));
 }
 
-fn readings(format: CompassFormat, bytes: &[u8]) -> (Vec<HeardAttitude>, DecodeCounts) {
+fn readings(format: CompassFormat, bytes: &[u8]) -> (Vec<ReceivedAttitude>, DecodeCounts) {
     let (mut decoder, mut out) = (CompassDecoder::new(format), Vec::new());
     decoder.push(bytes, MonoTime::from_ns(5), &mut out);
     decoder.flush(&mut out);

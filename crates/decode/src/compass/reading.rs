@@ -45,7 +45,7 @@ impl CompassReading {
 
 /// A reading and its time of arrival.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub struct HeardAttitude {
+pub struct ReceivedAttitude {
     /// The reading for the estimator.
     pub sample: AttitudeSample,
     /// The reading as the device reported it.
@@ -66,9 +66,9 @@ pub(super) fn heard(
     first: LineSpan,
     last: LineSpan,
     counts: &mut DecodeCounts,
-) -> HeardAttitude {
+) -> ReceivedAttitude {
     counts.flagged += u64::from(reading.flagged);
-    HeardAttitude {
+    ReceivedAttitude {
         sample: reading.sample(),
         reading,
         t_recv: last.t_last,

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use super::reading::{CompassReading, HeardAttitude, heard};
+use super::reading::{CompassReading, ReceivedAttitude, heard};
 use crate::counts::{DecodeCounts, Refusal};
 use crate::lines::LineSpan;
 use windhover_base::time::MonoTime;
@@ -48,7 +48,7 @@ impl RecordFramer {
         bytes: &[u8],
         t_recv: MonoTime,
         counts: &mut DecodeCounts,
-        out: &mut Vec<HeardAttitude>,
+        out: &mut Vec<ReceivedAttitude>,
     ) {
         for (index, &byte) in bytes.iter().enumerate() {
             self.buffer.push_back(byte);

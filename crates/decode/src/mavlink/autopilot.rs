@@ -28,17 +28,17 @@ const EARLIEST_UNIX_USEC: u64 = 1_577_836_800_000_000;
 
 /// A decoded message, and its time of validity.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub struct HeardAutopilot {
+pub struct ReceivedAutopilot {
     /// Time of validity, host time; fixes were valid their receiver's latency earlier.
     pub t: MonoTime,
     /// The content.
-    pub said: AutopilotSaid,
+    pub measurement: AutopilotMeasurement,
 }
 
 /// The content of an autopilot's message.
 #[derive(Clone, Copy, PartialEq, Debug)]
 #[expect(clippy::large_enum_variant, reason = "a value at a time, passed on")]
-pub enum AutopilotSaid {
+pub enum AutopilotMeasurement {
     /// Attitude, its heading true.
     Attitude(AttitudeSample),
     /// Rates and forces in the body's axes.
@@ -88,7 +88,7 @@ impl AutopilotDecoder {
     }
 
     /// Takes bytes that were received at `t`.
-    pub fn push(&mut self, bytes: &[u8], t: MonoTime, out: &mut Vec<HeardAutopilot>) {
+    pub fn push(&mut self, bytes: &[u8], t: MonoTime, out: &mut Vec<ReceivedAutopilot>) {
         let mut heard = std::mem::take(&mut self.heard);
         self.frames.push(bytes, &mut heard);
         for frame in heard.drain(..) {
@@ -123,7 +123,7 @@ impl AutopilotDecoder {
         &mut self,
         frame: &MavlinkFrame,
         t: MonoTime,
-        out: &mut Vec<HeardAutopilot>,
+        out: &mut Vec<ReceivedAutopilot>,
     ) -> Result<bool, Refusal> {
         if self.follows.is_none() && is_autopilot(frame) {
             self.follows = Some(frame.system);
@@ -212,13 +212,13 @@ impl AutopilotDecoder {
         heading: f64,
         tilt: Tilt,
         rates: [f32; 3],
-        out: &mut Vec<HeardAutopilot>,
+        out: &mut Vec<ReceivedAutopilot>,
     ) -> Result<bool, Refusal> {
         if ![heading, tilt.pitch, tilt.roll].iter().all(|angle| angle.is_finite() && angle.abs() < 7.0) {
             return Err(Refusal::OutOfRange);
         }
         let sample = AttitudeSample { heading: Some(heading), heading_is_true: true, tilt: Some(tilt) };
-        out.push(HeardAutopilot { t, said: AutopilotSaid::Attitude(sample) });
+        out.push(ReceivedAutopilot { t, measurement: AutopilotMeasurement::Attitude(sample) });
         if self.forces.is_none_or(|last| t - last >= LATELY) {
             self.inertial(t, Vector3::from(rates).map(f64::from), None, out);
         }
@@ -230,13 +230,13 @@ impl AutopilotDecoder {
         t: MonoTime,
         rate: Vector3<f64>,
         force: Option<Vector3<f64>>,
-        out: &mut Vec<HeardAutopilot>,
+        out: &mut Vec<ReceivedAutopilot>,
     ) -> bool {
         if force.is_some() {
             self.forces = Some(t);
         }
         let sample = InertialSample { rate_rps: Some(rate), force_mps2: force };
-        out.push(HeardAutopilot { t, said: AutopilotSaid::Inertial(sample) });
+        out.push(ReceivedAutopilot { t, measurement: AutopilotMeasurement::Inertial(sample) });
         true
     }
 
@@ -244,7 +244,7 @@ impl AutopilotDecoder {
         &mut self,
         fix: &GPS_RAW_INT_DATA,
         t: MonoTime,
-        out: &mut Vec<HeardAutopilot>,
+        out: &mut Vec<ReceivedAutopilot>,
     ) -> Result<bool, Refusal> {
         // The same fix again: the message has its own rate.
         if fix.time_usec == self.fix_usec {
@@ -292,7 +292,7 @@ impl AutopilotDecoder {
             hdop: known(fix.eph).map(|dop| dop * 1e-2),
             ..GnssEpoch::default()
         };
-        out.push(HeardAutopilot { t, said: AutopilotSaid::Gnss(epoch) });
+        out.push(ReceivedAutopilot { t, measurement: AutopilotMeasurement::Gnss(epoch) });
         Ok(true)
     }
 
@@ -300,7 +300,7 @@ impl AutopilotDecoder {
         &mut self,
         place: &GLOBAL_POSITION_INT_DATA,
         t: MonoTime,
-        out: &mut Vec<HeardAutopilot>,
+        out: &mut Vec<ReceivedAutopilot>,
     ) -> Result<bool, Refusal> {
         let boot = Span::from_ns(i64::from(place.time_boot_ms) * 1_000_000);
         let t = self.at(boot, t)?;
@@ -315,7 +315,7 @@ impl AutopilotDecoder {
         let vel_ned_mps = Vector3::new(place.vx, place.vy, place.vz).map(|v| f64::from(v) * 1e-2);
         let alt_msl_m = f64::from(place.alt) * 1e-3;
         let said = AutopilotPosition { boot, lat_deg, lon_deg, alt_msl_m, vel_ned_mps };
-        out.push(HeardAutopilot { t, said: AutopilotSaid::Position(said) });
+        out.push(ReceivedAutopilot { t, measurement: AutopilotMeasurement::Position(said) });
         Ok(true)
     }
 }

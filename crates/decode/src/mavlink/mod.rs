@@ -5,5 +5,7 @@ mod frames;
 #[cfg(test)]
 mod tests;
 
-pub use autopilot::{AutopilotDecoder, AutopilotSaid, HeardAutopilot, asked, is_autopilot, question};
+pub use autopilot::{
+    AutopilotDecoder, AutopilotMeasurement, ReceivedAutopilot, asked, is_autopilot, question,
+};
 pub use frames::{MavlinkFrame, MavlinkFrames};

@@ -50,7 +50,7 @@ fn a_crooked_mount_is_found() {
         .iter()
         .find(|constant| constant.kind == windhover_refine::ConstantKind::Mount(1))
         .expect("it is estimated");
-    assert!(pitch.is_told(), "{pitch:?}");
+    assert!(pitch.is_determined(), "{pitch:?}");
     let error = (pitch.value - 1.5f64.to_radians()) / pitch.sigma;
     assert!(error.abs() < 3.0, "{pitch:?}");
 }

@@ -10,7 +10,7 @@ use tokio::time::Instant;
 
 use super::{JUDGE, Session, lock};
 use crate::io::link::live::LiveQueue;
-use crate::io::link::pace::Way;
+use crate::io::link::pace::Priority;
 use crate::io::link::wire::{self, WireError};
 use crate::io::proto::link::{self as pb, to_station};
 use crate::io::records::{Record, Schema};
@@ -60,7 +60,7 @@ impl Session {
     }
 
     /// Time until something may be sent.
-    fn delay(&self, way: Way) -> Duration {
+    fn delay(&self, way: Priority) -> Duration {
         let now = Instant::now();
         let own = lock(&self.governor).delay(way, now);
         let ceiling = self.shared.ceiling.as_ref();
@@ -101,7 +101,7 @@ impl Session {
                 changed.await.map_err(|_| WireError::Ended("the program ends".into()))?;
                 continue;
             }
-            let delay = self.delay(Way::Live);
+            let delay = self.delay(Priority::Live);
             if !delay.is_zero() {
                 // A newer estimate may arrive meanwhile and replace the waiting one.
                 let _ = tokio::time::timeout(delay, changed).await;
@@ -140,7 +140,7 @@ impl Session {
     async fn low_turn(&self) {
         loop {
             let cut = lock(&self.governor).is_cut();
-            let delay = self.delay(Way::Low);
+            let delay = self.delay(Priority::Low);
             if !cut && delay.is_zero() && !self.live_waits.load(Ordering::Relaxed) {
                 return;
             }

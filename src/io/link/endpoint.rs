@@ -26,7 +26,7 @@ const GOODBYE: Duration = Duration::from_millis(300);
 
 /// One side's UDP port.
 #[derive(Clone)]
-pub struct Door {
+pub struct LinkEndpoint {
     pub(super) endpoint: Endpoint,
     pub(super) role: Role,
     files: KeyFiles,
@@ -38,8 +38,8 @@ pub struct Door {
     open: Arc<Mutex<BTreeMap<usize, Connection>>>,
 }
 
-impl Door {
-    /// Opens the port. Admitted peers come out of the receiver, for [`Door::run`].
+impl LinkEndpoint {
+    /// Opens the port. Admitted peers come out of the receiver, for [`LinkEndpoint::run`].
     pub fn open(
         role: Role,
         files: &KeyFiles,
@@ -60,7 +60,7 @@ impl Door {
         let endpoint = Endpoint::new(config, server, socket, Arc::new(quinn::TokioRuntime))
             .map_err(|source| LinkError::Bind { address, source })?;
         let (arrivals, receiver) = mpsc::channel(16);
-        let door = Self {
+        let link_endpoint = Self {
             endpoint,
             role,
             files: files.clone(),
@@ -70,7 +70,7 @@ impl Door {
             arrivals,
             open: Arc::default(),
         };
-        Ok((door, receiver))
+        Ok((link_endpoint, receiver))
     }
 
     /// The local address of the port.
@@ -126,7 +126,7 @@ impl Door {
                 let _ = incoming.retry();
                 continue;
             }
-            let door = self.clone();
+            let link_endpoint = self.clone();
             underway.spawn(async move {
                 let address = incoming.remote_address();
                 let outcome = match incoming.accept() {
@@ -138,9 +138,9 @@ impl Door {
                 };
                 match outcome {
                     Ok(connection) => {
-                        let _ = door.greet(connection).await;
+                        let _ = link_endpoint.greet(connection).await;
                     }
-                    Err(e) => door.events.refused(address, refusal(&e).0),
+                    Err(e) => link_endpoint.events.refused(address, refusal(&e).0),
                 }
             });
         }

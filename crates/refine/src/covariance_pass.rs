@@ -12,13 +12,13 @@ use crate::front::Back;
 use crate::noise::Components;
 use crate::problem::{Origin, Pass, Problem};
 use crate::recording::Recording;
-use crate::solve::{Factors, What};
-use crate::told::{Constant, Outlier, Refined, Tally};
+use crate::result::{Constant, Outlier, Refined, Tally};
+use crate::solve::{EliminatedKind, Factors};
 use crate::unknowns::{Prior, knot};
 use crate::values::Values;
 
 /// Result of a pass with covariances.
-pub(crate) struct Looked {
+pub(crate) struct PassResult {
     pub(crate) components: Components,
     pub(crate) refined: Refined,
     /// Correlation of pixel errors from frame to frame.
@@ -35,9 +35,9 @@ pub(crate) fn look(
     noise: &Noise,
     site: &Site,
     recordings: &[Recording],
-) -> Looked {
+) -> PassResult {
     let problem = pass.problem;
-    let mut looked = Looked {
+    let mut looked = PassResult {
         components: Components::new(problem.targets, problem.plan.windows),
         refined: Refined::default(),
         memory: PixelMemory::default(),
@@ -48,9 +48,9 @@ pub(crate) fn look(
     for (what, e) in factors.steps.iter().rev() {
         back.solve_with_covariance(e);
         match what {
-            What::Constants => looked.refined.constants = constants(problem, values, &back),
-            What::Landmark(_) => {}
-            What::Knot(k) => {
+            EliminatedKind::Constants => looked.refined.constants = constants(problem, values, &back),
+            EliminatedKind::Landmark(_) => {}
+            EliminatedKind::Knot(k) => {
                 let stop = &problem.plan.stops[*k];
                 pass.blocks(*k, values, noise, &mut |origin: Origin, block: &Block| {
                     looked.take(origin, block, &back, problem, (*k, noise), &mut counts);
@@ -72,7 +72,7 @@ pub(crate) fn look(
     looked
 }
 
-impl Looked {
+impl PassResult {
     fn take(
         &mut self,
         origin: Origin,

@@ -62,25 +62,25 @@ impl Places {
 
 /// Accepts the clients of one port.
 #[derive(Debug)]
-pub(super) struct Door {
+pub(super) struct ClientListener {
     listener: TcpListener,
     /// What the port serves, for the operator.
     name: &'static str,
     places: Places,
 }
 
-impl Door {
+impl ClientListener {
     /// Admits clients to `name`.
     pub(super) fn new(listener: TcpListener, name: &'static str) -> Self {
         Self { listener, name, places: Places::default() }
     }
 
     /// The next client that gets a place.
-    pub(super) async fn next(&mut self) -> (Visitor, SocketAddr) {
+    pub(super) async fn next(&mut self) -> (ClientStream, SocketAddr) {
         loop {
             match self.listener.accept().await {
                 Ok((stream, address)) => match self.places.take() {
-                    Some(place) => return (Visitor::new(stream, place, self.places.clone()), address),
+                    Some(place) => return (ClientStream::new(stream, place, self.places.clone()), address),
                     None => self.tell(&format!("{address} is refused: {PLACES} clients are connected")),
                 },
                 Err(error) => {
@@ -96,11 +96,11 @@ impl Door {
     }
 }
 
-impl axum::serve::Listener for Door {
-    type Io = Visitor;
+impl axum::serve::Listener for ClientListener {
+    type Io = ClientStream;
     type Addr = SocketAddr;
 
-    async fn accept(&mut self) -> (Visitor, SocketAddr) {
+    async fn accept(&mut self) -> (ClientStream, SocketAddr) {
         self.next().await
     }
 
@@ -111,7 +111,7 @@ impl axum::serve::Listener for Door {
 
 /// A client's connection. It fails when the client has to leave.
 #[derive(Debug)]
-pub(super) struct Visitor {
+pub(super) struct ClientStream {
     stream: TcpStream,
     place: Arc<Place>,
     places: Places,
@@ -119,7 +119,7 @@ pub(super) struct Visitor {
     limit: Pin<Box<Sleep>>,
 }
 
-impl Visitor {
+impl ClientStream {
     fn new(stream: TcpStream, place: Arc<Place>, places: Places) -> Self {
         let leave = Box::pin(place.leave.clone().cancelled_owned());
         Self { stream, place, places, leave, limit: Box::pin(tokio::time::sleep(ASKING)) }
@@ -145,13 +145,13 @@ impl Visitor {
     }
 }
 
-impl Drop for Visitor {
+impl Drop for ClientStream {
     fn drop(&mut self) {
         self.places.taken().retain(|place| !Arc::ptr_eq(place, &self.place));
     }
 }
 
-impl AsyncRead for Visitor {
+impl AsyncRead for ClientStream {
     fn poll_read(
         self: Pin<&mut Self>,
         context: &mut Context<'_>,
@@ -165,7 +165,7 @@ impl AsyncRead for Visitor {
     }
 }
 
-impl AsyncWrite for Visitor {
+impl AsyncWrite for ClientStream {
     fn poll_write(self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         let me = self.get_mut();
         let written = Pin::new(&mut me.stream).poll_write(context, bytes);
@@ -201,17 +201,17 @@ mod tests {
     async fn who_says_nothing_makes_room_for_who_comes() {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("an address");
-        let mut door = Door::new(listener, "page");
+        let mut listener = ClientListener::new(listener, "page");
         // Given all places taken by connections that are only opened.
         let (mut silent, mut inside) = (Vec::new(), Vec::new());
         for _ in 0..PLACES {
             silent.push(TcpStream::connect(address).await.expect("connected"));
-            inside.push(door.next().await.0);
+            inside.push(listener.next().await.0);
         }
         // When the first is answered and one more comes, then the second has to leave, and the new one is admitted.
         inside[0].write_all(b"answer").await.expect("written");
         let mut late = TcpStream::connect(address).await.expect("connected");
-        let (mut visitor, _) = door.next().await;
+        let (mut visitor, _) = listener.next().await;
         late.write_all(b"question").await.expect("written");
         let mut heard = [0; 8];
         visitor.read_exact(&mut heard).await.expect("asked");
@@ -222,6 +222,6 @@ mod tests {
         // When clients leave, then their places are free.
         inside.clear();
         drop(visitor);
-        assert!(door.places.taken().is_empty());
+        assert!(listener.places.taken().is_empty());
     }
 }

@@ -5,7 +5,7 @@
 //! sentence that was seen to follow the longest silence. A device with a sentence for the whole attitude repeats it in
 //! the others, which then add nothing.
 
-use super::reading::{CompassReading, HeardAttitude, heard};
+use super::reading::{CompassReading, ReceivedAttitude, heard};
 use crate::burst::Cycle;
 use crate::counts::DecodeCounts;
 use crate::lines::LineSpan;
@@ -62,7 +62,7 @@ struct Draft {
 
 /// Combines sentences to readings.
 #[derive(Clone, Debug)]
-pub(super) struct Together {
+pub(super) struct ReadingAssembler {
     draft: Option<Draft>,
     /// Sentences of the reading that was output last.
     done: Vec<Key>,
@@ -73,7 +73,7 @@ pub(super) struct Together {
     since_whole: u32,
 }
 
-impl Default for Together {
+impl Default for ReadingAssembler {
     fn default() -> Self {
         Self {
             draft: None,
@@ -86,14 +86,14 @@ impl Default for Together {
     }
 }
 
-impl Together {
+impl ReadingAssembler {
     /// A sentence of the device's own: a complete attitude.
     pub(super) fn whole(
         &mut self,
         reading: CompassReading,
         span: LineSpan,
         counts: &mut DecodeCounts,
-        out: &mut Vec<HeardAttitude>,
+        out: &mut Vec<ReceivedAttitude>,
     ) {
         self.draft = None;
         self.since_whole = 0;
@@ -108,7 +108,7 @@ impl Together {
         sentence: &Sentence<'_>,
         span: LineSpan,
         counts: &mut DecodeCounts,
-        out: &mut Vec<HeardAttitude>,
+        out: &mut Vec<ReceivedAttitude>,
     ) {
         if self.since_whole < AFTER_WHOLE {
             self.since_whole += 1;
@@ -132,14 +132,14 @@ impl Together {
     }
 
     /// Time has passed: outputs an open reading after which the device has fallen silent.
-    pub(super) fn tick(&mut self, now: MonoTime, counts: &mut DecodeCounts, out: &mut Vec<HeardAttitude>) {
+    pub(super) fn tick(&mut self, now: MonoTime, counts: &mut DecodeCounts, out: &mut Vec<ReceivedAttitude>) {
         if self.draft.as_ref().is_some_and(|draft| now - draft.last.t_last >= QUIET) {
             self.close(counts, out);
         }
     }
 
     /// The open reading ends because another begins, or the stream ends.
-    pub(super) fn close(&mut self, counts: &mut DecodeCounts, out: &mut Vec<HeardAttitude>) {
+    pub(super) fn close(&mut self, counts: &mut DecodeCounts, out: &mut Vec<ReceivedAttitude>) {
         if let Some(draft) = &self.draft {
             self.cycle.ended(&draft.keys);
             self.give_out(counts, out);
@@ -147,7 +147,7 @@ impl Together {
         self.done.clear();
     }
 
-    fn give_out(&mut self, counts: &mut DecodeCounts, out: &mut Vec<HeardAttitude>) {
+    fn give_out(&mut self, counts: &mut DecodeCounts, out: &mut Vec<ReceivedAttitude>) {
         if let Some(mut draft) = self.draft.take() {
             draft.reading.flagged &= draft.reading.heading_deg.is_none();
             out.push(heard(draft.reading, draft.first, draft.last, counts));

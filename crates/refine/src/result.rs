@@ -29,7 +29,7 @@ const MATTERS: f64 = 0.5;
 
 impl Constant {
     /// Whether the flight determines it; otherwise it stays near its expected value.
-    pub fn is_told(&self) -> bool {
+    pub fn is_determined(&self) -> bool {
         self.prior_sigma > 0.0 && self.sigma < TOLD * self.prior_sigma
     }
 
@@ -37,7 +37,7 @@ impl Constant {
     /// amount.
     pub fn is_settled(&self) -> bool {
         let off = (self.value - self.prior).abs();
-        self.is_told() && off > 3.0 * self.sigma && off > MATTERS * self.prior_sigma
+        self.is_determined() && off > 3.0 * self.sigma && off > MATTERS * self.prior_sigma
     }
 }
 
@@ -78,7 +78,7 @@ pub struct Refined {
     pub targets: Vec<(usize, TargetEstimate)>,
     /// Constants of the flight.
     pub constants: Vec<Constant>,
-    /// What the tilt sensor was assumed to measure.
+    /// EliminatedKind the tilt sensor was assumed to measure.
     pub felt: Option<FeltTilt>,
     /// The outliers, the largest first.
     pub outliers: Vec<Outlier>,

@@ -9,14 +9,14 @@ use windhover_base::time::Span;
 const LISTEN: Span = Span::from_ns(1_500_000_000);
 
 /// The line while its speed is settled.
-pub(super) struct Talk<'a> {
+pub(super) struct Dialogue<'a> {
     pub(super) line: &'a mut Line,
     pub(super) settings: &'a SerialSettings,
     pub(super) clock: HostClock,
     pub(super) reports: Reports<'a>,
 }
 
-impl Talk<'_> {
+impl Dialogue<'_> {
     pub(super) async fn send(&mut self, bytes: &[u8]) -> Result<(), Fault> {
         self.line.write(bytes).await
     }

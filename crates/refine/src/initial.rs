@@ -7,7 +7,7 @@ use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::{MonoTime, Span};
 use windhover_estimate::{Estimator, Site};
 
-use crate::recording::{Heard, Recording};
+use crate::recording::{Measured, Recording};
 use crate::unknowns::knot;
 use crate::values::Knot;
 
@@ -18,7 +18,7 @@ const BEHIND: Span = Span::from_ns(300_000_000);
 
 /// The filter's result for one flight.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct First {
+pub(crate) struct InitialValues {
     /// In order of time, each instant once.
     pub(crate) own: Vec<Ownship>,
     /// Of each target, where it was tracked, in order of time.
@@ -29,15 +29,20 @@ pub(crate) struct First {
 }
 
 /// Runs the filter over a recording.
-pub(crate) fn filtered(rig: &Rig, estimator: &EstimatorConfig, site: &Site, recording: &Recording) -> First {
+pub(crate) fn filtered(
+    rig: &Rig,
+    estimator: &EstimatorConfig,
+    site: &Site,
+    recording: &Recording,
+) -> InitialValues {
     let mut filter = Estimator::new(rig, estimator, site);
-    let mut first = First { targets: vec![Vec::new(); rig.target.len()], ..First::default() };
+    let mut first = InitialValues { targets: vec![Vec::new(); rig.target.len()], ..InitialValues::default() };
     let (mut out, mut asked) = (Vec::new(), None);
     for heard in recording.in_order() {
         match heard {
-            Heard::Epoch(epoch) => filter.gnss(epoch, &mut out),
-            Heard::Reading(sample) => filter.attitude(sample, &mut out),
-            Heard::Frame(frame) => filter.frame(frame, &mut out),
+            Measured::Epoch(epoch) => filter.gnss(epoch, &mut out),
+            Measured::Reading(sample) => filter.attitude(sample, &mut out),
+            Measured::Frame(frame) => filter.frame(frame, &mut out),
         }
         let t = heard.t_recv();
         filter.tick(t, &mut out);
@@ -55,7 +60,7 @@ pub(crate) fn filtered(rig: &Rig, estimator: &EstimatorConfig, site: &Site, reco
     first
 }
 
-impl First {
+impl InitialValues {
     fn take(&mut self, out: &mut Vec<EstimatorOutput>, t: MonoTime) {
         for said in out.drain(..) {
             match said {

@@ -9,7 +9,7 @@ use super::motion;
 
 /// One vehicle in one round of messages.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub struct Told {
+pub struct VehicleReport {
     /// Moment of sending, since the autopilot's start where its clock is known, else since the program's.
     pub now: Span,
     /// The state at the moment of sending.
@@ -40,7 +40,7 @@ pub struct Told {
 /// A vehicle relative to the helicopter, at the time of a frame.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Sighting {
-    /// Exposure of the frame, on the clock of [`Told::now`].
+    /// Exposure of the frame, on the clock of [`VehicleReport::now`].
     pub at: Span,
     /// From the body frame's origin to the vehicle's reported point, north, east, down, metres.
     pub offset_ned_m: Vector3<f64>,
@@ -52,7 +52,7 @@ pub struct Sighting {
     pub sigma_m: (f64, f64),
 }
 
-impl Told {
+impl VehicleReport {
     /// Velocity of the reported point, north, east, down, m/s.
     pub fn velocity(&self) -> Vector3<f64> {
         motion::velocity(&self.state, self.reference_m)

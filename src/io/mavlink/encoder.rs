@@ -13,8 +13,8 @@ use windhover_base::time::{MonoTime, Span, UtcTime};
 use super::camera::Camera;
 use super::helicopter::Helicopter;
 use super::packet::{self, Sender, Signature, SigningKey};
-use super::told::{Sighting, Told};
-use super::vehicle::{Limits, Said, Vehicle};
+use super::report::{Sighting, VehicleReport};
+use super::vehicle::{Limits, Reportable, Vehicle};
 use super::{messages, motion};
 
 /// MAV_COMP_ID_AUTOPILOT1: ground stations draw vehicles for this component only.
@@ -39,7 +39,7 @@ struct System {
 
 /// Makes MAVLink frames from the pipeline's outputs.
 #[derive(Debug)]
-pub struct Teller {
+pub struct MavlinkEncoder {
     config: MavlinkConfig,
     systems: Vec<System>,
     limits: Limits,
@@ -57,7 +57,7 @@ pub struct Teller {
     stamp: u64,
 }
 
-impl Teller {
+impl MavlinkEncoder {
     /// For this configuration: these targets over this ground, seen by this camera.
     pub fn new(
         config: &MavlinkConfig,
@@ -172,12 +172,12 @@ impl Teller {
             if self.systems[index].stands_back.is_some_and(|until| now < until) {
                 continue;
             }
-            let said = self.systems[index].vehicle.said(now, &self.limits);
+            let reportable = self.systems[index].vehicle.reportable(now, &self.limits);
             if beat {
-                self.put(index, &messages::heartbeat(status(&said)), now, out);
+                self.put(index, &messages::heartbeat(status(&reportable)), now, out);
             }
-            if let Some(told) = self.told(index, &said, now).filter(|_| positions) {
-                self.put_state(index, &told, now, out);
+            if let Some(report) = self.report(index, &reportable, now).filter(|_| positions) {
+                self.put_state(index, &report, now, out);
             }
         }
         self.heartbeat = if beat { Some(now) } else { self.heartbeat };
@@ -191,8 +191,8 @@ impl Teller {
     }
 
     /// The content of a vehicle's messages at `now`; `None` where nothing may be sent.
-    fn told(&self, index: usize, said: &Said, now: MonoTime) -> Option<Told> {
-        let (Said::Seen(t, state) | Said::Predicted(t, state)) = said else { return None };
+    fn report(&self, index: usize, reportable: &Reportable, now: MonoTime) -> Option<VehicleReport> {
+        let (Reportable::Seen(t, state) | Reportable::Predicted(t, state)) = reportable else { return None };
         let (system, frame) = (&self.systems[index], self.frame.as_ref()?);
         let rate_mps2 = system.vehicle.rate_mps2();
         let at_now = motion::ahead(state, rate_mps2, system.reference_m, now - *t);
@@ -204,7 +204,7 @@ impl Teller {
         let absolute = at_now.covariance.map_or(0.0, |p| p[(0, 0)].max(p[(1, 1)]).max(0.0).sqrt());
         let heard = difference.is_some_and(|(_, fresh)| fresh);
         let relative = state.relative_sigma_m.filter(|_| heard);
-        let told = Told {
+        let report = VehicleReport {
             now: self.since_start(now),
             state: at_now,
             place_deg: (place.lat_deg, place.lon_deg),
@@ -215,13 +215,13 @@ impl Teller {
             sigma_m: relative.unwrap_or(absolute),
             rate_mps2,
             reference_m: system.reference_m,
-            seen: matches!(said, Said::Seen(..)),
+            seen: matches!(reportable, Reportable::Seen(..)),
             number: u8::try_from(index).unwrap_or(u8::MAX),
             sighting: self.sighting(*t, state, down),
             size_m: system.size_m,
             in_picture: system.in_picture,
         };
-        told.is_finite().then_some(told)
+        report.is_finite().then_some(report)
     }
 
     fn sighting(&self, t: MonoTime, state: &TargetState, down: f64) -> Option<Sighting> {
@@ -245,31 +245,31 @@ impl Teller {
         level + state.height_m - datum_m
     }
 
-    fn put_state(&mut self, index: usize, told: &Told, now: MonoTime, out: &mut Vec<Vec<u8>>) {
+    fn put_state(&mut self, index: usize, report: &VehicleReport, now: MonoTime, out: &mut Vec<Vec<u8>>) {
         use MavlinkMessage as M;
-        let down_m = self.frame.map_or(0.0, |frame| frame.datum().height_m - told.state.height_m);
+        let down_m = self.frame.map_or(0.0, |frame| frame.datum().height_m - report.state.height_m);
         let landing = self.config.landing_frame;
         for kind in self.config.messages.clone() {
-            let seen = told.sighting.as_ref().filter(|_| told.seen);
+            let seen = report.sighting.as_ref().filter(|_| report.seen);
             match kind {
-                M::GlobalPositionInt => self.put(index, &messages::global_position_int(told), now, out),
-                M::Attitude => self.put(index, &messages::attitude(told), now, out),
-                M::FollowTarget => self.put(index, &messages::follow_target(told), now, out),
-                M::Odometry => self.put(index, &messages::odometry(told, down_m), now, out),
-                M::TargetAbsolute => self.put_camera(&messages::target_absolute(told), now, out),
+                M::GlobalPositionInt => self.put(index, &messages::global_position_int(report), now, out),
+                M::Attitude => self.put(index, &messages::attitude(report), now, out),
+                M::FollowTarget => self.put(index, &messages::follow_target(report), now, out),
+                M::Odometry => self.put(index, &messages::odometry(report, down_m), now, out),
+                M::TargetAbsolute => self.put_camera(&messages::target_absolute(report), now, out),
                 M::TargetRelative => {
-                    let message = seen.map(|seen| messages::target_relative(told, seen));
+                    let message = seen.map(|seen| messages::target_relative(report, seen));
                     message.into_iter().for_each(|message| self.put_camera(&message, now, out));
                 }
                 M::LandingTarget => {
-                    let message = seen.map(|seen| messages::landing_target(told, seen, landing));
+                    let message = seen.map(|seen| messages::landing_target(report, seen, landing));
                     message.into_iter().for_each(|message| self.put_camera(&message, now, out));
                 }
                 M::CameraTrackingGeoStatus if index == 0 => {
-                    self.put_camera(&messages::camera_tracking_geo_status(told), now, out);
+                    self.put_camera(&messages::camera_tracking_geo_status(report), now, out);
                 }
                 M::CameraTrackingImageStatus if index == 0 => {
-                    self.put_camera(&messages::camera_tracking_image_status(told), now, out);
+                    self.put_camera(&messages::camera_tracking_image_status(report), now, out);
                 }
                 M::CameraTrackingGeoStatus | M::CameraTrackingImageStatus => {}
             }
@@ -334,10 +334,10 @@ fn seen_as(marker: &MarkerConfig, target: usize, index: usize) -> MarkerId {
 
 /// The track status for a heartbeat: active while positions of a visible vehicle are sent, critical while predicted
 /// ones are, and standby where none are.
-fn status(said: &Said) -> TrackStatus {
-    match said {
-        Said::Seen(..) => TrackStatus::Tracking,
-        Said::Predicted(..) => TrackStatus::Coasting,
-        Said::Nothing => TrackStatus::Lost,
+fn status(reportable: &Reportable) -> TrackStatus {
+    match reportable {
+        Reportable::Seen(..) => TrackStatus::Tracking,
+        Reportable::Predicted(..) => TrackStatus::Coasting,
+        Reportable::Nothing => TrackStatus::Lost,
     }
 }
