@@ -76,6 +76,13 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
             "the receiver's slow error wanders farther than configured, against what is seen of vehicles and ground".into(),
             "raise gps.bias_sigma_m: positions are allowed to be as far off meanwhile".into(),
         ),
+        MisfitCause::Lens => MisfitWords {
+            source: "camera".into(),
+            kind,
+            figure: format!("{figure:+.3}"),
+            cause: "the lens distorts otherwise than configured: by this much in k1".into(),
+            advice: "calibrate the camera (windhover calibrate), and check camera.intrinsics and the picture's size".into(),
+        },
         MisfitCause::AntennaPlace => of_source(
             format!("{figure:.2} m"),
             "the receiver's antenna is not where gps.antenna_position_m has it, by how it swings in turns".into(),
@@ -121,6 +128,7 @@ const fn kind(cause: MisfitCause) -> &'static str {
         MisfitCause::TargetTurns { .. } => "target_turns",
         MisfitCause::TargetSways { .. } => "target_sways",
         MisfitCause::AntennaPlace => "antenna_place",
+        MisfitCause::Lens => "lens",
         MisfitCause::Wanders => "wanders",
         MisfitCause::TargetSlides { .. } => "target_slides",
         MisfitCause::Late => "late",

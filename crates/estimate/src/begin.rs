@@ -158,7 +158,7 @@ pub(crate) fn ground_point(
     let ned_from_camera =
         own.ned_from_body * nalgebra::Rotation3::from_matrix_unchecked(models.camera_from_body.transpose());
     let camera = own.position + own.ned_from_body * models.camera_at;
-    locate(&models.camera, &camera, &ned_from_camera, px, &models.ground, above_m, FARTHEST_M)
+    locate(&models.lens(own), &camera, &ned_from_camera, px, &models.ground, above_m, FARTHEST_M)
         .ok()
         .map(|found| found.ned_m)
 }

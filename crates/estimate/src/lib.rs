@@ -27,6 +27,7 @@ mod kind;
 mod learn;
 mod learn_vehicle;
 mod matrix;
+mod lens;
 mod measurement;
 mod models;
 mod motion;

@@ -126,6 +126,8 @@ pub(crate) struct State {
     pub(crate) height: HeightCheck,
     /// By how much lower than configured the ground lies, m: the receiver's heights are over that.
     pub(crate) ground_lower_m: f64,
+    /// Whether the lens was found to be another one than configured.
+    pub(crate) lens_open: bool,
     /// Whether the antenna's place was found to be measured wrongly.
     pub(crate) antenna_anywhere: bool,
     /// By how much earlier than stamped frames are true, as was found out, s.
@@ -180,7 +182,7 @@ impl State {
         self.alive = other.alive;
         self.own = other.own;
         (self.ground_lower_m, self.camera_late_s) = (other.ground_lower_m, other.camera_late_s);
-        self.antenna_anywhere = other.antenna_anywhere;
+        (self.antenna_anywhere, self.lens_open) = (other.antenna_anywhere, other.lens_open);
         self.own_columns = other.own_columns;
         self.senses = other.senses;
         self.fits = other.fits;
@@ -201,7 +203,7 @@ impl State {
         self.features.fill(Feature::default());
         self.tags.fill(TagFit::default());
         self.scale = None;
-        self.antenna_anywhere = false;
+        (self.antenna_anywhere, self.lens_open) = (false, false);
         self.cov.fill(0.0);
         (self.past_motion.in_use, self.past_bias.in_use) = (false, false);
         self.copies.iter_mut().for_each(|copy| copy.in_use = false);

@@ -282,6 +282,8 @@ pub enum MisfitCause {
     },
     /// The receiver's slow error wanders farther than configured. Figure: how many times as far.
     Wanders,
+    /// The lens distorts otherwise than configured. Figure: the error of its radial distortion k1.
+    Lens,
     /// The receiver's antenna is elsewhere than configured. Figure: by how much, m.
     AntennaPlace,
     /// The times of validity of its measurements are earlier than their stamps. Figure: by how much, s.

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use nalgebra::{Vector2, Vector3};
+use nalgebra::{Vector2, Vector3, Vector4};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -146,6 +146,7 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
     own.gps_delay_s = within(most::DELAY_S);
     own.drag_per_s = 0.2 + within(0.2);
     own.compass_delay_s = within(most::COMPASS_DELAY_S);
+    own.lens = Vector4::new(within(0.1), within(0.1), within(0.005), within(0.005));
     own.arm = Vector2::new(within(0.3), within(0.3));
     own.ned_from_body = ned_from_body_321(within(3.1), within(0.2), within(0.2));
     own.position.z = core.models.ground.down_m(own.position.x, own.position.y) - 12.0 + within(4.0);

@@ -363,6 +363,25 @@ fn a_vehicle_that_sways_on_its_springs_is_no_worse_than_its_sway() {
 }
 
 #[test]
+fn a_lens_whose_distortion_is_left_out_is_found_out() {
+    let lens = |out: &[EstimatorOutput]| {
+        told(out).into_iter().filter(|(cause, _)| *cause == MisfitCause::Lens).last()
+    };
+    for scenario in ["follow", "circle20"] {
+        let (world, out) = flown(scenario, 25.0, 3);
+        let twin = score(&estimates(&out), &world, 6.0);
+        assert_eq!(lens(&out), None, "{scenario}");
+        let (world, out) = flown(&format!("{scenario}+no-distortion"), 25.0, 3);
+        let score = score(&estimates(&out), &world, 6.0);
+        println!("{scenario}: {score:?}, twin {twin:?}, found {:?}", lens(&out));
+        // Not found out, the NEES is 20 to 150, and heading is off by some degrees.
+        assert!(score.nees <= (1.3 * twin.nees).max(4.2) && score.speed < 1.5 * twin.speed, "{score:?}");
+        let k1 = lens(&out).expect("it is reported").1;
+        assert!((-0.3..-0.05).contains(&k1), "{k1}");
+    }
+}
+
+#[test]
 fn an_antenna_that_is_elsewhere_is_found_out() {
     let antenna = |out: &[EstimatorOutput]| {
         told(out).into_iter().filter(|(cause, _)| *cause == MisfitCause::AntennaPlace).last()
