@@ -359,8 +359,8 @@ fn rows_exposed_one_after_the_other() {
             [
                 left_out(own::POSITION.range(), 5.0),
                 left_out(own::ATTITUDE.range(), 60.0),
-                // A hundredth of what they move a pixel by themselves.
-                left_out(own::LENS.range(), 20.0),
+                // Some percent of what they move a pixel by themselves.
+                left_out(own::LENS.range(), 60.0),
                 left_out(seen, 20.0),
                 left_out(layout.tag(0).all().column(0)..layout.len(), 5.0),
             ]
