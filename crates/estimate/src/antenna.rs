@@ -20,8 +20,8 @@ const REPORTED_M: f64 = 0.15;
 impl Core {
     /// After a velocity of the receiver: whether the antenna's place was measured wrongly.
     pub(crate) fn judge_antenna(&mut self) {
-        let off_m = self.state.own.arm.norm();
-        if !self.at_truth && !self.state.antenna_anywhere && off_m > BEYOND * ARM_SIGMA_M {
+        let beyond = self.state.own.arm.norm() > BEYOND * ARM_SIGMA_M && self.antenna_misfit().is_some();
+        if !self.at_truth && !self.state.antenna_anywhere && beyond {
             self.state.antenna_anywhere = true;
             self.state.cov.add_diagonal(own::ARM, &[ANYWHERE_M * ANYWHERE_M; 2]);
         }

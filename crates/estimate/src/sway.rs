@@ -125,6 +125,11 @@ impl Sway {
         self.var[1] > 0.0
     }
 
+    /// Whether it was seen for long enough to be judged.
+    pub(crate) fn is_judged(&self) -> bool {
+        self.displaced.iter().all(|displaced| displaced.taken_s >= JUDGED_S)
+    }
+
     /// Standard deviation of its markers' displacement, m; `None` where it was not seen to sway.
     pub(crate) fn shown_m(&self) -> Option<f64> {
         let [across, down] = self.displaced.map(|displaced| displaced.var);
