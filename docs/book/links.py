@@ -11,7 +11,7 @@ INSIDE = {
     "README.md": "book/what-it-is.md",
     "ARCHITECTURE.md": "book/architecture.md",
     "CONTRIBUTING.md": "book/contributing.md",
-    "docs/README.md": "book/what-it-is.md",
+    "docs/README.md": "index.md",
 }
 INCLUDE = re.compile(r"\{\{#include ([^}:]+)[^}]*\}\}")
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
