@@ -83,6 +83,13 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
             cause: "the lens distorts otherwise than configured: by this much in k1".into(),
             advice: "calibrate the camera (windhover calibrate), and check camera.intrinsics and the picture's size".into(),
         },
+        MisfitCause::Readout => MisfitWords {
+            source: "camera".into(),
+            kind,
+            figure: format!("{:.1} ms", 1e3 * figure),
+            cause: format!("its rows are exposed one after the other, in {:.1} ms (a rolling shutter)", 1e3 * figure),
+            advice: format!("set camera.readout_ms = {:.1}, or calibrate it", 1e3 * figure),
+        },
         MisfitCause::AntennaPlace => of_source(
             format!("{figure:.2} m"),
             "the receiver's antenna is not where gps.antenna_position_m has it, by how it swings in turns".into(),
@@ -128,6 +135,7 @@ const fn kind(cause: MisfitCause) -> &'static str {
         MisfitCause::TargetTurns { .. } => "target_turns",
         MisfitCause::TargetSways { .. } => "target_sways",
         MisfitCause::AntennaPlace => "antenna_place",
+        MisfitCause::Readout => "readout",
         MisfitCause::Lens => "lens",
         MisfitCause::Wanders => "wanders",
         MisfitCause::TargetSlides { .. } => "target_slides",

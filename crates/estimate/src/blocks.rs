@@ -99,8 +99,11 @@ pub(crate) mod own {
     /// Errors of the lens's distortion: k1, k2, p1, p2.
     pub(crate) const LENS: Block<4> = Block::after(ARM);
 
+    /// How much longer than configured the camera takes from its first row to its last, s.
+    pub(crate) const READOUT: Block<1> = Block::after(LENS);
+
     /// Constant error of the gyros, body axes, rad/s. From here on only where there is an IMU.
-    pub(crate) const RATE_BIAS: Block<3> = Block::after(LENS);
+    pub(crate) const RATE_BIAS: Block<3> = Block::after(READOUT);
     /// Constant error of the accelerometers, body axes, m/s².
     pub(crate) const FORCE_BIAS: Block<3> = Block::after(RATE_BIAS);
     /// Heading bias of the second source of attitude, rad. From here on only where there is one.
@@ -115,7 +118,7 @@ pub(crate) mod own {
     /// What has intensities that are fitted in flight: rate, gusts, thrust, error of the tilt reading.
     pub(crate) const MOTION: Block<{ TILT_ERROR.end() - ATTITUDE.end() }> = Block::from_start_of(RATE);
     /// Length of the helicopter's part with GPS and compass only, with an IMU, and with a second source of attitude.
-    pub(crate) const LEN: usize = LENS.end();
+    pub(crate) const LEN: usize = READOUT.end();
     pub(crate) const WITH_IMU: usize = FORCE_BIAS.end();
     pub(crate) const WITH_SECOND: usize = SECOND_TILT_ERROR.end();
     /// What moves by itself, forces and slow errors: the table of `own.rs`.

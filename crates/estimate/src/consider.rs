@@ -24,6 +24,7 @@ const BLIND: Held = ALWAYS
     .and(own::GPS_DELAY)
     .and(own::COMPASS_DELAY)
     .and(own::ARM)
+    .and(own::READOUT)
     .and(own::DRAG)
     .and(own::TRIM)
     .and(own::TILT_BIAS)

@@ -26,6 +26,7 @@ impl Core {
         self.state.learn_targets(&self.learning);
         self.judge_turns();
         self.judge_lens();
+        self.bound_readout();
         self.state.copy_targets(frame.frame, self.keep_copies);
         self.judge_camera_clock();
     }

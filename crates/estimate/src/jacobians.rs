@@ -352,7 +352,7 @@ fn rows_exposed_one_after_the_other() {
     };
     for seed in 0..STATES {
         let mut core = random_core(seed, Ground::Flat { down_m: 0.0 });
-        core.models.readout_s = 0.025;
+        (core.models.readout_s, core.state.own.readout_s) = (0.02, 0.005);
         let low = Vector2::new(640.0, 900.0);
         let (target, slot, layout) = (0, 3, core.state.layout());
         let of_pose = |seen: std::ops::Range<usize>| {

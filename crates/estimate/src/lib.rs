@@ -38,6 +38,7 @@ mod receiver_error;
 mod resume;
 mod senses;
 mod shape;
+mod shutter;
 mod slip;
 mod sources;
 mod spin;

@@ -45,6 +45,8 @@ pub(crate) struct Own {
     pub(crate) arm: Vector2<f64>,
     /// By how much the lens's distortion (k1, k2, p1, p2) is more than configured.
     pub(crate) lens: Vector4<f64>,
+    /// How much longer than configured the camera takes from its first row to its last, s.
+    pub(crate) readout_s: f64,
     /// Of the gyros, rad/s, and of the accelerometers, m/s², body axes.
     pub(crate) rate_bias: Vector3<f64>,
     pub(crate) force_bias: Vector3<f64>,
@@ -117,6 +119,7 @@ impl Default for Own {
             compass_delay_s: 0.0,
             arm: Vector2::zeros(),
             lens: Vector4::zeros(),
+            readout_s: 0.0,
             rate_bias: Vector3::zeros(),
             force_bias: Vector3::zeros(),
             second: AttitudeErrors::default(),
@@ -175,7 +178,7 @@ struct Slow {
 }
 
 /// The slow states in the order of their columns.
-const SLOW: [Slow; 21] = [
+const SLOW: [Slow; 22] = [
     Slow {
         first: place(own::GUST),
         mean: |own| own.gust.as_mut_slice(),
@@ -272,6 +275,13 @@ const SLOW: [Slow; 21] = [
         first: place(own::LENS.part::<2>(2)),
         mean: |own| &mut own.lens.as_mut_slice()[2..],
         start_var: |_| [0.0; 3],
+        wander: Drift::Walk(0.0),
+    },
+    Slow {
+        first: place(own::READOUT),
+        mean: |own| std::slice::from_mut(&mut own.readout_s),
+        // Global shutters have none, others some 10 to 30 ms.
+        start_var: |_| [0.01f64.powi(2); 3],
         wander: Drift::Walk(0.0),
     },
     Slow {

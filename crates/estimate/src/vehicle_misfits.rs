@@ -41,6 +41,7 @@ impl Core {
             .chain(self.clock_misfit())
             .chain(self.antenna_misfit())
             .chain(self.lens_misfit())
+            .chain(self.readout_misfit())
             .chain(self.receiver_misfit())
             .chain(outside)
             .chain(moving)

@@ -284,6 +284,8 @@ pub enum MisfitCause {
     Wanders,
     /// The lens distorts otherwise than configured. Figure: the error of its radial distortion k1.
     Lens,
+    /// The camera takes another time from its first row to its last than configured. Figure: that time, s.
+    Readout,
     /// The receiver's antenna is elsewhere than configured. Figure: by how much, m.
     AntennaPlace,
     /// The times of validity of its measurements are earlier than their stamps. Figure: by how much, s.

@@ -62,6 +62,8 @@ pub(crate) fn target_point(
 pub(crate) struct Moment {
     /// `τ`, s.
     pub(crate) after_s: f64,
+    /// `s`.
+    share: f64,
     /// `π̇`, px/s.
     flow: Vector2<f64>,
 }
@@ -77,7 +79,7 @@ impl Moment {
     ) -> Self {
         let share = px.y / (models.image_px.1 - 1.0) - 0.5;
         let flow = view.d_point * (velocity - own.velocity) + view.d_attitude * (own.rotation() * own.rate);
-        Self { after_s: share * models.readout_s, flow }
+        Self { after_s: share * (models.readout_s + own.readout_s), share, flow }
     }
 }
 
@@ -89,6 +91,7 @@ pub(crate) struct CameraColumns {
     attitude: Columns<3>,
     rate: Columns<3>,
     lens: Columns<4>,
+    readout: Columns<1>,
 }
 
 impl CameraColumns {
@@ -100,6 +103,7 @@ impl CameraColumns {
             attitude: z.touch(own::ATTITUDE),
             rate: z.touch(own::RATE),
             lens: z.touch(own::LENS),
+            readout: z.touch(own::READOUT),
         }
     }
 
@@ -121,6 +125,7 @@ impl CameraColumns {
         z.set(2 * i, self.position, &-view.d_point);
         z.set(2 * i, self.velocity, &(view.d_point * -after_s));
         z.set(2 * i, self.attitude, &view.d_attitude);
+        z.set(2 * i, self.readout, &(moment.flow * moment.share));
         z.set(2 * i, self.lens, &view.d_lens);
         z.set(2 * i, self.rate, &(view.d_attitude * own.rotation() * after_s));
         for r in 0..2 {
