@@ -216,7 +216,7 @@ fn place(full: &FloatImage, corners: Corners, columns: usize, window_px: f64) ->
 
 /// Leaves out inner corners that do not lie between their neighbours: the edge of a shadow or a glint
 /// drew them aside. Corners along the border of the board have no neighbours to tell.
-fn without_strays(corners: Corners, columns: usize) -> Corners {
+pub(super) fn without_strays(corners: Corners, columns: usize) -> Corners {
     let rows = corners.len() / columns;
     let at = |c: i64, r: i64| {
         let inside = c >= 0 && r >= 0 && c < columns as i64 && r < rows as i64;
@@ -272,7 +272,7 @@ fn to_nearest(corners: &Corners, columns: usize, k: usize) -> f64 {
 mod tests {
     use super::*;
     use crate::drawn_board::{DrawnBoard, Shadow};
-    use windhover_base::geo::{CameraModel, rot_z};
+    use windhover_base::geo::{CameraModel, LensModel, rot_z};
 
     fn camera() -> CameraModel {
         CameraModel {
@@ -280,6 +280,7 @@ mod tests {
             fy: 605.0,
             cx: 330.0,
             cy: 236.0,
+            model: LensModel::Brown,
             distortion: [-0.22, 0.06, 0.001, -0.0005, 0.0],
             skew: 0.0,
         }

@@ -173,10 +173,10 @@ impl Detector {
         if sides.iter().any(|s| !(1..=LARGEST_IMAGE_PX).contains(s)) {
             return;
         }
-        if self.families.iter().any(|f| !f.inverted) {
+        if self.families.iter().any(|f| !f.in_negative) {
             self.search(image, rim, false);
         }
-        if self.families.iter().any(|f| f.inverted) {
+        if self.families.iter().any(|f| f.in_negative) {
             let mut negative = std::mem::take(&mut self.negative);
             negate(image, &mut negative);
             self.search(negative.view(), rim, true);
@@ -329,7 +329,7 @@ impl Detector {
             tried.push((n, quad));
             // Of a small tag a side may be drawn to what is beside it: then as it was.
             let tag = [straight, in_frame].iter().find_map(|quad| {
-                let mut families = families.iter().filter(|f| f.inverted == inverted);
+                let mut families = families.iter().filter(|f| f.in_negative == inverted);
                 families.find_map(|f| decode(image, pyramid, quad, f, refiner))
             });
             found.extend(tag);

@@ -162,13 +162,30 @@ fn over_exposed_tags_are_found_and_their_corners_are_where_the_print_has_them() 
 
 #[test]
 fn a_border_of_two_cells_is_a_layout_and_is_not_taken_for_one_of_one() {
-    let wide = TagLayout { family: TagFamily::Tag36h11, border: 2 };
+    let wide = TagLayout { border: 2, ..TagFamily::Tag36h11.into() };
     for (edge, turn) in [(40.0, 0.3), (70.0, 1.1), (110.0, -0.4)] {
         let scene = Scene { layout: wide, edge, turn, ..Scene::default() };
         scene.assert_found(&SIZES, 0.2, &format!("{edge} px"));
         for min_px in SIZES {
             let found = scene.detect(TagFamily::Tag36h11.into(), min_px);
             assert_eq!(found, [], "{edge} px taken for a border of one cell, from {min_px} px");
+        }
+    }
+}
+
+#[test]
+fn mirrored_and_inverted_tags_are_layouts_and_found_as_no_other() {
+    for family in [TagFamily::Tag36h11, TagFamily::Tag41h12, TagFamily::Aruco5x5N50, TagFamily::Tag48h12] {
+        let ways = [(false, false), (true, false), (false, true), (true, true)];
+        for (mirrored, inverted) in ways {
+            let layout = TagLayout { mirrored, inverted, ..family.into() };
+            let scene = Scene { layout, edge: 60.0, turn: 0.6, tilt: 0.3, ..Scene::default() };
+            let name = format!("{} mirrored {mirrored} inverted {inverted}", family.name());
+            scene.assert_found(&SIZES, 0.25, &name);
+            for (mirrored, inverted) in ways.into_iter().filter(|way| *way != (mirrored, inverted)) {
+                let other = TagLayout { mirrored, inverted, ..layout };
+                assert_eq!(scene.detect(other, 12.0), [], "{name}, taken for {other:?}");
+            }
         }
     }
 }
