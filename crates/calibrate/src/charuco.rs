@@ -45,7 +45,9 @@ pub enum CharucoError {
         tags: usize,
     },
     /// The tags do not lie as on this board.
-    #[error("the tags seen do not lie as on this board: are --board, --square-m, --tag-m and --family right?")]
+    #[error(
+        "the tags seen do not lie as on this board: are --board, --square-m, --tag-m and --family right?"
+    )]
     OtherBoard,
 }
 
@@ -67,9 +69,9 @@ impl CharucoBoard {
     /// white, as OpenCV drew boards with an even number of rows before its version 4.6.
     pub fn squares(&self, first_white: bool) -> impl Iterator<Item = (usize, usize)> {
         let (across, down) = (self.columns + 1, self.rows + 1);
-        (0..across * down).map(move |k| (k % across, k / across)).filter(move |(x, y)| {
-            ((x + y) % 2 == 0) == first_white
-        })
+        (0..across * down)
+            .map(move |k| (k % across, k / across))
+            .filter(move |(x, y)| ((x + y) % 2 == 0) == first_white)
     }
 
     /// The inner corners seen, with their places on the board (x right, y down, origin at the first inner corner), each in a
@@ -122,7 +124,8 @@ impl CharucoBoard {
     fn tag_corners(&self, (x, y): (usize, usize)) -> [Vector2<f64>; 4] {
         let margin = 0.5 * (self.square_m - self.tag_m);
         let origin = Vector2::new(x as f64, y as f64) * self.square_m + Vector2::repeat(margin);
-        [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)].map(|(x, y)| origin + Vector2::new(x, y) * self.tag_m)
+        [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
+            .map(|(x, y)| origin + Vector2::new(x, y) * self.tag_m)
     }
 
     /// Every inner corner beside a tag that is seen.

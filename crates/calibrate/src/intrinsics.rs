@@ -188,7 +188,8 @@ mod tests {
 
     #[test]
     fn exact_corners_give_the_exact_camera() {
-        let found = calibrated(&exact(&boards()), Wanted { model: LensModel::Brown, k3: true, skew: true }).expect("tilted boards");
+        let found = calibrated(&exact(&boards()), Wanted { model: LensModel::Brown, k3: true, skew: true })
+            .expect("tilted boards");
         for (got, want) in figures(&found.camera).iter().zip(figures(&camera())) {
             assert!((got - want).abs() < 1e-5 * want.abs().max(1.0), "{got} {want}");
         }
@@ -274,11 +275,13 @@ mod tests {
     }
 
     fn is_the_camera(found: &Intrinsics) {
-        for (k, (got, want)) in
-            figures(&found.camera).iter().zip(figures(&camera())).enumerate().take(8)
-        {
+        for (k, (got, want)) in figures(&found.camera).iter().zip(figures(&camera())).enumerate().take(8) {
             let sigma = found.sigma[k];
-            assert!((got - want).abs() < 4.0 * sigma, "{}: {got} {want} {sigma}", parameters(LensModel::Brown)[k]);
+            assert!(
+                (got - want).abs() < 4.0 * sigma,
+                "{}: {got} {want} {sigma}",
+                parameters(LensModel::Brown)[k]
+            );
         }
     }
 

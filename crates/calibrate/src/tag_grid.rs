@@ -138,7 +138,15 @@ mod tests {
 
     fn camera() -> CameraModel {
         let distortion = [-0.2, 0.05, 0.0005, -0.0005, 0.0];
-        CameraModel { fx: 640.0, fy: 636.0, cx: 324.0, cy: 238.0, model: LensModel::Brown, distortion, skew: 0.0 }
+        CameraModel {
+            fx: 640.0,
+            fy: 636.0,
+            cx: 324.0,
+            cy: 238.0,
+            model: LensModel::Brown,
+            distortion,
+            skew: 0.0,
+        }
     }
 
     /// Whether the sheet is dark at a point; numbers count from the bottom row up with `from_below`.
@@ -195,7 +203,8 @@ mod tests {
         // When the camera is calibrated with them.
         let views: Vec<PlaneView> = photos.iter().map(|p| GRID.find(p.view()).expect("tags")).collect();
         let found =
-            calibrate(&views, 640.0, 480.0, Wanted { model: LensModel::Brown, k3: false, skew: false }).expect("tilted enough");
+            calibrate(&views, 640.0, 480.0, Wanted { model: LensModel::Brown, k3: false, skew: false })
+                .expect("tilted enough");
         // Then it is found within its own sigmas.
         assert!(views[4].px.len() < views[0].px.len(), "the last is partly outside");
         let truth = camera();

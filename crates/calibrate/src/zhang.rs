@@ -59,8 +59,15 @@ fn normalised(points: &[Vector2<f64>]) -> Option<(Matrix3<f64>, Vec<Vector2<f64>
 pub fn starts(homographies: &[Matrix3<f64>], width: f64, height: f64) -> Vec<CameraModel> {
     let middle = Vector2::new((width - 1.0) / 2.0, (height - 1.0) / 2.0);
     let scale = width.max(height);
-    let guess =
-        CameraModel { fx: scale, fy: scale, cx: middle.x, cy: middle.y, model: LensModel::Brown, distortion: [0.0; 5], skew: 0.0 };
+    let guess = CameraModel {
+        fx: scale,
+        fy: scale,
+        cx: middle.x,
+        cy: middle.y,
+        model: LensModel::Brown,
+        distortion: [0.0; 5],
+        skew: 0.0,
+    };
     let mut found: Vec<CameraModel> = [false, true]
         .into_iter()
         .filter_map(|held| closed_form(homographies, middle, scale, held))
@@ -186,8 +193,15 @@ mod tests {
 
     #[test]
     fn perfect_views_give_the_camera_back() {
-        let camera =
-            CameraModel { fx: 800.0, fy: 820.0, cx: 350.0, cy: 220.0, model: LensModel::Brown, distortion: [0.0; 5], skew: 0.0 };
+        let camera = CameraModel {
+            fx: 800.0,
+            fy: 820.0,
+            cx: 350.0,
+            cy: 220.0,
+            model: LensModel::Brown,
+            distortion: [0.0; 5],
+            skew: 0.0,
+        };
         let poses = [(0.3, 0.2, 0.1), (-0.4, 0.5, 0.2), (0.1, -0.5, 0.4)].map(|(a, b, c)| PlanePose {
             rotation: ned_from_body_321(a, b, c),
             translation: Vector3::new(-0.1, -0.05, 0.5),

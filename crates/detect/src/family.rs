@@ -77,8 +77,9 @@ impl Family {
     /// The tables of a family; `max_hamming` is cut to what the family allows.
     pub fn new(layout: TagLayout, max_hamming: u8) -> Self {
         let TagLayout { family, border, mirrored, inverted } = layout;
-        let &FamilySpec { border: square, pad, form, inverted: set_is_dark, correctable: limit, codes, .. } =
-            family.spec();
+        let &FamilySpec {
+            border: square, pad, form, inverted: set_is_dark, correctable: limit, codes, ..
+        } = family.spec();
         let border = usize::from(border.max(1));
         let width = square + 2 * (border - 1);
         let mut cells = data_cells(width, pad, border as i32, form);
@@ -135,8 +136,9 @@ impl Family {
     pub fn find(&self, grid: &[bool]) -> Option<Word> {
         let mut best: Option<Word> = None;
         for (turns, order) in self.turned.iter().enumerate() {
-            let word =
-                order.iter().fold(0, |word, &i| word << 1 | u64::from(grid[usize::from(i)] != self.set_is_dark));
+            let word = order
+                .iter()
+                .fold(0, |word, &i| word << 1 | u64::from(grid[usize::from(i)] != self.set_is_dark));
             if let Some((id, hamming)) = self.index.nearest(word, self.codes)
                 && best.is_none_or(|b| hamming < b.hamming)
             {

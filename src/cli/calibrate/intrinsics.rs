@@ -12,8 +12,8 @@ use crate::io::new_file::Inputs;
 use crate::pixels;
 use crate::plot;
 use crate::plot::intrinsics::{coverage_advice, coverage_svg, per_view_svg, residuals_svg};
-use windhover_base::msg::GrayImage;
 use windhover_base::geo::{CameraModel, LensModel};
+use windhover_base::msg::GrayImage;
 use windhover_calibrate::intrinsics::{Intrinsics, Wanted, calibrate, parameters};
 use windhover_calibrate::{PlaneView, WINDOW_PX, find_corners};
 

@@ -54,7 +54,9 @@ impl TargetArgs {
             }
             (Some(square_m), Some(tag_m), None) => {
                 if tag_m >= square_m {
-                    return Err(CliError::usage("--tag-m must be less than --square-m: tags lie inside squares"));
+                    return Err(CliError::usage(
+                        "--tag-m must be less than --square-m: tags lie inside squares",
+                    ));
                 }
                 let board = CharucoBoard { family: self.family, columns, rows, square_m, tag_m };
                 self.check_tags(board.tags())?;

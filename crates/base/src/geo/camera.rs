@@ -269,11 +269,12 @@ mod tests {
 
     #[test]
     fn derivatives_match_differences() {
-        let points = [Vector3::new(2.1, -1.4, 6.0), Vector3::new(9.1, 3.4, 6.0), Vector3::new(1e-9, 0.0, 6.0)];
-        for (camera, point) in
-            [paper_camera(), fisheye()].into_iter().flat_map(|c| points.map(|p| (c, p))).filter(|(c, p)| {
-                c.model == LensModel::Fisheye || p.x < 9.0
-            })
+        let points =
+            [Vector3::new(2.1, -1.4, 6.0), Vector3::new(9.1, 3.4, 6.0), Vector3::new(1e-9, 0.0, 6.0)];
+        for (camera, point) in [paper_camera(), fisheye()]
+            .into_iter()
+            .flat_map(|c| points.map(|p| (c, p)))
+            .filter(|(c, p)| c.model == LensModel::Fisheye || p.x < 9.0)
         {
             let at = camera.project(&point).expect("in front");
             for axis in 0..3 {

@@ -28,6 +28,10 @@ struct Scene {
     noise: f64,
     /// Whether dark squares touch the border's corners, as on Kalibr's sheets.
     squares: bool,
+    /// Where a shadow begins: its direction and how far from the tag's middle, and the share of the light left in it.
+    shade: Option<(Vector2<f64>, f64, f64)>,
+    /// How far motion smears the image along its rows, pixels.
+    motion: f64,
 }
 
 impl Default for Scene {
@@ -46,6 +50,8 @@ impl Default for Scene {
             blur: 0.7,
             noise: 1.5,
             squares: false,
+            shade: None,
+            motion: 0.0,
         }
     }
 }
@@ -93,7 +99,9 @@ impl Scene {
         for k in 0..16 {
             let normal: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(&mut rng));
             let square = [f64::from(k % 4) / 4.0 - 0.375, f64::from(k / 4) / 4.0 - 0.375];
-            let at = Vector2::new(self.blur * normal[0] + square[0], self.blur * normal[1] + square[1]);
+            let along = ((f64::from(k) + 0.5) / 16.0 - 0.5) * self.motion;
+            let at =
+                Vector2::new(self.blur * normal[0] + square[0] + along, self.blur * normal[1] + square[1]);
             kernel.extend([at, -at]);
         }
         let (width, height) = self.size;
@@ -104,7 +112,11 @@ impl Scene {
                 .iter()
                 .map(|k| {
                     let p = back * (at + k).push(1.0);
-                    self.light(&pattern, p.x / p.z, p.y / p.z)
+                    let shaded = |(towards, off, _): &(Vector2<f64>, f64, f64)| {
+                        towards.dot(&(at + k - self.middle)) > *off
+                    };
+                    let share = self.shade.filter(shaded).map_or(1.0, |s| s.2);
+                    share * self.light(&pattern, p.x / p.z, p.y / p.z)
                 })
                 .sum();
             let grain: f64 = StandardNormal.sample(&mut rng);
@@ -232,6 +244,44 @@ fn tags_of_every_family_are_found() {
             scene.assert_found(&[12.0], 0.35, &format!("{}, {edge} px", family.name()));
         }
     }
+}
+
+/// Whatever is found from 12 px on is found from 16 and 24 px on where it is larger: tags half in shadow, smeared, seen
+/// aslant, beside squares that touch them.
+#[test]
+fn a_size_asked_for_loses_no_larger_tag() {
+    let mut rng = ChaCha8Rng::seed_from_u64(21);
+    let mut compared = 0;
+    for k in 0..48 {
+        let direction: f64 = rng.random_range(0.0..std::f64::consts::TAU);
+        let shade = (Vector2::new(direction.cos(), direction.sin()), rng.random_range(-12.0..12.0), 0.35);
+        let scene = Scene {
+            size: (300, 240),
+            middle: Vector2::new(rng.random_range(110.0..190.0), rng.random_range(90.0..150.0)),
+            edge: rng.random_range(30.0..80.0),
+            turn: rng.random_range(0.0..std::f64::consts::TAU),
+            tilt: if k % 4 == 3 { rng.random_range(0.9..1.25) } else { rng.random_range(0.0..0.6) },
+            white: rng.random_range(120.0..230.0),
+            ground: rng.random_range(35.0..90.0),
+            blur: rng.random_range(0.6..1.2),
+            noise: rng.random_range(1.5..6.0),
+            motion: if k % 4 == 1 { rng.random_range(2.0..5.0) } else { 0.0 },
+            shade: (k % 4 == 0).then_some(shade),
+            squares: k % 4 == 2,
+            ..Scene::default()
+        };
+        let image = scene.draw(k);
+        let found = |min_px: f64| -> Option<TagDetection> {
+            let mut detector = Detector::new(&[scene.layout], Limits { min_px, max_hamming: 2 });
+            detector.detect(image.view()).first().copied()
+        };
+        let Some(tag) = found(12.0) else { continue };
+        for min_px in [16.0, 24.0].into_iter().filter(|px| 1.1 * px < tag.size_px) {
+            compared += 1;
+            assert!(found(min_px).is_some(), "{k}, seed 21: {:.1} px, not from {min_px} px on", tag.size_px);
+        }
+    }
+    assert!(compared > 70, "only {compared} comparisons, seed 21");
 }
 
 #[test]
