@@ -225,11 +225,20 @@ pub(super) fn without_strays(corners: Corners, columns: usize) -> Corners {
     let between = |c: i64, r: i64, step: (i64, i64)| {
         let neighbour = |k: i64| at(c + k * step.0, r + k * step.1);
         let (before, after) = (neighbour(-1)?, neighbour(1)?);
-        // The cubic through four neighbours follows perspective and distortion; the line through two
-        // follows less.
+        // A cubic through four neighbours follows perspective and distortion, beside the board's edge too; through three a
+        // parabola follows most of it, and the line through two less.
+        let one_sided = |near: Vector2<f64>,
+                         next: Vector2<f64>,
+                         beyond: Option<Vector2<f64>>,
+                         far: Vector2<f64>| match beyond {
+            Some(beyond) => (near * 6.0 - next * 4.0 + beyond + far) / 4.0,
+            None => near - (next - far) / 3.0,
+        };
         Some(match (neighbour(-2), neighbour(2)) {
             (Some(first), Some(last)) => ((before + after) * 4.0 - first - last) / 6.0,
-            _ => (before + after) / 2.0,
+            (None, Some(last)) => one_sided(after, last, neighbour(3), before),
+            (Some(first), None) => one_sided(before, first, neighbour(-3), after),
+            (None, None) => (before + after) / 2.0,
         })
     };
     let stays = |k: usize, p: Vector2<f64>| {
@@ -320,6 +329,38 @@ mod tests {
         // Where the shadow's edge runs through a corner itself, it may be left out.
         assert!(found.iter().flatten().count() >= 50);
         assert!(worst(&found, &drawn.corners()) < 0.2, "{}", worst(&found, &drawn.corners()));
+    }
+
+    /// Boards that fill most of a lens of 130°, squares at the rim a third as wide as those in the middle.
+    #[test]
+    fn whole_boards_that_fill_a_wide_lens_are_found() {
+        let fisheye = CameraModel {
+            fx: 262.0,
+            fy: 262.0,
+            model: LensModel::Fisheye,
+            distortion: [-0.02, 0.004, 0.0, 0.0, 0.0],
+            ..camera()
+        };
+        let barrel =
+            CameraModel { fx: 330.0, fy: 330.0, distortion: [-0.26, 0.085, 0.0, 0.0, -0.012], ..camera() };
+        for (lens, distance) in [(fisheye, 0.075), (fisheye, 0.1), (barrel, 0.13), (barrel, 0.16)] {
+            for (turn, pitch, roll) in
+                [(0.0, 0.0, 0.0), (0.1, 0.2, -0.1), (-0.15, -0.15, 0.25), (3.1, 0.1, 0.2)]
+            {
+                let drawn =
+                    DrawnBoard::new(lens, (640, 480), (9, 6), 0.025).posed(turn, pitch, roll, distance);
+                let truth = drawn.corners();
+                let is_inside = |p: &&Vector2<f64>| p.x > 8.0 && p.y > 8.0 && p.x < 631.0 && p.y < 471.0;
+                if truth.iter().filter(is_inside).count() < 54 {
+                    continue;
+                }
+                let name = format!("{:?} at {distance} m, {turn} {pitch} {roll}", lens.model);
+                let found = find_corners(drawn.image(None).view(), 9, 6, WINDOW_PX);
+                let found = found.unwrap_or_else(|e| panic!("{name}: {e}"));
+                assert!(found.iter().flatten().count() >= 52, "{name}: {}", found.iter().flatten().count());
+                assert!(worst(&found, &truth) < 0.35, "{name}: {}", worst(&found, &truth));
+            }
+        }
     }
 
     #[test]

@@ -54,6 +54,9 @@ const BUSY_SHARE: f32 = 0.3;
 /// Share of an image that is looked at more closely because nowhere else there is as much contrast.
 const STRONGEST_SHARE: f32 = 0.05;
 
+/// And no fewer tiles than a tag of some fifty pixels of its level has, however small the image is.
+const STRONGEST_TILES: u32 = 256;
+
 /// Share of an image with the contrast of print in clear air below which weak contrast is what there is.
 const HAZY_SHARE: f32 = 0.05;
 
@@ -143,9 +146,9 @@ impl Binariser {
         let mut tiles = [0u32; 256];
         self.relative.iter().for_each(|&r| tiles[usize::from(r)] += 1);
         let from = |r: u8| tiles[usize::from(r)];
-        // The least contrast, above `floor`, of a share of the image; `least` at most.
-        let of_share = |share: f32, mut least: u8, floor: u8| {
-            let budget = (share * self.wide_low.len() as f32) as u32;
+        let share = |share: f32| (share * self.wide_low.len() as f32) as u32;
+        // The least contrast, `floor` or more, with which no more tiles than `budget` count; at most `least`.
+        let of_tiles = |budget: u32, mut least: u8, floor: u8| {
             let mut passed = (least..=u8::MAX).map(from).sum::<u32>();
             while least > floor && passed + from(least - 1) <= budget {
                 least -= 1;
@@ -153,8 +156,8 @@ impl Binariser {
             }
             least
         };
-        let least = of_share(BUSY_SHARE, ENOUGH_RELATIVE, CLEAR_RELATIVE);
-        let strongest = of_share(STRONGEST_SHARE, u8::MAX, least);
+        let least = of_tiles(share(BUSY_SHARE), ENOUGH_RELATIVE, CLEAR_RELATIVE);
+        let strongest = of_tiles(share(STRONGEST_SHARE).max(STRONGEST_TILES), u8::MAX, least);
         let dim = tiles[1..usize::from(least)].iter().sum::<u32>();
         let clear = tiles[usize::from(CLEAR_RELATIVE)..].iter().sum::<u32>();
         [self.dim_share, self.clear_share] =
