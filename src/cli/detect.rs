@@ -37,10 +37,10 @@ pub(super) struct Args {
     /// Smallest edge of a tag's black square that is looked for, pixels
     #[arg(long, value_name = "N", default_value_t = 16.0, value_parser = min_px)]
     min_px: f64,
-    /// Most wrong bits corrected; families with few bits correct fewer
+    /// Most wrong bits that are corrected; families with few bits correct fewer
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u8).range(0..=3))]
     max_hamming: u8,
-    /// One JSON object an image on standard output; its `ms` is the processor time that detection took
+    /// One JSON object for each image on standard output; its `ms` is the processor time of the detection
     #[arg(long)]
     json: bool,
 }

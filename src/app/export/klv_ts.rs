@@ -1,4 +1,5 @@
-//! Video with its metadata: H.264 in an MPEG transport stream, with a packet of KLV a frame (MISB ST 0601, 0903, 0604).
+//! Video with its metadata: H.264 in an MPEG transport stream, with one KLV packet for each frame (MISB ST 0601, 0903,
+//! 0604).
 
 use std::collections::BTreeMap;
 use std::io::{BufWriter, Write as _};
@@ -24,19 +25,19 @@ use windhover_base::msg::{EventBody, FramePayload};
 use windhover_base::settings::CameraConfig;
 use windhover_base::time::{MonoTime, NS_PER_S};
 
-/// Its file, and what that says near its begin.
+/// Its file, and the generator's name near the start of the file.
 pub(super) const FILE: (&str, &str) = ("flight.ts", "windhover");
 
-/// The ground farther away than this is not told of, metres.
+/// Ground farther away than this is not reported, metres.
 const FARTHEST_M: f64 = 5_000.0;
 /// The first frame is shown at this time of the stream, ticks of 90 kHz.
 const FIRST_PTS: u64 = 90_000;
-/// A slower vehicle is said to stand.
+/// Below this speed a vehicle is reported as stationary.
 const STANDS_MPS: f64 = 0.1;
-/// Frames a second where no configuration tells.
+/// Frames a second where no configuration gives a rate.
 const FPS: f64 = 15.0;
 
-/// What is known of the frames before the first of them is encoded.
+/// What is known about the frames before the first one is encoded.
 #[derive(Default)]
 struct Known {
     own: BTreeMap<u32, Ownship>,
@@ -80,7 +81,9 @@ impl Known {
         }
         known.warnings = reader.take_warnings();
         if known.utc_minus_host_ns.is_none() {
-            known.warnings.push("the receiver never told the date: the packets' times are the host's".into());
+            known
+                .warnings
+                .push("the receiver never reported the date: times of the packets are the host's".into());
         }
         known
     }
@@ -124,15 +127,16 @@ impl Pose<'_> {
         self.datum.geodetic(&point.ned_m)
     }
 
-    /// Where a place is in the image, if it is in front of the camera.
+    /// The pixel of a place, if it is in front of the camera.
     fn pixel(&self, ned: &Vector3<f64>) -> Option<(f64, f64)> {
         let seen = self.ned_from_camera.inverse() * (ned - self.at_ned);
         self.lens.project(&seen).map(|projection| (projection.px.x, projection.px.y))
     }
 }
 
-/// Azimuth, elevation and roll of a sensor whose axes are the optical one, image right, image down: the angles of
-/// Rz(azimuth) Ry(elevation) Rx(roll). Straight down, where azimuth and roll turn alike, all of it is azimuth.
+/// Azimuth, elevation and roll of a sensor whose axes are the optical axis, image right, image down: the angles of
+/// Rz(azimuth) Ry(elevation) Rx(roll). Straight down, where azimuth and roll are not separable, all of the rotation is
+/// azimuth.
 fn relative_deg(body_from_camera: &Rotation3<f64>) -> [f64; 3] {
     let axes = [Vector3::z(), Vector3::x(), Vector3::y()].map(|axis| body_from_camera * axis);
     let body_from_sensor = Rotation3::from_basis_unchecked(&axes);
@@ -159,7 +163,7 @@ fn field_deg(camera: &CameraConfig) -> Option<[f64; 2]> {
     Some([across, down])
 }
 
-/// What the packets of a frame tell.
+/// The content of a frame's packets.
 fn view(
     frame: u32,
     t: MonoTime,
@@ -188,7 +192,7 @@ fn view(
         let lever = camera.map_or(Vector3::zeros(), |camera| camera.mount.position());
         let at_ned = Vector3::new(own.north_m, own.east_m, own.down_m) + ned_from_body * lever;
         view.sensor = Some(datum.geodetic(&at_ned));
-        // Level ground at the height of a vehicle that is seen, else at the datum's.
+        // Level ground at the height of a visible vehicle, else at the datum's height.
         let down_m = targets.first().map_or(0.0, |target| datum.ned(place(target)).z);
         pose = camera.map(|camera| Pose {
             datum,
@@ -240,7 +244,7 @@ fn seen(s: &TargetState, id: u32, pose: Option<&Pose<'_>>) -> SeenTarget {
     SeenTarget { id, life, pixel, lat_deg, lon_deg, height_m, place_sigma, velocity_mps, velocity_sigma }
 }
 
-/// One-sigma of east and north, and their correlation, of two variances and a covariance.
+/// One sigma of east and north, and their correlation, from two variances and a covariance.
 fn sigmas(ee: f64, nn: f64, en: f64) -> (f64, f64, f64) {
     let (east, north) = (ee.max(0.0).sqrt(), nn.max(0.0).sqrt());
     let correlation = if east * north > 0.0 { (en / (east * north)).clamp(-1.0, 1.0) } else { 0.0 };
@@ -251,7 +255,7 @@ pub(super) fn export(flight: &Path, reader: McapReader, out: &Path) -> Result<Ex
     let config = attached_config(flight)?.and_then(|text| Config::parse(&text).ok());
     let mut known = Known::read(reader, config.as_ref());
     known.mission = flight.file_stem().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
-    // A camera is known by its lens and mount.
+    // The configuration gives the camera's lens and mount.
     let camera = config.as_ref().and_then(|config| toml::to_string(&config.camera).ok()).unwrap_or_default();
     known.core_id = core_id(&camera).to_vec();
     let path = out.join(FILE.0);
@@ -274,7 +278,7 @@ pub(super) fn export(flight: &Path, reader: McapReader, out: &Path) -> Result<Ex
     if unusable > 0 {
         exported
             .warnings
-            .push(format!("{unusable} frames cannot be decoded, or are of another size: left out"));
+            .push(format!("{unusable} frames cannot be decoded or have another size: they are left out"));
     }
     let file = file.ok_or_else(|| ExportError::NoFrames { path: flight.to_owned() })?;
     let whole = file.into_inner().map_err(|error| error.into_error()).and_then(NewFile::finish);
@@ -283,7 +287,7 @@ pub(super) fn export(flight: &Path, reader: McapReader, out: &Path) -> Result<Ex
     Ok(exported)
 }
 
-/// The film in the making.
+/// The video being written.
 struct Film<'a> {
     known: &'a Known,
     config: Option<&'a Config>,
@@ -301,7 +305,7 @@ struct Stream {
 }
 
 impl Film<'_> {
-    /// The bytes of a frame: tables where it can be begun with, its KLV, its picture.
+    /// The bytes of a frame: tables where decoding can start at it, its KLV, its picture.
     fn frame(&mut self, frame: &FramePayload) -> Result<Vec<u8>, ExportError> {
         let Ok(picture) = pixels::decode(frame, true) else {
             self.unusable += 1;

@@ -27,7 +27,7 @@ pub(super) struct TargetArgs {
     family: TagFamily,
 }
 
-/// The same, sorted out.
+/// The same, as one value.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Target {
     /// A chessboard.

@@ -36,10 +36,10 @@ pub struct CameraModel {
     /// What the distortion's terms mean.
     #[serde(default)]
     pub model: LensModel,
-    /// k1, k2, p1, p2, k3; of a fisheye k1, k2, k3, k4 and nought. Written, four terms or five.
+    /// k1, k2, p1, p2, k3; of a fisheye k1, k2, k3, k4 and zero. Configured as four terms or five.
     #[serde(default, deserialize_with = "four_or_five")]
     pub distortion: [f64; 5],
-    /// Bouguet's α: how far the pixel axes are from square.
+    /// Bouguet's α: the skew of the pixel axes.
     #[serde(default)]
     pub skew: f64,
 }
@@ -131,7 +131,7 @@ impl CameraModel {
             let step = jacobian.try_inverse()? * (distorted - at);
             m += step;
             if step.norm_squared() < 1e-24 {
-                // A root across the fold is no answer: the map must keep its orientation.
+                // A root beyond the fold is not a solution: the map must keep its orientation.
                 let ok = jacobian.determinant() > 0.0 && jacobian[(0, 0)] > 0.0;
                 return ok.then_some(m);
             }
