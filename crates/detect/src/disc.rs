@@ -5,7 +5,6 @@ use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
 use super::binarise::{Binariser, Bitmap, Where};
 use super::components::{Component, Labeller, Outline, Touch};
-use super::disc_arcs::{Arcs, Circle};
 use super::quad::bilinear;
 use super::simd::Simd;
 use windhover_base::msg::ImageView;
@@ -33,23 +32,8 @@ const LEAST_AXES: f64 = 0.5;
 /// Rays from the centre along which the rim is looked for.
 const RAYS: usize = 48;
 
-/// Rays that must meet the rim, and most between two that do: a disc half hidden has no centre to give, but a strip of
-/// its own colour or a shadow's edge may lie across the rim.
-const LEAST_RAYS: usize = 38;
-const WIDEST_GAP: usize = 7;
-
-/// Rays along which the outer half of the disc is as light as its rim, and by how much it may differ, over the step at the
-/// rim: paint is even, but for a shadow's edge; stones are not.
-const LEAST_EVEN: usize = 30;
-const UNEVEN: f64 = 0.35;
-
-/// Where between the local minimum and maximum dark and light are divided, of 256. Where a shadow's edge crosses the
-/// rim, what is in the light joins a dark disc's ground to the disc but for the low one, and parts a light disc but for
-/// the high one.
-const FRACTIONS: [u16; 3] = [128, 72, 190];
-
-/// Longest side of a region over the largest disc looked for, where several discs and strips are one region.
-const MOST_JOINED: f64 = 6.0;
+/// Rays that must meet the rim: a disc half hidden or cut by a shadow has no centre to give.
+const LEAST_RAYS: usize = 42;
 
 /// Finds discs; keeps its buffers.
 #[derive(Clone, Debug)]
@@ -58,7 +42,6 @@ pub(super) struct DiscFinder {
     binariser: Binariser,
     bits: Bitmap,
     labeller: Labeller,
-    arcs: Arcs,
 }
 
 impl DiscFinder {
@@ -69,7 +52,6 @@ impl DiscFinder {
             binariser: Binariser::default(),
             bits: Bitmap::default(),
             labeller: Labeller::default(),
-            arcs: Arcs::default(),
         }
     }
 
@@ -80,46 +62,27 @@ impl DiscFinder {
         }
         let least = sizes.0.max(LEAST_DIAMETER);
         self.binariser.measure(image, (LEAST_STEP, LEAST_STEP), false, self.simd);
-        for fraction in FRACTIONS {
-            // Ground may have as much contrast as a disc: any that is above the gate counts.
-            self.binariser.mark(image, fraction, Where::AboveNoise, &mut self.bits, self.simd);
-            self.find_marked(image, (least, sizes.1), out);
-        }
-    }
-
-    /// Appends the discs among the marked regions of an image.
-    fn find_marked(&mut self, image: ImageView<'_>, sizes: (f64, f64), out: &mut Vec<Blob>) {
+        self.binariser.mark(image, 128, Where::Everywhere, &mut self.bits, self.simd);
         let (width, height) = (image.width, image.height);
         let keep = |c: &Component| {
             let (w, h) = (c.width() as f64, c.height() as f64);
-            let is_inside = c.left > 0
+            let inside = c.left > 0
                 && c.top > 0
                 && usize::from(c.right) + 1 < width
                 && usize::from(c.bottom) + 1 < height;
-            is_inside && w.max(h) + 1.0 >= sizes.0 && w.max(h) <= MOST_JOINED * sizes.1
+            inside
+                && w.max(h) + 1.0 >= least
+                && w.min(h) <= sizes.1 + 2.0
+                && w.min(h) >= LEAST_AXES * 0.9 * w.max(h)
         };
-        let Self { labeller, arcs, bits, simd, .. } = self;
-        labeller.label(bits, Touch::Corners, *simd, keep);
-        let mut add = |rough: &Ellipse| {
-            let is_known = |b: &Blob| (b.center - rough.center).norm() < 0.2 * b.diameter;
-            if out.iter().any(is_known) {
-                return;
-            }
-            if let Some(blob) = refine(image, rough)
-                && (sizes.0..=sizes.1).contains(&blob.diameter)
+        self.labeller.label(&self.bits, Touch::Corners, self.simd, keep);
+        for (component, outline) in self.labeller.kept() {
+            if let Some(rough) = ellipse_of(component, outline)
+                && let Some(blob) = refine(image, &rough)
+                && (least..=sizes.1).contains(&blob.diameter)
                 && !out.iter().any(|b| (b.center - blob.center).norm() < 0.25 * blob.diameter)
             {
                 out.push(blob);
-            }
-        };
-        for (component, outline) in labeller.kept() {
-            match ellipse_of(component, outline) {
-                Some(rough) => add(&rough),
-                // A region that a rim is a part of: half a disc, two that are joined.
-                None => {
-                    let radii = (0.5 * sizes.0, 0.5 * sizes.1);
-                    arcs.find(component, outline, radii, |circle| add(&Ellipse::of_circle(circle)));
-                }
             }
         }
     }
@@ -136,17 +99,6 @@ struct Ellipse {
 }
 
 impl Ellipse {
-    fn of_circle((center, radius): Circle) -> Self {
-        Self { center, shape: Matrix2::identity() / (radius * radius) }
-    }
-
-    /// Signed distance of a point from the rim along the ray from the centre, nearly, pixels.
-    fn residual(&self, p: &Vector2<f64>) -> f64 {
-        let d = p - self.center;
-        let f = (d.transpose() * self.shape * d)[0].max(1e-12).sqrt();
-        (f - 1.0) * d.norm() / f
-    }
-
     /// Distance from the centre to the rim in a direction.
     fn radius(&self, d: Vector2<f64>) -> f64 {
         1.0 / (d.transpose() * self.shape * d)[0].max(1e-9).sqrt()
@@ -185,11 +137,11 @@ fn refine(image: ImageView<'_>, rough: &Ellipse) -> Option<Blob> {
     let mut ellipse = *rough;
     let mut fit = None;
     for _ in 0..3 {
-        let rays = rim(image, &ellipse);
-        if rays.iter().flatten().count() < LEAST_RAYS {
+        let (points, count) = rim(image, &ellipse);
+        if count < LEAST_RAYS {
             return None;
         }
-        let found = fit_conic(&rays, &ellipse)?;
+        let found = fit_conic(&points[..count], &ellipse)?;
         ellipse = found.0;
         fit = Some(found);
     }
@@ -200,7 +152,7 @@ fn refine(image: ImageView<'_>, rough: &Ellipse) -> Option<Blob> {
     let half_axes = [axes[larger], axes[1 - larger]];
     let round = half_axes[1] >= LEAST_AXES * half_axes[0];
     // What is no ellipse leaves residuals that grow with it: a square's are a tenth of its radius.
-    let fits = rms <= 0.15 + 0.02 * half_axes[0] && has_rim(image, &ellipse);
+    let fits = rms <= 0.15 + 0.02 * half_axes[0];
     (round && fits && half_axes[0].is_finite()).then(|| Blob {
         center: ellipse.center,
         cov,
@@ -210,38 +162,12 @@ fn refine(image: ImageView<'_>, rough: &Ellipse) -> Option<Blob> {
     })
 }
 
-/// Whether the rim is where the ellipse has it, but for a few gaps, and the disc is even within it.
-fn has_rim(image: ImageView<'_>, ellipse: &Ellipse) -> bool {
-    let rays = rim(image, ellipse);
-    let is_on = |ray: &Option<Vector2<f64>>| {
-        ray.is_some_and(|p| ellipse.residual(&p).abs() < 0.3 + 0.03 * (p - ellipse.center).norm())
-    };
-    let (mut gap, mut widest) = (0, 0);
-    for ray in rays.iter().chain(&rays) {
-        gap = if is_on(ray) { 0 } else { gap + 1 };
-        widest = widest.max(gap);
-    }
-    let is_even = |p: &Vector2<f64>| {
-        let out = p - ellipse.center;
-        let radius = out.norm();
-        let at = |r: f64| {
-            let q = ellipse.center + out * (r / radius);
-            f64::from(bilinear(image, [q.x as f32, q.y as f32]))
-        };
-        let near = (0.15 * radius).clamp(1.5, 3.0);
-        let (inner, outer) = (at(radius - near), at(radius + near));
-        (at(0.55 * radius) - inner).abs() < UNEVEN * (outer - inner)
-    };
-    let on = rays.iter().filter(|ray| is_on(ray)).count();
-    let even = rays.iter().flatten().filter(|p| is_even(p)).count();
-    on >= LEAST_RAYS && widest <= WIDEST_GAP && even >= LEAST_EVEN
-}
-
 /// Where the image steps from dark to light along rays from the centre.
-fn rim(image: ImageView<'_>, ellipse: &Ellipse) -> [Option<Vector2<f64>>; RAYS] {
+fn rim(image: ImageView<'_>, ellipse: &Ellipse) -> ([Vector2<f64>; RAYS], usize) {
     const HALF: usize = 8;
-    let mut points = [None; RAYS];
-    for (k, point) in points.iter_mut().enumerate() {
+    let mut points = [Vector2::zeros(); RAYS];
+    let mut count = 0;
+    for k in 0..RAYS {
         let (s, c) = (std::f64::consts::TAU * k as f64 / RAYS as f64).sin_cos();
         let d = Vector2::new(c, s);
         let radius = ellipse.radius(d);
@@ -280,22 +206,23 @@ fn rim(image: ImageView<'_>, ellipse: &Ellipse) -> [Option<Vector2<f64>>; RAYS] 
             center += (first / sum).clamp(-half, half);
         }
         if mass > 0.0 && center.abs() < 0.7 * HALF as f64 {
-            *point = Some(ellipse.center + d * (radius + center * spacing));
+            points[count] = ellipse.center + d * (radius + center * spacing);
+            count += 1;
         }
     }
-    points
+    (points, count)
 }
 
 /// Least-squares ellipse through points by Gauss–Newton on radial distances from the one given, with the
 /// RMS of what is left and the covariance of the centre. Cauchy weights: a twig over the rim must not pull.
-fn fit_conic(rays: &[Option<Vector2<f64>>], start: &Ellipse) -> Option<(Ellipse, f64, Matrix2<f64>)> {
+fn fit_conic(points: &[Vector2<f64>], start: &Ellipse) -> Option<(Ellipse, f64, Matrix2<f64>)> {
     let mut ellipse = *start;
     let mut result = None;
     for round in 0..4 {
         let mut information = SMatrix::<f64, 5, 5>::zeros();
         let mut right = SVector::<f64, 5>::zeros();
         let (mut sum, mut weights) = (0.0, 0.0);
-        for p in rays.iter().flatten() {
+        for p in points {
             let d = p - ellipse.center;
             let m = ellipse.shape * d;
             let f = d.dot(&m).max(1e-12).sqrt();
@@ -312,7 +239,7 @@ fn fit_conic(rays: &[Option<Vector2<f64>>], start: &Ellipse) -> Option<(Ellipse,
             let weight = if round == 0 { 1.0 } else { 1.0 / (1.0 + (residual / 0.5).powi(2)) };
             information += row * row.transpose() * weight;
             right -= row * (weight * residual);
-            sum += weight * residual * residual;
+            sum += residual * residual;
             weights += weight;
         }
         // Columns differ by the radius squared; scale before solving.
@@ -325,7 +252,7 @@ fn fit_conic(rays: &[Option<Vector2<f64>>], start: &Ellipse) -> Option<(Ellipse,
         if !(ellipse.shape.determinant() > 0.0 && ellipse.shape[(0, 0)] > 0.0) {
             return None;
         }
-        let rms = (sum / weights).sqrt();
+        let rms = (sum / points.len() as f64).sqrt();
         // Rays share pixels near small discs: count them as half as many; interpolation leaves its own.
         let variance = 2.0 * sum / (weights - 5.0).max(1.0);
         let cov = Matrix2::from_fn(|i, j| inverse[(i, j)] * scale[i] * scale[j]) * variance

@@ -46,9 +46,6 @@ const GATE_SIGMAS: f64 = 4.0;
 /// Ground wanted around a disc, pixels.
 const AROUND_PX: f64 = 12.0;
 
-/// Largest disc looked for, over the frame's shorter side.
-const LARGEST_SHARE: f64 = 0.5;
-
 /// How far a disc's size may be from the predicted one, and a pair's ratio from the configured one.
 const SIZE_SLACK: f64 = 0.25;
 const RATIO_SLACK: f64 = 0.12;
@@ -94,11 +91,9 @@ impl DiscPairs {
         let tracking = prediction.filter(|p| !p.search);
         for i in 0..self.discs.len() {
             if let Some(prediction) = tracking {
-                if let Some(m) = predicted(&self.discs[i], Some(prediction))
-                    && let Some(roi) = roi_of(image, m)
-                {
-                    let sizes = [-1.0, 1.0].map(|sign| (1.0 + sign * SIZE_SLACK) * m.size_px);
-                    self.search(i, image, rgb, roi, sizes.into());
+                let roi = predicted(&self.discs[i], Some(prediction)).and_then(|m| roi_of(image, m));
+                if let Some(roi) = roi {
+                    self.search(i, image, rgb, roi);
                 }
                 continue;
             }
@@ -116,8 +111,7 @@ impl DiscPairs {
                 }
                 None => {
                     let whole = Roi { u: 0, v: 0, width: image.width, height: image.height };
-                    let largest = LARGEST_SHARE * image.width.min(image.height) as f64;
-                    self.search(i, image, rgb, whole, (0.0, largest));
+                    self.search(i, image, rgb, whole);
                 }
             }
         }
@@ -127,18 +121,11 @@ impl DiscPairs {
         }
     }
 
-    /// Looks for what may be a disc in a part of a frame; diameters within `sizes`, pixels.
-    fn search(
-        &mut self,
-        disc: usize,
-        image: ImageView<'_>,
-        rgb: Option<&RgbImage>,
-        roi: Roi,
-        sizes: (f64, f64),
-    ) {
+    fn search(&mut self, disc: usize, image: ImageView<'_>, rgb: Option<&RgbImage>, roi: Roi) {
         let look = self.discs[disc].look;
         self.found.clear();
         let part = image.crop(roi.u, roi.v, roi.width, roi.height);
+        let sizes = (0.0, 0.5 * image.width.min(image.height) as f64);
         match (look, rgb) {
             (Look::Dark, _) => self.finder.find(part, sizes, &mut self.found),
             (Look::Light, _) => {

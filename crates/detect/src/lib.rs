@@ -7,7 +7,6 @@ mod corners;
 mod detection;
 mod detector;
 mod disc;
-mod disc_arcs;
 mod disc_pairs;
 mod disjoint_sets;
 mod edge_points;
