@@ -440,14 +440,16 @@ fn unrefined(corners: &Quad) -> Refined {
     Refined { corners, corner_cov: [cov; 4], center, center_cov: cov / 2.0 }
 }
 
-/// Smallest that one tag inside another may not be, over the outer one: 48h12 leaves two of its ten cells free.
+/// From where on, over the outer one, a tag is no other inside it: 48h12 leaves two of its ten cells free.
 const NESTED: f32 = 0.5;
 
-/// Whether two quadrilaterals are of one tag, the first of one that was found: not one inside it.
+/// Whether two quadrilaterals are of one tag, the first of one that was found: neither one inside it nor one around it.
 fn same_place(a: &Quad, b: &Quad) -> bool {
     let centre = |q: &Quad| [0, 1].map(|k| q.iter().map(|p| p[k]).sum::<f32>() / 4.0);
     let size = |q: &Quad| distance(q[0], q[2]) + distance(q[1], q[3]);
-    distance(centre(a), centre(b)) < 0.2 * distance(a[0], a[2]) && size(b) > NESTED * size(a)
+    distance(centre(a), centre(b)) < 0.2 * distance(a[0], a[2])
+        && size(b) > NESTED * size(a)
+        && size(a) > NESTED * size(b)
 }
 
 fn detection(found: &Found) -> TagDetection {

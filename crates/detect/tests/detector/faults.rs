@@ -30,6 +30,8 @@ struct Scene {
     squares: bool,
     /// Where a shadow begins: its direction and how far from the tag's middle, and the share of the light left in it.
     shade: Option<(Vector2<f64>, f64, f64)>,
+    /// A tag in the free middle of a nested one, over its four cells with all its print.
+    inner: Option<(TagFamily, u32)>,
     /// How far motion smears the image along its rows, pixels.
     motion: f64,
 }
@@ -52,6 +54,7 @@ impl Default for Scene {
             squares: false,
             shade: None,
             motion: 0.0,
+            inner: None,
         }
     }
 }
@@ -75,13 +78,19 @@ impl Scene {
         })
     }
 
-    fn light(&self, pattern: &TagPattern, x: f64, y: f64) -> f64 {
+    fn light(&self, pattern: &TagPattern, inner: Option<&TagPattern>, x: f64, y: f64) -> f64 {
         let cell = 2.0 / pattern.border as f64;
         let half = pattern.side() as f64 / 2.0;
         let far = x.abs().max(y.abs());
         let in_square = self.squares && x.abs().min(y.abs()) > 1.0 && far < 1.0 + 2.4 * cell;
         let (cx, cy) = (x / cell + half, y / cell + half);
         let on_print = cx >= 0.0 && cy >= 0.0 && cx < 2.0 * half && cy < 2.0 * half;
+        if let Some(inner) = inner
+            && (cx - half).abs().max((cy - half).abs()) < 1.0
+        {
+            let cell = |c: f64| ((c - half + 1.0) * 0.5 * inner.side() as f64) as usize;
+            return if inner.white(cell(cx), cell(cy)) { self.white } else { self.black };
+        }
         match on_print {
             _ if in_square => self.black,
             true if pattern.white(cx as usize, cy as usize) => self.white,
@@ -94,6 +103,7 @@ impl Scene {
     fn draw(&self, seed: u64) -> GrayImage {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let pattern = tag_pattern(self.layout, self.id);
+        let inner = self.inner.map(|(family, id)| tag_pattern(family, id));
         let back = self.view().try_inverse().expect("a view has an inverse");
         let mut kernel = Vec::new();
         for k in 0..16 {
@@ -116,7 +126,7 @@ impl Scene {
                         towards.dot(&(at + k - self.middle)) > *off
                     };
                     let share = self.shade.filter(shaded).map_or(1.0, |s| s.2);
-                    share * self.light(&pattern, p.x / p.z, p.y / p.z)
+                    share * self.light(&pattern, inner.as_ref(), p.x / p.z, p.y / p.z)
                 })
                 .sum();
             let grain: f64 = StandardNormal.sample(&mut rng);
@@ -198,6 +208,35 @@ fn mirrored_and_inverted_tags_are_layouts_and_found_as_no_other() {
                 let other = TagLayout { mirrored, inverted, ..layout };
                 assert_eq!(scene.detect(other, 12.0), [], "{name}, taken for {other:?}");
             }
+        }
+    }
+}
+
+#[test]
+fn a_tag_inside_a_tag_is_found_beside_it() {
+    for (family, id) in [(TagFamily::Tag48h12, 11), (TagFamily::Tag36h11, 11)] {
+        let layout = TagFamily::Tag48h12.into();
+        let (size, middle) = ((420, 400), Vector2::new(210.3, 199.6));
+        let scene = Scene {
+            size,
+            middle,
+            layout,
+            edge: 216.0,
+            turn: 0.4,
+            tilt: 0.3,
+            inner: Some((family, id)),
+            ..Scene::default()
+        };
+        let image = scene.draw(1);
+        for min_px in SIZES {
+            let families = [TagFamily::Tag48h12, TagFamily::Tag36h11];
+            let mut detector = Detector::new(&families, Limits { min_px, max_hamming: 2 });
+            let mut ids: Vec<(TagFamily, u32)> =
+                detector.detect(image.view()).iter().map(|t| (t.family, t.id)).collect();
+            ids.sort_unstable();
+            let mut both = [(TagFamily::Tag48h12, 7), (family, id)];
+            both.sort_unstable();
+            assert_eq!(ids, both, "from {min_px} px");
         }
     }
 }
