@@ -39,7 +39,7 @@ def cold_boot(flight):
     flight.kept["whole"] = session
     nothing, (stopped, result) = flight.stop_nothing(), flight.stop_daemon()
     # Where the emulator is too slow to end a `sleep` in a second, a card may be too slow for the end of a flight:
-    # the daemon then says so, and the next start seals it.
+    # the daemon then reports that, and the next start completes it.
     demand(result == "success" or nothing > SLOW_STOP_S, f"stopping ended with {result} after {stopped} s")
     # A scenario that fills the card must not cost this one.
     machine.run(f"windhover store keep {row['flight']}")
@@ -108,8 +108,8 @@ FAULTS = [
     ("wrap_sequence_number=1,inject_fatal_streaming_error=1", None, "wrap_sequence_number=0"),
     # One buffer is refused: whether the stream goes on or begins anew is the driver's matter.
     ("inject_vidioc_qbuf_error=1", None, None),
-    # The stream dies, and the first attempts to begin again fail too. That it went is told twice a minute at
-    # most, that it came always.
+    # The stream ends, and the first attempts to restart it fail too. Its loss is reported twice a minute at most,
+    # its return always.
     ("inject_vidioc_reqbufs_error=1,inject_fatal_streaming_error=1", ["device_up", "about=camera"], None),
     ("inject_vidioc_streamon_error=1,inject_fatal_streaming_error=1", ["device_up", "about=camera"], None),
 ]

@@ -66,7 +66,7 @@ class Ports(unittest.TestCase):
                 head = b"\xc0\x00\x00\x00\x01\x08" if n % 2 else b""
                 for _, to in found:
                     stranger.sendto(head + noise, ("127.0.0.1", to))
-        # Then: it holds no more than before, says next to nothing, and goes on.
+        # Then: it keeps no more memory than before, sends almost nothing, and continues.
         daemon.wait("event=health")
         self.assertLess(resident() - before[0], 16_384, "KiB more than before")
         self.assertLessEqual(tasks(), before[1] + 2)

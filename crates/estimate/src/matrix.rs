@@ -229,9 +229,12 @@ impl Shear {
 pub(crate) fn subtract_rows<const M: usize>(row: &mut [f64], y: &[f64; M], w: &[&[f64]; M]) {
     let w = w.map(|w| &w[..row.len()]);
     for (j, x) in row.iter_mut().enumerate() {
+        // In a register: stored once, not once a component.
+        let mut left = *x;
         for i in 0..M {
-            *x -= y[i] * w[i][j];
+            left -= y[i] * w[i][j];
         }
+        *x = left;
     }
 }
 
