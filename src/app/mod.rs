@@ -10,6 +10,7 @@ pub mod downlink;
 pub mod event_queue;
 pub mod events;
 pub mod export;
+pub mod film;
 pub mod flight;
 pub mod flight_store;
 pub mod geopositions;
