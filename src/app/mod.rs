@@ -40,5 +40,6 @@ pub mod status;
 pub mod supervise;
 pub mod topology;
 pub mod truth;
+pub mod video_task;
 pub mod warm_start;
 mod watch;

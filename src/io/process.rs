@@ -8,6 +8,12 @@ pub fn resident_mb() -> Option<f64> {
     Some(kb * 1024.0 / 1e6)
 }
 
+/// Lowers the priority of the calling thread by so many steps (of 19). Where the system does not allow it, nothing changes.
+pub fn be_nice(steps: i32) {
+    // On Linux it is the thread's own.
+    let _ = rustix::process::nice(steps);
+}
+
 /// The kernel's name for this boot; `None` where /proc does not tell.
 pub fn boot_id() -> Option<String> {
     let id = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok()?;

@@ -7,7 +7,8 @@ mod view;
 pub use known::{Known, is_of_film};
 
 use crate::io::video::{
-    H264Encoder, TransportStream, Unit, VideoError, core_id, sensor_packet, targets_packet, with_time,
+    H264Encoder, TimeStatus, TransportStream, Unit, VideoError, core_id, sensor_packet, targets_packet,
+    with_time,
 };
 use crate::pixels;
 use windhover_base::msg::FramePayload;
@@ -16,6 +17,8 @@ use windhover_base::time::{MonoTime, NS_PER_S};
 
 /// The first frame is shown at this time of the stream, ticks of 90 kHz.
 const FIRST_PTS: u64 = 90_000;
+/// A smaller change of the time between two frames is none, microseconds: the receiver's clock is fitted to less.
+const STEP_US: i64 = 5_000;
 /// Frames a second where no configuration tells.
 const FPS: f64 = 15.0;
 
@@ -35,6 +38,8 @@ struct Stream {
     ts: TransportStream,
     began: MonoTime,
     last_pts: u64,
+    /// Exposure and time of the frame before.
+    last: Option<(MonoTime, u64)>,
     size: (usize, usize),
 }
 
@@ -70,6 +75,7 @@ impl Film {
                 ts: TransportStream::default(),
                 began: frame.t_exposure,
                 last_pts: 0,
+                last: None,
                 size,
             }),
         };
@@ -84,7 +90,9 @@ impl Film {
         view.mission.clone_from(&self.mission);
         view.core_id.clone_from(&self.core_id);
         let targets = targets_packet(view.unix_us, &targets, size_px, view.field_deg, &view.core_id);
-        let unit = with_time(&unit, view.unix_us, self.known.utc_minus_host_ns.is_some());
+        let step_us = stream.step_us(frame.t_exposure, view.unix_us);
+        let status = TimeStatus { is_utc: self.known.utc_minus_host_ns.is_some(), step_us };
+        let unit = with_time(&unit, view.unix_us, status);
         let mut ts = Vec::new();
         stream.ts.before(pts, &mut ts);
         stream.ts.unit(Unit::Klv, pts, &sensor_packet(&view), &mut ts);
@@ -95,6 +103,15 @@ impl Film {
 }
 
 impl Stream {
+    /// By how much a frame's time does not continue that of the frame before, microseconds; what the fit of the receiver's clock moves it
+    /// by is none.
+    fn step_us(&mut self, t: MonoTime, unix_us: u64) -> i64 {
+        let (before, before_us) = self.last.replace((t, unix_us)).unwrap_or((t, unix_us));
+        let step =
+            (unix_us as i64).saturating_sub(before_us as i64).saturating_sub((t - before).ns() / 1_000);
+        if step.abs() < STEP_US { 0 } else { step }
+    }
+
     /// When a frame is shown, ticks of 90 kHz; always later than the one before.
     fn pts(&mut self, t_exposure: MonoTime) -> u64 {
         let since = (t_exposure - self.began).ns().max(0) as u128;

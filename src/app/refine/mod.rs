@@ -1,11 +1,13 @@
 //! The flight afterwards: a recorded flight refined as a whole, and written beside it.
 
 mod adopt;
+mod beside;
 mod outside;
 mod words;
 mod write;
 
 pub use adopt::adopted;
+pub use beside::RefinedBeside;
 pub use words::{ConstantWords, constant_words, source_name};
 
 use std::path::{Path, PathBuf};
