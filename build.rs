@@ -1,4 +1,4 @@
-//! Compiles the protobuf schemas of captures, flights and the link, with no protoc installed.
+//! Compiles the protobuf schemas of captures, flights and the link, without an installed protoc.
 
 use std::path::{Path, PathBuf};
 

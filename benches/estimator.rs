@@ -14,7 +14,7 @@ use windhover_base::time::{FrameClock, MonoTime, Span};
 use windhover_estimate::{Bound, BoundTruth, Estimator, EstimatorOutput, PaperEstimator, Site};
 use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 
-/// What is scored begins here, seconds into the flight.
+/// Scores start here, seconds into the flight.
 const BURN_S: f64 = 6.0;
 
 /// Squared errors of one run.
@@ -92,7 +92,7 @@ impl Score {
     }
 }
 
-/// An estimate beside the truth: each error with its sigma.
+/// An estimate and the truth: each error with its sigma.
 fn line(e: &TargetEstimate, world: &World) -> String {
     let head = format!("{:6.2} target {} {:?}", world.seconds(e.t_valid), e.target, e.status);
     let Some((state, p)) = e.state.as_ref().and_then(|s| Some((s, s.covariance?))) else { return head };
@@ -115,7 +115,7 @@ fn line(e: &TargetEstimate, world: &World) -> String {
     )
 }
 
-/// The truth as the bound takes it.
+/// The truth in the form for the bound.
 fn truth_at(world: &World, t: MonoTime, gps_delay_s: f64) -> BoundTruth {
     let own = world.ownship(t);
     let targets = (0..world.vehicles()).map(|i| {
@@ -136,13 +136,13 @@ fn truth_at(world: &World, t: MonoTime, gps_delay_s: f64) -> BoundTruth {
     }
 }
 
-/// Intensities of motion: a target's speed and yaw rate, the helicopter's rates about its roll and pitch axes
-/// and about its yaw axis, what pushes it beside thrust along its axis, its thrust; units²/s.
+/// Intensities of motion: a target's speed and yaw rate, the helicopter's rates about its roll and pitch axes and about
+/// its yaw axis, forces other than thrust along its axis, its thrust; units²/s.
 type Intensities = [f64; 6];
 
-/// Limits of the scale at which intensities are taken, s.
+/// Limits of the time scale of intensities, s.
 const SCALES_S: (f64, f64) = (0.1, 5.0);
-/// Scale at which the filter learns the motion of the helicopter, and the bound is begun, s.
+/// Time scale at which the filter learns the motion of the helicopter, and at which the bound starts, s.
 const LEARNT_OVER_S: f64 = 0.4;
 
 /// Intensities of the true motion, each by its increments over its own `scale`.
@@ -166,7 +166,7 @@ fn intensities(world: &World, scales_s: &[f64; 6]) -> Intensities {
         });
         sum / f64::max(n, 1.0) / step_s
     };
-    // A vehicle at rest has no intensity at all; a figure must be positive.
+    // A vehicle at rest has intensity zero; a configured value must be positive.
     [
         walk(0, &[0]).max(4e-4),
         walk(1, &[1]).max(1e-4),
@@ -180,7 +180,7 @@ fn intensities(world: &World, scales_s: &[f64; 6]) -> Intensities {
 /// Correlation time of the thrust beyond the weight in the filter's model, s.
 const THRUST_TAU_S: f64 = 2.0;
 
-/// The configuration with these intensities and the true noise figures.
+/// The configuration with these intensities and the true noise.
 fn told_the_truth(world: &World, q: &Intensities) -> (Rig, EstimatorConfig) {
     let scenario = world.scenario();
     let mut rig = scenario.rig.clone();
@@ -220,7 +220,7 @@ impl BoundScore {
         self.variance += covariance.diagonal();
     }
 
-    /// Over how long a filter this good remembers speed and yaw rate: `4/3 P/q`.
+    /// Memory of an optimal filter for speed and yaw rate: `4/3 P/q`.
     fn scales_s(&self, q: &Intensities) -> [f64; 2] {
         let p = [self.variance[3], self.variance[4]].map(|sum| sum / self.frames.max(1.0));
         std::array::from_fn(|i| (4.0 / 3.0 * p[i] / q[i]).clamp(SCALES_S.0, SCALES_S.1))
@@ -233,9 +233,9 @@ impl BoundScore {
     }
 }
 
-/// The bound over a flight: its measurements in order of when they were true. Motion is smoother than a walk,
-/// so the walk that describes it depends on the scale: that of the helicopter is taken over 0.4 s, as the filter
-/// learns it, that of vehicles over the bound's own memory of the component, found by computing it again.
+/// The bound over a flight: its measurements in order of validity. Motion is smoother than a random walk, so the
+/// describing walk depends on the time scale: for the helicopter 0.4 s, as in the filter; for vehicles the bound's own
+/// memory of the component, found by iteration.
 fn bound(world: &Arc<World>, site: &Site) -> Figures {
     let mut suite = SensorSuite::new(Arc::clone(world));
     let delay_s = suite.gps_latency_error().s();
@@ -260,16 +260,16 @@ fn bound(world: &Arc<World>, site: &Site) -> Figures {
     score.figures()
 }
 
-/// The measurements of a flight, when each was true, and what the frames showed.
+/// The measurements of a flight, their times of validity, and the detections of the frames.
 type Taken = Vec<(MonoTime, Sample, Option<FrameObservations>)>;
-/// Times the bound is computed until the scales of the motion fit it.
+/// Iterations of the bound until the time scales agree with it.
 const PASSES: usize = 4;
 
 fn bound_pass(world: &World, site: &Site, told: &(Rig, EstimatorConfig), taken: &Taken) -> BoundScore {
     let mut bound = Bound::new(&told.0, &told.1, site);
     let mut score = BoundScore::default();
     for (t, sample, seen) in taken {
-        // A fix enters where its stamp puts it, with the delay that is to be learnt.
+        // A fix enters at its stamp, with the delay that is to be estimated.
         let truth = truth_at(world, *t, 0.0);
         match sample {
             Sample::Gnss { stamped, .. } => bound.gnss(*t, &stamped.value, &truth),

@@ -1,6 +1,6 @@
-//! What the frames of recorded flights cost the detector: each searched whole, tracked, and tracked with eight ground
-//! features. `cargo bench --bench flights -- CAPTURE…`. A marker is foretold where it was in the frame before, plus
-//! its last step, with a sigma of four pixels. Processor time of the thread, decoding left out.
+//! Cost of the detector on frames of recorded flights: each searched as a whole, tracked, and tracked with eight ground
+//! features. `cargo bench --bench flights -- CAPTURE…`. A marker is predicted at its place in the previous frame plus
+//! its last step, with a sigma of four pixels. Processor time of the thread, without decoding.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ use windhover::pixels::{self, DecodedFrame};
 use windhover_base::msg::{EventBody, FrameObservations, FramePrediction, MarkerDetection, MarkerPrediction};
 use windhover_detect::tracking::FrameDetector;
 
-/// One way to look at the frames of a flight, and what it took.
+/// One way to process the frames of a flight, and its time.
 struct Way {
     name: &'static str,
     track: bool,
@@ -51,7 +51,7 @@ impl Way {
         self.foretell();
     }
 
-    /// What the next frame should show.
+    /// The prediction for the next frame.
     fn foretell(&mut self) {
         self.prediction.markers.clear();
         self.prediction.occupied.clear();

@@ -1,9 +1,9 @@
 //! Proof of the wireless link over an impaired relay: cuts, loss, a line too slow, ten stations, an hour's cut.
 //!
-//! `cargo bench --bench link` runs every case in about seven minutes and prints how late live records were
-//! and whether all arrived once; `cargo bench --bench link -- cut25 slow` runs those named. Beside each case
-//! stands the floor: how late bare UDP datagrams are that are sent 30 times a second through a relay of the
-//! same delay in the same run, which is what machine and harness add.
+//! `cargo bench --bench link` runs every case in about seven minutes and prints the lateness of live records and
+//! whether all arrived once; `cargo bench --bench link -- cut25 slow` runs the named ones. Each case has a floor: the
+//! lateness of bare UDP datagrams at 30 a second through a relay of the same delay in the same run, which is the part
+//! of machine and harness.
 
 #[path = "../tests/link/relay.rs"]
 #[expect(dead_code, reason = "the tests use the rest")]
@@ -29,7 +29,7 @@ fn radio() -> Radio {
     Radio { delay: Duration::from_millis(DELAY_MS as u64), ..Radio::default() }
 }
 
-/// Bare datagrams through a relay, and how late they were, ms beyond its delay.
+/// Bare datagrams through a relay, and their lateness beyond its delay, ms.
 struct Floor {
     late_ms: Arc<Mutex<Vec<f64>>>,
     stopped: Arc<AtomicBool>,
@@ -180,8 +180,8 @@ fn resident() -> usize {
     kib.unwrap_or(0) << 10
 }
 
-/// An hour's cut in simulated time: 31 records a second for an hour as fast as they can be made, a second of
-/// them every millisecond. A card holds everything, memory a part.
+/// An hour's cut in simulated time: 31 records a second for an hour as fast as they can be made, a second of them every
+/// millisecond. The card has all records, memory a part of them.
 async fn hour() {
     const SECONDS: u32 = 3_600;
     const A_SECOND: u32 = 31;

@@ -1,4 +1,4 @@
-//! What the store costs: encoding a frame, committing a second, listing, looking up.
+//! Costs of the store: encoding a frame, committing a second, listing, looking up.
 
 use std::hint::black_box;
 use std::sync::Arc;

@@ -1,18 +1,18 @@
-//! What the daemon costs and how soon it answers, with raw frames at full size and pace.
+//! Costs and latency of the daemon, with raw frames at full size and rate.
 //!
 //! `make load`, or `cargo run --release --example daemon_load -- [--seconds S] [--dir DIR]`
 //!
-//! Simulates a flight once (raw grey, 1280×1024, 30 frames/s), plays it over and over into
-//! `windhover run` - frames from memory, serial lines over pseudo-terminals - with recording on, and prints
-//! exposure to estimate, processor time by task, memory and losses. The flight hovers over a parked vehicle, so
-//! that its end fits its beginning; only the receiver's time jumps back.
+//! Simulates a flight once (raw grey, 1280×1024, 30 frames/s), plays it repeatedly into `windhover run` - frames from
+//! memory, serial lines over pseudo-terminals - with recording on, and prints exposure to estimate, processor time by
+//! task, memory and losses. The flight hovers over a parked vehicle, so that its end fits its beginning; only the
+//! receiver's time jumps back.
 //!
 //! It also prints how long a byte and a frame waited for their stamp: from just before the write into the line, and
-//! from when the frame was due, to the log time in the flight. `--busy N` has N threads compute meanwhile.
+//! from when the frame was due, to the log time in the flight. With `--busy N`, N threads compute meanwhile.
 //!
-//! It runs as the unit runs it: that environment, and that niceness where root asks for it. A bystander that
-//! only sleeps and looks at the clock tells how long the machine itself stood still: a frame that is late while
-//! it slept on is not the daemon's.
+//! The daemon runs in the environment of the unit, and with its niceness where root runs this. A separate thread that
+//! only sleeps and reads the clock shows how long the machine itself stood still: a frame that is late in that time is
+//! not the daemon's fault.
 
 use std::fs::{self, File};
 use std::io::Write;
@@ -41,13 +41,13 @@ struct Args {
     /// Length of the flight that is repeated, seconds
     #[arg(long, default_value_t = 12)]
     flight_s: u64,
-    /// Where flight, frames, card and log go
+    /// Folder for flight, frames, card and log
     #[arg(long, default_value = "target/load")]
     dir: PathBuf,
-    /// Where the frames are played from: a file system in memory, so that no disk makes them late
+    /// Folder from which the frames are played: a file system in memory, so that no disk delays them
     #[arg(long, default_value = "/dev/shm")]
     frames_in: PathBuf,
-    /// Threads that compute all the time beside the daemon
+    /// Threads that compute in parallel to the daemon
     #[arg(long, default_value_t = 0)]
     busy: usize,
     /// The daemon
@@ -77,7 +77,7 @@ fn main() -> Result<()> {
     fs::write(&config, configuration(&flight, &dir, camera.path(), [&gps.1, &compass.1])?)?;
 
     let log = dir.join("log");
-    // `nice` becomes the daemon; without the right to lower it, it says so and runs as it is.
+    // `nice` becomes the daemon; without the right to lower the niceness, it reports that and continues.
     let mut daemon = Command::new("nice")
         .args(["-n", of_unit("Nice=").next().unwrap_or("0")])
         .arg(&args.windhover)
@@ -111,7 +111,7 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// What the unit sets under this name, a line each.
+/// The values of the unit under this name, one line each.
 fn of_unit(name: &str) -> impl Iterator<Item = &'static str> {
     let unit = include_str!("../systemd/windhover.service");
     unit.lines().filter_map(move |line| line.strip_prefix(name))
@@ -137,7 +137,7 @@ fn simulate(args: &Args, flight: &Path) -> Result<()> {
 /// Bytes of a line, and when they came.
 type Bytes = Vec<(Span, bool, Vec<u8>)>;
 
-/// Puts the frames into a folder that the recorded camera plays; the bytes of both lines.
+/// Writes the frames into a folder that the recorded camera plays; returns the bytes of both lines.
 fn unpack(flight: &Path, camera: &Path) -> Result<Bytes> {
     let (mut list, mut bytes, mut first) = ("time_s,file\n".to_owned(), Vec::new(), None);
     for event in CaptureReader::open(flight)?.filter_map(|item| item.event) {
@@ -213,7 +213,7 @@ struct Written {
     data: Vec<u8>,
 }
 
-/// Feeds both lines at the real pace, again and again; what it wrote.
+/// Feeds both lines at the real pace, repeatedly; returns what it wrote.
 fn feed(bytes: &Bytes, flight_s: u64, mut gps: File, mut compass: File, asked: &AtomicBool) -> Vec<Written> {
     let began = Instant::now();
     let clock = HostClock::start();
@@ -251,7 +251,7 @@ fn report_stamps(card: &Path, written: &[Written]) -> Result<()> {
     for of in written {
         let reads = &reads[usize::from(of.is_gps)];
         let next = reads.partition_point(|(t, _)| *t < of.t);
-        // A read that begins with other bytes is of a write before it that waited.
+        // A read that begins with other bytes belongs to an earlier write that waited.
         bytes.extend(
             reads.get(next).filter(|(_, data)| data.starts_with(&of.data)).map(|(t, _)| (*t - of.t).ms()),
         );
@@ -272,8 +272,8 @@ fn report_stamps(card: &Path, written: &[Written]) -> Result<()> {
     Ok(())
 }
 
-/// Sleeps and looks at the clock: by how much it woke late, milliseconds, where that was 20 or more. So long the
-/// machine itself kept a thread waiting.
+/// Sleeps and reads the clock: returns by how much it woke late, milliseconds, where that was 20 or more. For that time
+/// the machine itself made a thread wait.
 fn stand_by(asked: &AtomicBool) -> Vec<f64> {
     let (nap, mut late) = (Duration::from_millis(5), Vec::new());
     while !asked.load(Ordering::Acquire) {
@@ -288,7 +288,7 @@ fn stand_by(asked: &AtomicBool) -> Vec<f64> {
 #[derive(Clone, Copy, Default)]
 struct Resident {
     all: f64,
-    /// What is the daemon's own, not a file's.
+    /// The daemon's own memory, without mapped files.
     own: f64,
 }
 
@@ -303,7 +303,7 @@ impl Resident {
     }
 }
 
-/// Resident memory once a second for so long.
+/// Resident memory once a second for this time.
 fn watch(daemon: &mut Child, seconds: u64) -> Result<Vec<Resident>> {
     let mut memory = Vec::new();
     let began = Instant::now();

@@ -1,8 +1,8 @@
 //! Frames to try a detector on, with the truth: two tags on a plate on textured ground seen from above, with
 //! shadows that cross them, motion blur, noise, dark decoys; some frames without any tag.
 //!
-//! `cargo run --release --example detector_frames -- FOLDER COUNT SEED`, then
-//! `python3 benches/peers.py BIN FOLDER`. Every texture is computed; none is anyone's photograph.
+//! `cargo run --release --example detector_frames -- FOLDER COUNT SEED`, then `python3 benches/peers.py BIN FOLDER`.
+//! All textures are computed; none is a photograph.
 
 use std::path::PathBuf;
 
@@ -65,7 +65,7 @@ fn pebbles(x: f64, y: f64, salt: u64) -> (f64, f64, f64) {
     (first, second, number)
 }
 
-/// What the ground is made of.
+/// Material of the ground.
 #[derive(Clone, Copy, Debug)]
 enum Ground {
     Mottled,
@@ -231,7 +231,7 @@ impl Scene {
             .map_or_else(ground, |patch| patch.tone)
     }
 
-    /// Light that comes from where a pixel looks.
+    /// Brightness of the place at a pixel.
     fn light(&self, u: f64, v: f64) -> f64 {
         let p = self.back * undistorted(u, v);
         let p = Vector2::new(p.x / p.z, p.y / p.z);
@@ -292,7 +292,7 @@ fn between(image: &[f64], u: f64, v: f64) -> f64 {
     top + fv * (at(0, 1) + fu * (at(1, 1) - at(0, 1)) - top)
 }
 
-/// The mean of an image shifted along a direction, `shifts` being symmetric about nought with their weights.
+/// The mean of an image shifted along a direction; `shifts` are symmetric about zero, with weights.
 fn smear(image: &[f64], direction: Vector2<f64>, shifts: &[(f64, f64)]) -> Vec<f64> {
     let total: f64 = shifts.iter().map(|s| s.1).sum();
     (0..image.len())

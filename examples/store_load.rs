@@ -1,11 +1,11 @@
-//! Records a made-up flight as the daemon would, and tells what it cost.
+//! Records a synthetic flight as the daemon would, and prints the costs.
 //!
-//! `cargo run --release --example store_load -- DIR [--seconds S] [--fps F] [--frames POLICY]
-//! [--estimates-hz H] [--acks]`
+//! `cargo run --release --example store_load -- DIR [--seconds S] [--fps F] [--frames POLICY] [--estimates-hz H]
+//! [--acks]`
 //!
-//! Prints processor time by thread, bytes handed to the block layer (`/proc/self/io`), bytes of
-//! data, commit times. With `--acks` it prints `ack N` whenever numbered GPS lines up to N are known
-//! to be durable: what the kill -9 test holds it to.
+//! Prints processor time by thread, bytes handed to the block layer (`/proc/self/io`), bytes of data, commit times.
+//! With `--acks` it prints `ack N` whenever numbered GPS lines up to N are known to be durable, which the kill -9 test
+//! checks.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -41,7 +41,7 @@ struct Args {
     /// Megabytes that must stay free
     #[arg(long, default_value_t = 64)]
     floor_mb: u64,
-    /// Only the index: one commit a `--seconds` second, of `--estimates-hz` records, as fast as it goes
+    /// Only the index: one commit for each second of `--seconds`, with `--estimates-hz` records, as fast as possible
     #[arg(long)]
     index_only: bool,
     /// Print what is durable
@@ -136,10 +136,10 @@ impl Feeder {
     }
 }
 
-/// Feeds at the rates asked for; tells acknowledgements on the way.
+/// Feeds at the requested rates; prints acknowledgements meanwhile.
 fn feed(args: &Args, feeder: &mut Feeder, began: MonoTime) {
     let handle = feeder.handle.clone();
-    // Lines fed before a commit ended are durable after the next one: the encoder is not that late.
+    // Lines fed before a commit ended are durable after the next one: the encoder is not later than that.
     let (mut seen, mut before) = (handle.status().last_commit_ns, None);
     loop {
         let elapsed = (feeder.clock.now() - began).s();
@@ -166,7 +166,7 @@ fn feed(args: &Args, feeder: &mut Feeder, began: MonoTime) {
     }
 }
 
-/// Commits queue records to an index alone; tells bytes to the block layer for each byte of data.
+/// Commits queue records to an index alone; prints bytes to the block layer for each byte of data.
 fn index_only(args: &Args) {
     let index = Index::open(&args.dir.join("index")).expect("a directory to write to");
     let (mut bytes, before) = (0, bytes_to_block_layer());

@@ -1,12 +1,12 @@
-//! Feeds a capture into the bench's lines at its own pace: serial bytes, frames, and the receiver's pulse,
-//! each into a Unix socket of the emulator. At its end it begins again, as if the receiver had been restarted.
+//! Feeds a capture into the bench's lines at its own pace: serial bytes, frames, and the receiver's pulse, each into a
+//! Unix socket of the emulator. At its end it starts again, as if the receiver had been restarted.
 //!
 //! `hil_feed CAPTURE GPS_SOCKET COMPASS_SOCKET FRAMES_SOCKET PULSE_SOCKET [GREY|YUYV|UYVY|NV12|RGB3]`
 //!
-//! Each frame carries its number as 24 squares of 8 pixels in its top-left corner, so that the far end
-//! can tell which frame it saw. Serial bytes that nobody takes are lost after two seconds, as on a real line,
-//! and do not wait in the emulator for somebody to open the port. One line `start NS` on standard output tells
-//! when it began, and `frame N` each frame that was handed over.
+//! Each frame carries its number as 24 squares of 8 pixels in its top-left corner, so that the far end can identify the
+//! frame. Serial bytes that are not read are lost after two seconds, as on a real line, and do not wait in the emulator
+//! until the port is opened. The line `start NS` on standard output gives the start, and `frame N` each frame that was
+//! sent.
 
 use std::io::Write;
 use std::os::unix::net::UnixStream;
@@ -56,8 +56,9 @@ struct Lines {
 
 impl Lines {
     fn open(gps: &str, compass: &str, frames: &str, pulse: &str, format: &str) -> Result<Self, Trouble> {
-        let pack = packing(format).ok_or_else(|| format!("{format} is no format of the bench"))?;
-        // The newest frame wins: what the far end has no time for is left out, as a camera does.
+        let pack = packing(format).ok_or_else(|| format!("{format} is not a format of the bench"))?;
+        // The newest frame replaces a waiting one: frames for which the far end has no time are left out, as by a
+        // camera.
         let (sender, receiver) = sync_channel::<(u32, GrayImage)>(1);
         let camera = UnixStream::connect(frames)?;
         Ok(Self {
@@ -80,7 +81,7 @@ impl Lines {
         }
     }
 
-    /// Plays the capture once; `pulse` is when a second of the receiver begins.
+    /// Plays the capture once; `pulse` is the start of a second of the receiver.
     fn play(&mut self, capture: &str, pulse: Option<MonoTime>) -> Result<(), Trouble> {
         let began = self.clock.now();
         println!("start {}", began.ns());
@@ -116,7 +117,7 @@ impl Lines {
     }
 }
 
-/// What waits in a line: some 70 writes, two seconds of either device. An emulator that stalls for less loses
+/// Size of a line's buffer: some 70 writes, two seconds of either device. A shorter stall of the emulator loses
 /// nothing.
 const LINE_BYTES: usize = 32 << 10;
 
@@ -128,7 +129,7 @@ fn line(path: &str) -> Result<UnixStream, Trouble> {
     Ok(stream)
 }
 
-/// Says something on a line; what does not fit is lost.
+/// Writes to a line; bytes that do not fit are lost.
 fn say(line: &mut UnixStream, bytes: &[u8]) -> std::io::Result<()> {
     match line.write(bytes) {
         Err(error) if error.kind() != std::io::ErrorKind::WouldBlock => Err(error),
@@ -136,10 +137,10 @@ fn say(line: &mut UnixStream, bytes: &[u8]) -> std::io::Result<()> {
     }
 }
 
-/// When the first pulse of the capture's receiver is due: the beginning of its second, which its sentences
-/// tell `gps.latency_ms` later. The earliest of the first ones has the least jitter. `None` without RMC.
+/// When the first pulse of the capture's receiver is due: the start of its second, whose sentences arrive
+/// `gps.latency_ms` later. The earliest of the first ones has the least jitter. `None` without RMC.
 fn first_pulse(capture: &str) -> Result<Option<MonoTime>, Trouble> {
-    /// Sentences looked at: ten seconds of them.
+    /// Sentences that are examined: ten seconds of them.
     const SENTENCES: usize = 50;
     let path = Path::new(capture);
     let config = attached_config(path)?.ok_or("the capture has no configuration")?;
@@ -171,7 +172,7 @@ fn write_frames(frames: &Receiver<(u32, GrayImage)>, mut camera: UnixStream, pac
 /// Grey pixels in a pixel format of V4L2.
 type Packing = fn(&[u8]) -> Vec<u8>;
 
-/// The packing of a format by its four-character code; colours are those of grey.
+/// The packing of a format by its four-character code; colour formats contain grey.
 fn packing(format: &str) -> Option<Packing> {
     const NO_COLOUR: u8 = 128;
     Some(match format {

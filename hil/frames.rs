@@ -1,5 +1,5 @@
-//! Tells which frame of the feed each frame of a recorded flight shows: `hil_frames FLIGHT` prints
-//! `frame,time_ns,number` rows, the number read from the squares `hil_feed` painted.
+//! Identifies the frame of the feed in each frame of a recorded flight: `hil_frames FLIGHT` prints
+//! `frame,time_ns,number` rows; the number is read from the squares that `hil_feed` painted.
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -30,8 +30,8 @@ fn main() -> ExitCode {
     ExitCode::SUCCESS
 }
 
-/// The number in the top-left corner; `None` where a square is neither dark nor light, as in the test
-/// picture the driver shows before the feed begins.
+/// The number in the top-left corner; `None` where a square is neither dark nor light, as in the driver's test picture
+/// before the feed begins.
 fn number(image: &ImageView<'_>) -> Option<u32> {
     (0..24u32).try_fold(0, |number, bit| {
         let square = image.crop(bit as usize * 8 + 2, 2, 4, 4);

@@ -1,9 +1,9 @@
 //! Compares what a ground station received of a flight with the flight on the card:
 //! `hil_stream FLIGHT STATION_FOLDER` prints one JSON object.
 //!
-//! The station's files of a run are those whose `run` files agree; the run is the one that has most in common
-//! with the flight. A message is the same where topic, time and bytes are. Only topics the station has are
-//! counted. `only_received_since_ns` is the time of the first message that is on the ground and not on the card.
+//! The station's files of a run are those whose `run` files agree; the run is the one that has most in common with the
+//! flight. A message is the same where topic, time and bytes are. Only topics that the station has are counted.
+//! `only_received_since_ns` is the time of the first message that is on the ground and not on the card.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

@@ -1,13 +1,12 @@
 //! Windhover watches an unmanned ground vehicle from a small helicopter.
 //!
-//! A recorded or live stream of serial bytes and camera frames goes in; where the vehicle is, where
-//! it points, how fast it drives and turns comes out, each with its covariance. `ARCHITECTURE.md`
-//! tells how the parts fit.
+//! Input is a recorded or live stream of serial bytes and camera frames. Output is the vehicle's position, heading,
+//! speed and yaw rate, each with its covariance. `ARCHITECTURE.md` describes how the parts fit together.
 //!
-//! What is worth having alone are crates of their own (`crates/`). A module names only modules listed
-//! above it here. Core (the crates, and modules up to `pipeline`) turns values into
-//! values: it never reads a clock, logs, waits or touches a device. `io` moves events and records;
-//! `app` wires; `cli` talks to people. `tests/architecture.rs` holds this.
+//! Parts that are useful alone are separate crates (`crates/`). A module uses only modules that are listed above it
+//! here. Core (the crates, and the modules down to `pipeline`) computes values from values: it never reads a clock,
+//! logs, waits or touches a device. `io` moves events and records; `app` connects the parts; `cli` is the command line.
+//! `tests/architecture.rs` checks this.
 
 #![warn(
     missing_docs,

@@ -1,5 +1,5 @@
-//! The direction of dependence: a module names only modules above it in `lib.rs` (among the crates, Cargo
-//! holds it), and core neither reads clocks nor logs nor touches devices.
+//! Direction of dependence: a module names only modules above it in `lib.rs` (Cargo ensures it among the crates), and
+//! core neither reads clocks nor logs nor touches devices.
 
 use std::path::{Path, PathBuf};
 
@@ -38,7 +38,7 @@ fn sources(folder: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
-/// The code of a file before its tests, comments left out.
+/// The code of a file before its tests, without comments.
 fn code(path: &Path) -> String {
     let text = std::fs::read_to_string(path).unwrap();
     let before_tests = text.split("#[cfg(test)]").next().unwrap_or("");
@@ -70,9 +70,9 @@ fn modules_name_only_what_stands_above_them() {
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 
-/// `io` moves events and records: it decodes, detects and estimates nothing. Of `windhover_decode` it has the
-/// grammar of sentences and packets alone, because a receiver is configured in the sentences it speaks, and its line
-/// speed is judged by what is sound.
+/// `io` moves events and records: it does not decode, detect or estimate. From `windhover_decode` it uses only the
+/// framing of sentences and packets, because receivers are configured with them, and because valid ones indicate the
+/// right line speed.
 #[test]
 fn io_names_no_stage() {
     let stages = [

@@ -1,4 +1,4 @@
-//! MCAP files made to hurt: whoever reads one spends memory on what is there, not on what it claims.
+//! Hostile MCAP files: a reader's memory depends on the file's content, not on the lengths that it states.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::collections::BTreeMap;
@@ -45,7 +45,7 @@ static ALLOCATOR: Counting = Counting;
 
 const MB: usize = 1 << 20;
 
-/// Most megabytes that `work` had beside what was there before.
+/// Largest number of megabytes that `work` allocated in addition.
 fn megabytes(work: impl FnOnce()) -> usize {
     let before = NOW.load(Ordering::Relaxed);
     MOST.store(before, Ordering::Relaxed);
@@ -53,7 +53,7 @@ fn megabytes(work: impl FnOnce()) -> usize {
     MOST.load(Ordering::Relaxed).saturating_sub(before).div_ceil(MB)
 }
 
-/// Reads it in every way there is; gives how many messages came.
+/// Reads it in every way; returns the number of messages.
 fn read_all(path: &Path) -> usize {
     let messages = McapReader::open(path).unwrap().count();
     assert!(CaptureReader::open(path).unwrap().count() <= messages);
@@ -117,7 +117,7 @@ fn strings_that_claim_gigabytes() {
         b.extend(u32::MAX.to_le_bytes());
     });
     chunk(&mut bytes, &inside);
-    // A chunk of a few bytes that says it unpacks to as much as is believed, and to more.
+    // A chunk of a few bytes that states an uncompressed size at the limit, and above it.
     for says in [1u64 << 28, 1 << 62] {
         put_record(&mut bytes, op::CHUNK, |b| {
             put_u64(b, 0);

@@ -1,10 +1,8 @@
 //! The captures beside this file, replayed: the outputs equal the goldens, and are the same twice.
 //!
-//! A golden changes only in a commit that says why. To make them anew after such a change:
-//! `cargo test --test replay -- --ignored make_goldens`
-//! The captures themselves, with their truth, are made by
-//! `cargo test --test replay -- --ignored make_captures`
-//! (their goldens must be made anew afterwards).
+//! A golden changes only in a commit that gives the reason. To make them again after such a change: `cargo test --test
+//! replay -- --ignored make_goldens` The captures themselves, with their truth, are made by `cargo test --test replay
+//! -- --ignored make_captures` (their goldens must be made again afterwards).
 
 use std::path::{Path, PathBuf};
 
@@ -42,7 +40,7 @@ fn golden(name: &str, table: &str) -> PathBuf {
     folder().join(name).join(table)
 }
 
-/// Numbers may differ in what another processor's rounding makes of them; all else must be equal.
+/// Numbers may differ by another processor's rounding; everything else must be equal.
 fn same(field: &str, wanted: &str) -> bool {
     match (field.parse::<f64>(), wanted.parse::<f64>()) {
         (Ok(got), Ok(want)) => (got - want).abs() <= 1e-5 + 1e-4 * want.abs(),

@@ -1,4 +1,4 @@
-//! Any bytes of a compass line, in every format: no panic, values in range.
+//! Arbitrary bytes of a compass line, in every format: no panic, values in range.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -8,7 +8,7 @@ use windhover_decode::CompassDecoder;
 
 const FORMATS: [CompassFormat; CompassFormat::ALL.len()] = CompassFormat::ALL;
 
-// The first byte chooses the format and how long reads are.
+// The first byte selects the format and the length of reads.
 fuzz_target!(|data: &[u8]| {
     let Some((&choice, stream)) = data.split_first() else {
         return;

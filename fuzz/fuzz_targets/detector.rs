@@ -1,11 +1,11 @@
-//! Any image of any size, 1×1 upward: no panic, finite corners.
+//! Arbitrary images of any size, 1×1 upward: no panic, finite corners.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
 use windhover_base::msg::{ImageView, TagFamily};
 use windhover_detect::{Detector, Limits};
 
-// The first three bytes choose width, stride and smallest tag; the rest are pixels.
+// The first three bytes select width, stride and smallest tag; the rest are pixels.
 fuzz_target!(|data: &[u8]| {
     let [width, extra, min_px, pixels @ ..] = data else { return };
     let (width, extra) = (usize::from(*width) + 1, usize::from(*extra % 8));

@@ -1,11 +1,11 @@
-//! Any bytes of a GPS line, cut anywhere: no panic, bounded output, values in range.
+//! Arbitrary bytes of a GPS line, cut anywhere: no panic, bounded output, values in range.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
 use windhover_base::time::{MonoTime, Span};
 use windhover_decode::GnssDecoder;
 
-// The first byte sets how long reads are and how far apart, so that the clocked paths run as well.
+// The first byte sets the length of reads and their intervals, so that the paths with time-outs run as well.
 fuzz_target!(|data: &[u8]| {
     let Some((&pace, stream)) = data.split_first() else {
         return;

@@ -1,4 +1,4 @@
-//! Any bytes of a link's stream or datagram, cut anywhere: no panic, no endless loop, bounded lengths.
+//! Arbitrary bytes of a link's stream or datagram, cut anywhere: no panic, no endless loop, bounded lengths.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -20,7 +20,7 @@ fn stream<M: prost::Message + Default>(data: &[u8], read: usize) {
     }
 }
 
-// The first byte chooses how long reads are.
+// The first byte selects the length of reads.
 fuzz_target!(|data: &[u8]| {
     let Some((&choice, bytes)) = data.split_first() else {
         return;

@@ -1,4 +1,4 @@
-//! Any bytes as MAVLink: no panic in what hears an autopilot, and no datagram is believed without the key.
+//! Arbitrary bytes as MAVLink: no panic in the decoder of the autopilot, and no datagram is accepted without the key.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;

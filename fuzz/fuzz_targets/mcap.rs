@@ -1,4 +1,4 @@
-//! Any bytes as a recording: read as messages and as events, its frames decoded; no panic, no endless loop.
+//! Arbitrary bytes as a recording: read as messages and as events, its frames decoded; no panic, no endless loop.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -6,7 +6,7 @@ use windhover::io::capture::{CaptureReader, attached_config};
 use windhover::pixels;
 use windhover_base::msg::EventBody;
 
-/// The magic that every recording begins with.
+/// The magic at the start of every recording.
 const MAGIC: [u8; 8] = *b"\x89MCAP0\r\n";
 
 fuzz_target!(|data: &[u8]| {

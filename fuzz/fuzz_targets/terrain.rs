@@ -1,4 +1,4 @@
-//! Any bytes as a terrain tile: a GeoTIFF, or the begin of a `.hgt`; no panic, and what is a tile has heights everywhere.
+//! Arbitrary bytes as a terrain tile: a GeoTIFF, or the start of a `.hgt`; no panic, and a tile has heights everywhere.
 #![no_main]
 
 use std::path::Path;

@@ -1,4 +1,4 @@
-//! Any bytes as a video (Y4M, AVI of Motion JPEG) and as one frame; no panic, no endless loop.
+//! Arbitrary bytes as a video (Y4M, AVI of Motion JPEG) and as one frame; no panic, no endless loop.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -6,7 +6,7 @@ use windhover::io::import::open_video;
 use windhover::pixels;
 use windhover_base::time::MonoTime;
 
-/// Begins of what is understood here; anything else would be given to an installed ffmpeg.
+/// Starts of the supported formats; any other input would be given to an installed ffmpeg.
 const BEGINS: [&[u8]; 2] = [b"YUV4MPEG2 ", b"RIFF"];
 
 fuzz_target!(|data: &[u8]| {

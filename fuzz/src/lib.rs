@@ -1,8 +1,8 @@
-//! What targets share.
+//! Shared by the targets.
 
 use std::path::Path;
 
-/// Writes a file of these parts in memory's file system where there is one, and hands it over.
+/// Writes a file of these parts, in a file system in memory where there is one, and passes it on.
 pub fn with_file(end: &str, parts: &[&[u8]], work: impl FnOnce(&Path)) {
     let memory = Path::new("/dev/shm");
     let folder = if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() };

@@ -9,10 +9,10 @@ use tracing::metadata::Kind;
 use tracing::subscriber::Interest;
 use tracing::{Event, Level, Metadata};
 
-/// Fields that one event can have. `tracing` takes a fixed number; what an event does not use stays empty.
+/// Most fields of any event. `tracing` takes a fixed number of fields; those that an event does not use stay empty.
 const MOST_FIELDS: usize = 1_024;
 
-/// Where an event comes from. Never freed, as `tracing` wants it: made once by who emits it.
+/// A `tracing` callsite. It is never freed, as `tracing` requires: the code that emits the event makes it once.
 pub struct RuntimeCallsite {
     metadata: OnceLock<Metadata<'static>>,
 }
@@ -32,7 +32,7 @@ impl RuntimeCallsite {
         callsite
     }
 
-    /// Emits an event: a value for each field in their order, `None` where it has none.
+    /// Emits an event with one value for each field, in the order of the fields; `None` where the event has none.
     pub fn emit(&'static self, values: &[Option<&dyn Value>]) {
         let metadata = Callsite::metadata(self);
         get_default(|dispatch| {
@@ -51,10 +51,10 @@ impl RuntimeCallsite {
 }
 
 impl Callsite for RuntimeCallsite {
-    // Asked for each event: they are few.
+    // Interest is asked for at each event: these events are few.
     fn set_interest(&self, _: Interest) {}
 
     fn metadata(&self) -> &Metadata<'_> {
-        self.metadata.get().expect("set before anybody sees the callsite")
+        self.metadata.get().expect("the callsite is set before it is used")
     }
 }

@@ -1,4 +1,4 @@
-//! The data card's task: keeps the store running, closes it when power is about to fail, passes on its notices.
+//! The data card's task: it keeps the store running, closes it before power fails, and forwards its notices.
 
 use std::sync::Arc;
 use std::sync::mpsc::Receiver;
@@ -16,11 +16,11 @@ use super::flight_store::{FlightStore, StoreOrders};
 use super::health::CardFigures;
 use super::presence::PartState;
 use super::status::SharedStatus;
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 
-/// How often the task passes on what the store reports and shows its state.
+/// How often the task forwards the store's notices and publishes its state.
 const ROUND: Duration = Duration::from_millis(100);
-/// Longest the flight is kept open for a pipeline that does not end.
+/// How long the flight stays open at most for a pipeline that does not end.
 const PIPELINE_ENDS: Duration = Duration::from_secs(1);
 
 /// A store that was started, and what it reports.
@@ -29,35 +29,35 @@ pub struct OpenStore {
     notices: Receiver<StoreNotice>,
 }
 
-/// Starts the store before there is a pipeline, so that a flight begins with the first event; `None` where nothing
-/// is to be kept.
+/// Starts the store before there is a pipeline, so that a flight begins with the first event; `None` where the
+/// configuration records nothing.
 pub fn open(config: &Config, clock: HostClock, flight_store: &FlightStore) -> Option<OpenStore> {
-    // A configuration that was checked can be written.
+    // A configuration that passed its checks can be written as TOML.
     let text = config.to_toml().unwrap_or_default();
     let (store, notices) = config.store.enabled.then(|| Store::start(&config.store, text, clock))?;
     flight_store.set(Some(store.handle()));
     Some(OpenStore { store, notices })
 }
 
-/// Recorded for less than this, a flight's pace is not known.
+/// While a flight is shorter than this, its data rate is not known.
 const SETTLED: Span = Span::from_ns(10_000_000_000);
 
-/// How long a flight is recorded, and how long the card lasts at its pace.
+/// How long a flight has been recorded, and how long the card lasts at its data rate.
 #[derive(Default)]
 struct CardPace {
-    /// When recording began, and bytes of the flight then and at last.
+    /// When recording began, the flight's bytes at that time, and its bytes at the last call.
     begun: Option<(MonoTime, u64, u64)>,
 }
 
 impl CardPace {
-    /// Takes the store's state of now; gives how long it records and what is left.
+    /// Takes the store's current state; returns the time recorded and the time left.
     fn take(&mut self, store: &StoreStatus, now: MonoTime) -> (Option<Span>, Option<Span>) {
         if store.recording != Recording::On {
             self.begun = None;
             return (None, None);
         }
         let written = store.bytes_written;
-        // Less than before is another flight.
+        // Fewer bytes than at the last call: this is another flight.
         let (began, first, _) =
             self.begun.filter(|(_, _, last)| *last <= written).unwrap_or((now, written, written));
         self.begun = Some((began, first, written));
@@ -72,7 +72,7 @@ impl CardPace {
 /// Why a store is closed.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 enum Closing {
-    /// The end was asked for.
+    /// The daemon is stopping.
     End,
     /// Power is about to fail.
     Power,
@@ -82,24 +82,24 @@ enum Closing {
 pub struct StoreTask {
     /// The configuration.
     pub config: Arc<Config>,
-    /// What every task is given.
+    /// The context of every task.
     pub context: TaskContext,
-    /// Where the card's state is shown.
+    /// Where the card's state is published.
     pub status: SharedStatus,
     /// Where the other tasks find the store.
     pub flight_store: FlightStore,
-    /// What it is asked to do.
+    /// Requests to the store.
     pub orders: StoreOrders,
-    /// Its heart.
-    pub heart: Heart,
+    /// The task's heartbeat.
+    pub heartbeat: Heartbeat,
 }
 
-/// Keeps the store running until the pipeline has handed over its last output after the end was asked for.
+/// Runs the store until a stop is requested and the pipeline has handed over its last output.
 pub async fn run(task: StoreTask, mut opened: Option<OpenStore>) {
     if !task.config.store.enabled {
         task.show_state("off");
         task.context.presence.set(Part::Store, PartState::Delivers);
-        return task.heart.while_waiting(task.context.stop.cancelled()).await;
+        return task.heartbeat.while_waiting(task.context.stop.cancelled()).await;
     }
     while let Some(OpenStore { store, mut notices }) = opened.take() {
         let why = task.attend(&store, &mut notices).await;
@@ -109,16 +109,16 @@ pub async fn run(task: StoreTask, mut opened: Option<OpenStore>) {
         }
         let outcome = task.status.with(|status| status.outcome.clone());
         let words = match outcome {
-            Some(Err(why)) => format!("power is going: NOT all is on the card: {why}"),
-            Some(Ok(words)) => format!("power is going: {words}"),
-            None => "power is going".into(),
+            Some(Err(why)) => format!("power is failing: NOT everything is on the card: {why}"),
+            Some(Ok(words)) => format!("power is failing: {words}"),
+            None => "power is failing".into(),
         };
         OperatorEvent::FlightClosed.emit("", words);
         task.show_state("closed");
         let mut power = task.orders.power_going.subscribe();
         let back = async { power.wait_for(|going| !going).await.is_ok() };
         let back = task.context.stop.run_until_cancelled(back);
-        if task.heart.while_waiting(back).await.is_none() {
+        if task.heartbeat.while_waiting(back).await.is_none() {
             return;
         }
         let (config, clock, store) =
@@ -128,7 +128,7 @@ pub async fn run(task: StoreTask, mut opened: Option<OpenStore>) {
 }
 
 impl StoreTask {
-    /// Attends to a running store until it is to be closed.
+    /// Serves a running store until it has to be closed.
     async fn attend(&self, store: &Store, notices: &mut Receiver<StoreNotice>) -> Closing {
         let handle = store.handle();
         let mut power = self.orders.power_going.subscribe();
@@ -143,7 +143,7 @@ impl StoreTask {
                     return Closing::Power;
                 }
                 _ = round.tick() => {
-                    self.heart.beat();
+                    self.heartbeat.beat();
                     self.report(notices);
                     self.show(&handle.status(), &mut pace);
                 }
@@ -151,13 +151,13 @@ impl StoreTask {
         }
     }
 
-    /// Waits until the end was asked for and the pipeline has handed over everything.
+    /// Waits until a stop is requested and the pipeline has handed over all its outputs.
     async fn end(&self) {
         self.context.stop.cancelled().await;
         let _ = tokio::time::timeout(PIPELINE_ENDS, self.orders.pipeline_done.cancelled()).await;
     }
 
-    /// Closes the flight; waits for the card.
+    /// Closes the flight and waits for the card.
     async fn close(&self, store: Store, notices: Receiver<StoreNotice>) {
         self.flight_store.set(None);
         let handle = store.handle();
@@ -168,7 +168,7 @@ impl StoreTask {
         self.report(&mut closed.await);
         let outcome = handle.status().outcome();
         self.status.with(|status| status.outcome = Some(outcome));
-        self.heart.beat();
+        self.heartbeat.beat();
     }
 
     fn report(&self, notices: &mut Receiver<StoreNotice>) {
@@ -233,7 +233,7 @@ mod tests {
         );
         let told = pace.take(&store(20_000_000), at(21.0));
         assert_eq!(told, (Some(Span::from_s(20.0)), Some(Span::from_s(1_000.0))));
-        // Another flight begins anew.
+        // Another flight starts from zero.
         assert_eq!(pace.take(&store(10), at(22.0)), (Some(Span::ZERO), None));
     }
 }

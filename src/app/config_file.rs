@@ -9,7 +9,7 @@ use crate::config::{Config, ConfigError};
 use crate::io::{self, terrain::TileError};
 use windhover_base::geo::Tile;
 
-/// Why a configuration file gave no configuration.
+/// Why a configuration could not be loaded.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigFileError {
     /// The file could not be read.
@@ -17,7 +17,7 @@ pub enum ConfigFileError {
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The file does not hold a valid configuration.
@@ -33,7 +33,7 @@ pub enum ConfigFileError {
     Terrain {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The terrain tile that it names could not be read.
         source: TileError,
     },
 }
@@ -52,7 +52,7 @@ pub fn load(path: &Path) -> Result<Config, ConfigFileError> {
     load_all(path).map(|loaded| loaded.config)
 }
 
-/// Reads and checks a configuration file and what it names. Blocks: a tile takes seconds to read.
+/// Reads and checks a configuration file and the terrain tile that it names. Blocks: reading a tile takes seconds.
 pub fn load_all(path: &Path) -> Result<Loaded, ConfigFileError> {
     let text =
         read_text(path).map_err(|source| ConfigFileError::Unreadable { path: path.to_owned(), source })?;
@@ -66,22 +66,22 @@ pub fn load_all(path: &Path) -> Result<Loaded, ConfigFileError> {
     Ok(Loaded { config, terrain })
 }
 
-/// A configuration is no longer than this, bytes.
+/// Largest size of a configuration, bytes.
 const LONGEST: u64 = 1 << 20;
 
-/// The text of a file, which may be a device that never ends.
+/// The text of a file. The file may be a device that never ends.
 fn read_text(path: &Path) -> std::io::Result<String> {
     let mut text = String::new();
     let read = File::open(path)?.take(LONGEST + 1).read_to_string(&mut text)?;
     if read as u64 > LONGEST {
-        return Err(std::io::Error::other("it is longer than 1 MB, which no configuration is"));
+        return Err(std::io::Error::other("it is longer than 1 MB, the limit for a configuration"));
     }
     Ok(text)
 }
 
-/// The terrain tile of a recording's configuration: the file of that name beside the recording, else the one that the
-/// configuration names. `None` where it names none or it cannot be read: a recording may name a tile of another machine,
-/// of which the pipeline then tells.
+/// The terrain tile of a recording's configuration: the file of that name beside the recording, else the file that the
+/// configuration names. `None` where it names none or the file cannot be read: a recording may name a tile of another
+/// machine, and the pipeline then reports it.
 pub fn terrain_of(config: &Config, recording: &Path) -> Option<Arc<Tile>> {
     let named = Path::new(config.ground.terrain.as_ref()?);
     let beside = named.file_name().map(|name| recording.with_file_name(name));

@@ -1,4 +1,4 @@
-//! What every task of the daemon is given.
+//! The context of every task of the daemon.
 
 use std::sync::Arc;
 
@@ -10,16 +10,16 @@ use windhover_base::time::MonoTime;
 use super::event_queue::EventQueue;
 use super::presence::Presence;
 
-/// What every task is given. Copies share the same parts.
+/// The context of a task. Copies share the same parts.
 #[derive(Clone)]
 pub struct TaskContext {
     /// The clock.
     pub clock: HostClock,
-    /// When the graph started: before the first event.
+    /// When the task graph started, before the first event.
     pub began: MonoTime,
-    /// Asks for the end.
+    /// Requests the stop of the daemon.
     pub stop: CancellationToken,
-    /// Which parts are up.
+    /// Which devices are up.
     pub presence: Presence,
     /// Where events go.
     pub events: Arc<EventQueue>,

@@ -1,12 +1,12 @@
-//! The declination a flight was flown with: from its configuration, or the World Magnetic Model at
-//! its first dated fix.
+//! The declination of a recorded flight: from its configuration, or from the World Magnetic Model at its first fix with
+//! a date.
 
 use super::flight::Flight;
 use windhover_base::geo::{DeclinationError, Geodetic, declination};
 use windhover_base::settings::CompassConfig;
 use windhover_base::time::UtcTime;
 
-/// Radians, east positive; zero where the configuration names neither figure nor model.
+/// Radians, east positive; zero where the configuration gives neither a value nor a model.
 pub fn of_flight(compass: &CompassConfig, flight: &Flight) -> Result<f64, DeclinationError> {
     if let Some(degrees) = compass.declination_deg {
         return Ok(degrees.to_radians());

@@ -1,9 +1,9 @@
-//! Device tasks: what a device reports becomes events for the pipeline and lines for the operator.
+//! Device tasks: reports of a device become events for the pipeline and log events for the operator.
 
 use std::sync::Arc;
 
 use crate::config::{Config, Part};
-use crate::io::autopilot::{self, AutopilotSettings, Reached, ToAutopilot};
+use crate::io::autopilot::{self, AutopilotAddress, AutopilotSettings, ToAutopilot};
 use crate::io::camera::{self, CameraSettings};
 use crate::io::device::{Fault, NoteKind, Report, blocking};
 use crate::io::mavlink::signing_key;
@@ -15,10 +15,10 @@ use windhover_base::settings::{CompassFormat, GpsFormat, shares_line};
 use super::context::TaskContext;
 use super::events::{self, OperatorEvent};
 use super::presence::PartState;
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 
-/// Reads the GPS line until the end is asked for.
-pub async fn gps(config: Arc<Config>, context: TaskContext, heart: Heart) {
+/// Reads the GPS line until a stop is requested.
+pub async fn gps(config: Arc<Config>, context: TaskContext, heartbeat: Heartbeat) {
     let settings = SerialSettings {
         device: config.gps.device.clone(),
         baud: config.gps.baud,
@@ -26,10 +26,10 @@ pub async fn gps(config: Arc<Config>, context: TaskContext, heart: Heart) {
         text: config.gps.format != GpsFormat::Ubx,
         setup: setup(&config),
     };
-    line(Part::Gps, Source::Gps, &settings, context, heart).await;
+    line(Part::Gps, Source::Gps, &settings, context, heartbeat).await;
 }
 
-/// How the receiver is to be configured. Its sentences stay on where they tell the heading.
+/// How the receiver is to be configured. Its NMEA sentences stay enabled where they carry the heading.
 fn setup(config: &Config) -> Option<Setup> {
     let (gps, compass) = (&config.gps, &config.compass);
     let keep_text = shares_line(gps, compass) && compass.format == CompassFormat::Nmea;
@@ -40,8 +40,8 @@ fn setup(config: &Config) -> Option<Setup> {
     }
 }
 
-/// Reads the compass line until the end is asked for.
-pub async fn compass(config: Arc<Config>, context: TaskContext, heart: Heart) {
+/// Reads the compass line until a stop is requested.
+pub async fn compass(config: Arc<Config>, context: TaskContext, heartbeat: Heartbeat) {
     let settings = SerialSettings {
         device: config.compass.device.clone(),
         baud: config.compass.baud,
@@ -49,18 +49,29 @@ pub async fn compass(config: Arc<Config>, context: TaskContext, heart: Heart) {
         text: config.compass.format.is_text(),
         setup: None,
     };
-    line(Part::Compass, Source::Compass, &settings, context, heart).await;
+    line(Part::Compass, Source::Compass, &settings, context, heartbeat).await;
 }
 
-async fn line(part: Part, source: Source, settings: &SerialSettings, context: TaskContext, heart: Heart) {
+async fn line(
+    part: Part,
+    source: Source,
+    settings: &SerialSettings,
+    context: TaskContext,
+    heartbeat: Heartbeat,
+) {
     let (clock, stop) = (context.clock, context.stop.clone());
-    let device = DeviceReports { part, source, context, heart };
+    let device = DeviceReports { part, source, context, heartbeat };
     let reports = |report| device.take(report);
     stop.run_until_cancelled(serial::run(settings, clock, &reports)).await;
 }
 
-/// Hears the autopilot, and sends it what is to be sent, until the end is asked for.
-pub async fn autopilot(config: Arc<Config>, outgoing: ToAutopilot, context: TaskContext, heart: Heart) {
+/// Receives from the autopilot and sends to it, until a stop is requested.
+pub async fn autopilot(
+    config: Arc<Config>,
+    outgoing: ToAutopilot,
+    context: TaskContext,
+    heartbeat: Heartbeat,
+) {
     let Some(autopilot) = &config.autopilot else { return };
     let key = config.mavlink.signing_key.clone();
     let key = match blocking(move || signing_key(key.as_deref())).await {
@@ -68,8 +79,8 @@ pub async fn autopilot(config: Arc<Config>, outgoing: ToAutopilot, context: Task
         Err(error) => return OperatorEvent::AutopilotNote.emit("autopilot", error),
     };
     let reached = match (&autopilot.device, autopilot.listen_at()) {
-        (Some(device), _) => Reached::Serial { device: device.clone(), baud: autopilot.baud },
-        (None, Some(address)) => Reached::Udp(address.to_owned()),
+        (Some(device), _) => AutopilotAddress::Serial { device: device.clone(), baud: autopilot.baud },
+        (None, Some(address)) => AutopilotAddress::Udp(address.to_owned()),
         (None, None) => return,
     };
     let (system_id, configure) = (autopilot.system_id, autopilot.configure);
@@ -81,13 +92,13 @@ pub async fn autopilot(config: Arc<Config>, outgoing: ToAutopilot, context: Task
         signing_link_id: config.mavlink.signing_link_id,
     };
     let (clock, stop) = (context.clock, context.stop.clone());
-    let device = DeviceReports { part: Part::Autopilot, source: Source::Autopilot, context, heart };
+    let device = DeviceReports { part: Part::Autopilot, source: Source::Autopilot, context, heartbeat };
     let reports = |report| device.take(report);
     stop.run_until_cancelled(autopilot::run(&settings, &outgoing, clock, &reports)).await;
 }
 
-/// Takes frames until the end is asked for.
-pub async fn camera(config: Arc<Config>, context: TaskContext, heart: Heart) {
+/// Takes frames until a stop is requested.
+pub async fn camera(config: Arc<Config>, context: TaskContext, heartbeat: Heartbeat) {
     let settings = CameraSettings {
         device: config.camera.device.clone(),
         width: config.camera.width,
@@ -96,22 +107,22 @@ pub async fn camera(config: Arc<Config>, context: TaskContext, heart: Heart) {
         pixel_format: config.camera.pixel_format,
     };
     let (clock, stop) = (context.clock, context.stop.clone());
-    let device = DeviceReports { part: Part::Camera, source: Source::Camera, context, heart };
+    let device = DeviceReports { part: Part::Camera, source: Source::Camera, context, heartbeat };
     let reports = |report| device.take(report);
     stop.run_until_cancelled(camera::run(&settings, clock, &reports)).await;
 }
 
-/// Watches the receiver's pulse until the end is asked for. A pulse line that is missing costs nothing
-/// but accuracy: it is no part that readiness waits for.
-pub async fn pulses(device: String, context: TaskContext, heart: Heart) {
-    let reports = |report| plain(report, "pps", &heart);
+/// Reads the receiver's pulse until a stop is requested. Without the pulse line only accuracy is lost, so readiness
+/// does not wait for it.
+pub async fn pulses(device: String, context: TaskContext, heartbeat: Heartbeat) {
+    let reports = |report| plain(report, "pps", &heartbeat);
     let pulse = |t| context.events.put(t, EventBody::Pulse);
     context.stop.run_until_cancelled(pps::run(&device, context.clock, &reports, &pulse)).await;
 }
 
-/// What a device reports that delivers neither bytes nor frames.
-fn plain(report: Report, name: &str, heart: &Heart) {
-    heart.beat();
+/// Reports of a device that delivers neither bytes nor frames.
+fn plain(report: Report, name: &str, heartbeat: &Heartbeat) {
+    heartbeat.beat();
     match report {
         Report::Up(text) => OperatorEvent::DeviceUp.emit(name, text),
         Report::Down(fault) => events::device_down(name, &fault),
@@ -124,12 +135,12 @@ struct DeviceReports {
     part: Part,
     source: Source,
     context: TaskContext,
-    heart: Heart,
+    heartbeat: Heartbeat,
 }
 
 impl DeviceReports {
     fn take(&self, report: Report) {
-        self.heart.beat();
+        self.heartbeat.beat();
         let name = self.part.name();
         match report {
             Report::Beat => {}

@@ -1,7 +1,7 @@
-//! The link's task: ground stations over QUIC, and the vehicles as MAVLink beside it.
+//! The link's task: ground stations over QUIC, and the vehicles over MAVLink.
 //!
-//! The pipeline's task hands records and outputs to a [`Downlink`], which never waits; this task does the
-//! rest. It lives on without a card, without stations, without keys.
+//! The pipeline's task hands records and outputs to a [`Downlink`], which never waits; this task does the rest. It also
+//! runs without a card, stations or keys.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -18,7 +18,7 @@ use crate::io::link::{
     Backlog, EarlyRecords, LinkError, LinkEvent, LinkHandle, LinkStatus, PayloadLink, PayloadSettings,
     Picture, StoreBacklog,
 };
-use crate::io::mavlink::{self, MavlinkSender, Station, StationNews};
+use crate::io::mavlink::{self, MavlinkSender, Station, StationChange};
 use crate::io::records::Record;
 use windhover_base::msg::{Event, EventBody, FramePayload, Output};
 use windhover_base::time::UtcTime;
@@ -27,36 +27,36 @@ use super::context::TaskContext;
 use super::events::OperatorEvent;
 use super::flight_store::FlightStore;
 use super::status::SharedStatus;
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 
-/// How often the task shows the link's state.
+/// How often the task publishes the link's state.
 const ROUND: Duration = Duration::from_millis(250);
-/// Pause before a link that could not be opened is tried again.
+/// Pause before the link is opened again after a failure.
 const AGAIN: Duration = Duration::from_secs(10);
 /// How long the link waits for the card at the start.
 const CARD: Duration = Duration::from_secs(2);
-/// A clock that reads less was never set: 2020-01-01.
+/// A clock below this value was never set: 2020-01-01.
 const CLOCK_SET_UNIX_NS: i64 = 1_577_836_800_000_000_000;
 
 struct Lines {
     link: Option<LinkHandle>,
-    /// What was made before there was one; `None` where there is to be none.
+    /// Records made before the link is open; `None` where the link is off.
     early: Option<EarlyRecords>,
     mavlink: Option<MavlinkSender>,
     frame: Option<FramePayload>,
 }
 
-/// The way down, from the pipeline's side. Copies are the same; nothing here waits.
+/// The pipeline's side of the link. Copies share the same link; no call waits.
 #[derive(Clone)]
 pub struct Downlink {
     lines: Arc<Mutex<Lines>>,
-    /// Whether the link numbers records in the run the store is in.
+    /// Whether the link numbers its records in the store's current run.
     one_run: Arc<AtomicBool>,
     to_autopilot: ToAutopilot,
 }
 
 impl Downlink {
-    /// Before anything is open; with a link configured, records are numbered from the first on.
+    /// Made before the link is open; with a link configured, records are numbered from the first one on.
     pub fn new(config: &Config, to_autopilot: &ToAutopilot) -> Self {
         let early =
             config.link.enabled.then(|| EarlyRecords::new(&PayloadSettings::from_config(&config.link)));
@@ -69,7 +69,7 @@ impl Downlink {
         self.lines.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Sends a record; gives the number under which the store is to keep it for back-fill.
+    /// Sends a record; returns the number under which the store keeps it for back-fill.
     pub fn record(&self, record: &Record) -> Option<u32> {
         let lines = self.lines();
         let number = match (&lines.link, &lines.early) {
@@ -80,12 +80,12 @@ impl Downlink {
         self.one_run.load(Ordering::Relaxed).then_some(number)
     }
 
-    /// The store closed its flight: from here on its runs are others than the link's.
+    /// The store closed its flight: its later runs differ from the link's run.
     pub fn store_closed(&self) {
         self.one_run.store(false, Ordering::Relaxed);
     }
 
-    /// Keeps a frame for the next thumbnail, where anybody wants one.
+    /// Keeps a frame for the next thumbnail, where a station asks for thumbnails.
     pub fn event(&self, event: &Event) {
         if let EventBody::Frame(frame) = &event.body {
             let mut lines = self.lines();
@@ -94,14 +94,14 @@ impl Downlink {
         }
     }
 
-    /// Gives MAVLink what it needs of an output.
+    /// Passes an output to MAVLink.
     pub fn mavlink(&self, output: &Output) {
         if let Some(mavlink) = &mut self.lines().mavlink {
             mavlink.output(output);
         }
     }
 
-    /// Makes a thumbnail's picture of what was seen in a frame that was kept for it.
+    /// Makes the picture of a thumbnail from the detections of a frame that was kept for it.
     pub fn picture(&self, output: &Output) {
         let mut lines = self.lines();
         let Output::Detections { frame, markers, features, .. } = output else { return };
@@ -116,19 +116,19 @@ impl Downlink {
 pub struct LinkTask {
     /// The configuration.
     pub config: Arc<Config>,
-    /// What every task is given.
+    /// The context of every task.
     pub context: TaskContext,
-    /// Where the link's state is shown.
+    /// Where the link's state is published.
     pub status: SharedStatus,
-    /// Where back-fill comes from.
+    /// Where the back-fill is read.
     pub flight_store: FlightStore,
-    /// The pipeline's side.
+    /// The pipeline's side of the link.
     pub downlink: Downlink,
-    /// Its heart.
-    pub heart: Heart,
+    /// The task's heartbeat.
+    pub heartbeat: Heartbeat,
 }
 
-/// Serves stations until the end is asked for.
+/// Serves stations until a stop is requested.
 pub async fn run(task: LinkTask) {
     let mut beside = JoinSet::new();
     if task.config.mavlink.enabled
@@ -142,7 +142,7 @@ pub async fn run(task: LinkTask) {
     while !task.context.stop.is_cancelled() {
         if !task.config.link.enabled {
             task.show("off");
-            task.heart.while_waiting(task.context.stop.cancelled()).await;
+            task.heartbeat.while_waiting(task.context.stop.cancelled()).await;
             continue;
         }
         match task.open().await {
@@ -157,7 +157,7 @@ pub async fn run(task: LinkTask) {
                 task.show("fault");
                 task.fault(&error);
                 let pause = task.context.stop.run_until_cancelled(tokio::time::sleep(AGAIN));
-                task.heart.while_waiting(pause).await;
+                task.heartbeat.while_waiting(pause).await;
             }
         }
     }
@@ -187,11 +187,11 @@ async fn send_mavlink(downlink: Downlink, status: SharedStatus, clock: HostClock
     }
 }
 
-/// Tells the operator what became of a station that MAVLink goes to.
-fn tell_mavlink(news: &StationNews) {
+/// Reports a change of a station that receives MAVLink.
+fn tell_mavlink(news: &StationChange) {
     match &news.fault {
         Some(fault) => OperatorEvent::MavlinkFault.emit(&news.name, fault),
-        None => OperatorEvent::MavlinkUp.emit(&news.name, "datagrams go out again"),
+        None => OperatorEvent::MavlinkUp.emit(&news.name, "datagrams are sent again"),
     }
 }
 
@@ -218,10 +218,10 @@ impl LinkTask {
         let (deep, run, flight) = self.identity().await;
         let one_run = deep.is_some();
         let settings = PayloadSettings::from_config(&self.config.link);
-        // Keys are read from files.
+        // Keys are read from files, which blocks.
         let opened = blocking(move || PayloadLink::open(&settings, run, &flight, deep)).await?;
         let mut lines = self.downlink.lines();
-        // A store that closed its flight meanwhile stays another's.
+        // If the store closed its flight meanwhile, its run stays another one.
         self.downlink.one_run.fetch_and(one_run, Ordering::Relaxed);
         if let Some(early) = lines.early.take() {
             opened.1.begin_with(early);
@@ -231,25 +231,25 @@ impl LinkTask {
         Ok(opened)
     }
 
-    /// Which run this is: the store's, where the card answers soon, else one of its own.
+    /// The number of this run: the store's, where the card answers in time, else the link's own.
     async fn identity(&self) -> (Option<Arc<dyn Backlog>>, u32, String) {
         let store = tokio::time::timeout(CARD, self.flight_store.opened());
         if self.config.store.enabled
-            && let Ok(store) = self.heart.while_waiting(store).await
+            && let Ok(store) = self.heartbeat.while_waiting(store).await
         {
             let opening = blocking(move || StoreBacklog::open(store));
-            let (backlog, run, flight) = self.heart.while_waiting(opening).await;
+            let (backlog, run, flight) = self.heartbeat.while_waiting(opening).await;
             return (Some(Arc::new(backlog)), run, flight);
         }
         let now = self.context.clock.now().ns();
-        // Nanoseconds of the start, folded: no two starts share them.
+        // Nanoseconds of the start, folded to 32 bits: two starts do not share them.
         let run = (now as u64 ^ (now as u64 >> 32)) as u32 | 0x8000_0000;
         let dated = now >= CLOCK_SET_UNIX_NS;
         let flight = if dated { UtcTime::from_unix_ns(now).compact() } else { format!("boot-{run}") };
         (None, run, flight)
     }
 
-    /// Passes the link's events to the operator and shows its state, until the end is asked for.
+    /// Forwards the link's events to the operator and publishes its state, until a stop is requested.
     async fn attend(&self, handle: &LinkHandle, mut events: mpsc::Receiver<LinkEvent>) {
         let mut round = tokio::time::interval(ROUND);
         round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
@@ -258,7 +258,7 @@ impl LinkTask {
                 () = self.context.stop.cancelled() => return,
                 Some(event) = events.recv() => self.tell(&event),
                 _ = round.tick() => {
-                    self.heart.beat();
+                    self.heartbeat.beat();
                     self.show(describe(&handle.status()));
                 }
             }
@@ -273,7 +273,7 @@ impl LinkTask {
             LinkEvent::Refused { address, why, unreported } => {
                 (LinkFault, "link", format!("{address}: {why} ({unreported} more)"))
             }
-            LinkEvent::KeysReloaded => (Reloaded, "link", "keys read again".into()),
+            LinkEvent::KeysReloaded => (Reloaded, "link", "keys were read again".into()),
             LinkEvent::KeysUnusable { why } => (LinkFault, "link", why.clone()),
             LinkEvent::Unresolved { address, why } => (LinkFault, "link", format!("{address}: {why}")),
         };
@@ -281,7 +281,7 @@ impl LinkTask {
     }
 }
 
-/// The link in a few words, for the health line.
+/// The link's state for the health line.
 fn describe(status: &LinkStatus) -> String {
     let hearing = status.stations.iter().filter(|station| station.hears_us);
     let best = hearing.clone().map(|station| station.rtt_ms).min_by(f64::total_cmp);

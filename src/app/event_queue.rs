@@ -1,4 +1,4 @@
-//! The queue of events before the pipeline: bounded, in order of time, the oldest frame dropped first.
+//! The queue of events before the pipeline: bounded, in order of time; the oldest frame is dropped first.
 
 use std::collections::VecDeque;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
@@ -7,41 +7,41 @@ use std::time::Duration;
 use windhover_base::msg::{Event, EventBody, FramePayload, PerSource, Source};
 use windhover_base::time::{MonoTime, Span};
 
-/// Reads of the serial lines that wait: more than ten seconds' worth. A pipeline that is further
-/// behind than this does not answer, and the watchdog has it started again.
+/// Reads of the serial lines that can wait: more than ten seconds of them. A pipeline that is further behind does not
+/// answer its heartbeat, and the watchdog restarts the daemon.
 const READS: usize = 8192;
 
-/// Frames that wait at most while a pipeline catches up, and for how long it may. A computer that stood still
-/// for some hundred milliseconds (a disk, another program) delivers everything at once afterwards, and the pipeline
-/// has handled it moments later. A queue that is not emptied within this time is not a burst.
+/// Most frames that wait while a pipeline catches up, and the longest time for it. After the computer stood still for
+/// some hundred milliseconds (a disk, another program), everything arrives at once, and the pipeline handles it within
+/// moments. If the queue is not empty within this time, the load is not a burst.
 const BURST: usize = 16;
 const CATCH_UP: Span = Span::from_ns(500_000_000);
 
-/// Bytes of the frames that wait, however few they are: twenty of 4K in colour.
+/// Most bytes of the frames that wait, whatever their number: twenty 4K frames in colour.
 const FRAME_BYTES: usize = 512 << 20;
 
-/// A frame whose turn comes later than this after it was heard is dropped: estimates are of now.
+/// A frame whose turn comes later than this after its arrival is dropped, so that estimates stay current.
 const FRESH: Span = Span::from_ns(500_000_000);
 
-/// A pipeline that took no frame for so long takes one that is older, but none older than this.
+/// A pipeline that has taken no frame for this time takes an older one, but none older than this.
 const STARVING: Span = Span::from_ns(5_000_000_000);
 const LATEST: Span = Span::from_ns(2_000_000_000);
 
 /// What devices delivered and the pipeline has not yet taken.
 ///
-/// Device tasks put events in, the pipeline's thread takes them out; neither waits for the other. No channel of a
-/// library drops its oldest message and reports that, so the lanes stand here.
+/// Device tasks put events in, and the pipeline's thread takes them out; neither waits for the other. Channels of the
+/// libraries do not drop their oldest message and report it, so the lanes are implemented here.
 ///
-/// Events leave it in the order they were heard, numbered, and with times that never go back: what
-/// the pipeline handles is what is recorded, so a recording replays to the same estimates.
+/// Events leave the queue numbered, in order of arrival, with times that never decrease. The recording holds exactly
+/// what the pipeline handles, so it replays to the same estimates.
 ///
-/// A pipeline that is busy with a frame finds the newest ones when it comes back. From then on the oldest of
-/// these stays: were it replaced while the reads before it are handled, a pipeline that is behind on reads
-/// would never see a frame. A frame whose turn comes too late all the same is dropped, and the pipeline handles
-/// reads until it is of now again: every frame that it handles while it is behind costs it the lead it gained.
+/// A pipeline that was busy with a frame finds the newest frames when it returns. From then on the oldest of these
+/// stays next: if newer frames replaced it while the earlier reads are handled, a pipeline that is behind on reads
+/// would never handle a frame. A frame whose turn still comes too late is dropped, and the pipeline handles reads until
+/// it is current again: each frame that it handles while behind costs it the progress that it made.
 ///
-/// Frames that come in a burst are all kept. Only a pipeline that does not catch up loses the oldest: then no more
-/// wait than the queue is set to hold, so that estimates are of what is seen now.
+/// All frames of a burst are kept. Only if the pipeline does not catch up, the oldest frames are dropped, until no more
+/// wait than the queue's configured length.
 #[derive(Debug)]
 pub struct EventQueue {
     lanes: Mutex<Lanes>,
@@ -53,18 +53,18 @@ pub struct EventQueue {
 struct Lanes {
     reads: VecDeque<(MonoTime, EventBody)>,
     frames: VecDeque<(MonoTime, FramePayload)>,
-    /// Whether the oldest frame is the next one, once the reads before it are handled.
+    /// Whether the oldest frame is next, as soon as the reads before it are handled.
     pinned: bool,
-    /// Whether lost frames were told since the last frame.
+    /// Whether lost frames were reported since the last frame.
     told: bool,
-    /// Since when more frames wait than the queue is set to hold; until all are taken.
+    /// Since when more frames wait than the configured length; reset when all are taken.
     crowded: Option<MonoTime>,
-    /// When the newest of everything was heard.
+    /// Arrival of the newest event of any kind.
     heard: Option<MonoTime>,
-    /// When a frame was last taken, by what was heard until then.
+    /// Arrival of the newest event when a frame was last taken.
     taken: Option<MonoTime>,
     dropped: PerSource<u32>,
-    /// Whether somebody wants the taker to look up.
+    /// Whether the taker is to return at once.
     woken: bool,
     last: Option<MonoTime>,
     next_seq: u64,
@@ -72,12 +72,12 @@ struct Lanes {
 }
 
 impl EventQueue {
-    /// A queue where so many frames wait for a pipeline that is behind.
+    /// A queue that holds this many frames for a pipeline that is behind.
     pub fn new(frames: usize) -> Self {
         Self { lanes: Mutex::default(), filled: Condvar::new(), frames: frames.max(1) }
     }
 
-    /// Puts in bytes of a line, or that a source came or went.
+    /// Puts in bytes of a line, or that a source appeared or disappeared.
     pub fn put(&self, t_recv: MonoTime, body: EventBody) {
         let mut lanes = self.lock();
         if lanes.reads.len() >= READS
@@ -92,7 +92,7 @@ impl EventQueue {
         self.filled.notify_one();
     }
 
-    /// Puts in a frame; where too many wait, the oldest goes that is not the next one.
+    /// Puts in a frame; where too many wait, the oldest one that is not next is dropped.
     pub fn put_frame(&self, t_recv: MonoTime, frame: FramePayload) {
         let mut lanes = self.lock();
         lanes.frames.push_back((t_recv, frame));
@@ -109,7 +109,7 @@ impl EventQueue {
         self.filled.notify_one();
     }
 
-    /// The next event in order of time; `None` where nothing came for `patience`.
+    /// The next event in order of time; `None` where none came for `patience`.
     pub fn take(&self, patience: Duration) -> Option<Event> {
         let mut lanes = self.lock();
         if lanes.is_empty() {
@@ -121,13 +121,13 @@ impl EventQueue {
         lanes.next()
     }
 
-    /// Has [`Self::take`] return at once, now or when it is called next.
+    /// Makes [`Self::take`] return at once, now or at its next call.
     pub fn wake(&self) {
         self.lock().woken = true;
         self.filled.notify_one();
     }
 
-    /// An event of the queue's own making (time passing), numbered in order.
+    /// An event that the queue makes itself (a tick), numbered in order.
     pub fn number(&self, t: MonoTime, body: EventBody) -> Event {
         self.lock().number(t, body)
     }
@@ -138,7 +138,7 @@ impl EventQueue {
 }
 
 impl Lanes {
-    /// Drops the oldest frame that is not the next one while there are too many, down to the newest.
+    /// Drops the oldest frame that is not next while there are too many, down to the newest.
     fn thin(&mut self, too_many: impl Fn(&Self) -> bool) {
         let goes = usize::from(self.pinned);
         while self.frames.len() > goes + 1 && too_many(self) {
@@ -151,7 +151,7 @@ impl Lanes {
         self.reads.is_empty() && self.frames.is_empty()
     }
 
-    /// Whether a frame heard at `t` comes too late.
+    /// Whether a frame that arrived at `t` is too late.
     fn is_stale(&self, t: MonoTime) -> bool {
         let since = |earlier: MonoTime| self.heard.map_or(Span::ZERO, |heard| heard - earlier);
         let starving = self.taken.is_none_or(|taken| since(taken) >= STARVING);
@@ -176,7 +176,7 @@ impl Lanes {
         let earliest = read.into_iter().chain(frame).min()?;
         let frame_is_next = frame.is_some_and(|t| read.is_none_or(|read| t < read));
         self.pinned = frame.is_some();
-        // What was lost is told before what is still here; frames with the next one, not one by one.
+        // Losses are reported before the events that remain; lost frames together with the next frame, not one by one.
         let frames_due = frame.is_none() || (frame_is_next && !self.told);
         let due = |source: Source| source != Source::Camera || frames_due;
         let lost = Source::ALL.iter().copied().find(|&source| self.dropped[source] > 0 && due(source));
@@ -200,8 +200,8 @@ impl Lanes {
     }
 
     fn number(&mut self, t: MonoTime, body: EventBody) -> Event {
-        // Two threads may stamp and put in the other order, microseconds apart; and no two events share
-        // an instant, so that a recording sorted by time has this order.
+        // Two threads may stamp and put in reverse order, microseconds apart. No two events share an instant, so a
+        // recording sorted by time has this order.
         let t_recv = self.last.map_or(t, |last| t.max(last + Span::from_ns(1)));
         self.last = Some(t_recv);
         let seq = self.next_seq;
@@ -269,11 +269,11 @@ mod tests {
     fn a_burst_is_kept() {
         let queue = EventQueue::new(2);
         for round in [0, 400, 1000, 5000] {
-            // Given a computer that stood still, which delivers everything at once.
+            // Given a computer that stood still, after which everything arrives at once.
             for n in 0..BURST as i64 {
                 queue.put_frame(at(round + n), frame(round + n));
             }
-            // Then all of it is there, in order.
+            // Then all of it is in the queue, in order.
             let events = drain(&queue);
             assert_eq!(events.len(), BURST);
             assert!(events.iter().all(|e| matches!(e.body, EventBody::Frame(_))), "{events:?}");
@@ -293,14 +293,14 @@ mod tests {
                 ages.extend(newest.map(|e| n * 33 - e.t_recv.ns() / 1_000_000));
             }
         }
-        // Then no frame is older than a queue of three, once it is clear that this is no burst.
+        // Then no frame is older than a queue of three allows, once the load is known not to be a burst.
         let late = ages[60..].iter().max().copied();
         assert!(late <= Some(100), "{ages:?}");
     }
 
     #[test]
     fn the_newest_frames_win_and_the_loss_is_told() {
-        // Given frames that nobody takes for longer than a burst lasts.
+        // Given frames that nobody takes for longer than the longest burst.
         let queue = EventQueue::new(2);
         for ms in [10, 20, 30, 40, 600] {
             queue.put_frame(at(ms), frame(ms));
@@ -323,7 +323,7 @@ mod tests {
 
     #[test]
     fn a_pipeline_behind_on_reads_still_sees_frames() {
-        // Given a pipeline that takes one read in the time of a frame, three reads behind.
+        // Given a pipeline that is three reads behind and takes one read in the time of a frame.
         let queue = EventQueue::new(2);
         for ms in [0, 10, 20] {
             queue.put(at(ms), EventBody::Bytes { source: Source::Compass, data: vec![0] });
@@ -334,14 +334,14 @@ mod tests {
             queue.put(at(ms + 1), EventBody::Bytes { source: Source::Compass, data: vec![0] });
             taken.extend(queue.take(Duration::ZERO));
         }
-        // Then it comes to a frame all the same, after the reads before it, and what was lost is told with it, once.
+        // Then it still reaches a frame, after the reads before it, and the losses are reported with it, once.
         let frames = taken.iter().filter(|e| matches!(e.body, EventBody::Frame(_))).count();
         let told = taken.iter().filter(|e| matches!(e.body, EventBody::Dropped { .. })).count();
-        assert!(frames >= 3 && told <= frames, "{frames} frames, {told} times told of lost ones: {taken:?}");
+        assert!(frames >= 3 && told <= frames, "{frames} frames, losses reported {told} times: {taken:?}");
     }
 
-    /// Feeds a queue for a minute: a read every 10 ms and a frame every 100 ms, and a pipeline that takes so long for
-    /// each. Gives how late each frame that it handled was, when that was, and how many were lost.
+    /// Feeds a queue for a minute: a read every 10 ms and a frame every 100 ms, and a pipeline that takes the given
+    /// time for each. Returns the lateness and the time of each handled frame, and the number of lost frames.
     fn behind(read_ms: i64, frame_ms: i64) -> (Vec<(i64, i64)>, u32) {
         let queue = EventQueue::new(3);
         let (mut now, mut fed, mut handled, mut lost) = (0, 0, Vec::new(), 0);
@@ -370,8 +370,8 @@ mod tests {
     fn a_pipeline_that_is_behind_catches_up_before_it_takes_a_frame() {
         // Given a pipeline that has a fifth of its time left for frames of 900 ms, when it runs for a minute.
         let (handled, lost) = behind(8, 900);
-        // Then no frame that it handles is of long ago, it handles as many as it has time for, and the rest is lost
-        // and counted.
+        // Then no handled frame is old, as many frames are handled as there is time for, and the rest is dropped and
+        // counted.
         assert!(handled.iter().all(|(_, late)| *late <= 520), "{handled:?}");
         assert!((9..=16).contains(&handled.len()), "{} frames: {handled:?}", handled.len());
         assert!((550..=600).contains(&(lost as usize + handled.len())), "{lost} lost, {handled:?}");
@@ -379,7 +379,7 @@ mod tests {
 
     #[test]
     fn a_pipeline_that_never_catches_up_handles_no_frame_of_long_ago() {
-        // Given a pipeline for which the reads alone are too much, then frames are lost and counted.
+        // Given a pipeline that is too slow for the reads alone, then frames are dropped and counted.
         let (handled, lost) = behind(12, 100);
         assert!(handled.iter().all(|(_, late)| *late <= 2_100), "{handled:?}");
         assert!(lost > 50 && !handled.is_empty(), "{lost} lost, {handled:?}");

@@ -1,7 +1,6 @@
 //! The one table of operator events: fixed names, severities, throttles. Each row is a `tracing` callsite.
 //!
-//! People search logs and write alarms for these names: a name never changes its meaning and is
-//! never used again.
+//! Operators search logs and write alarms for these names: a name never changes its meaning and is never reused.
 
 use std::fmt::Display;
 use std::path::Path;
@@ -16,11 +15,10 @@ use windhover_base::time::{self, MonoTime, NS_PER_S, UtcTime};
 
 use super::latencies::OfFlight;
 
-/// The target of every operator event, and of nothing else.
+/// The target of every operator event, used by nothing else.
 pub const TARGET: &str = "windhover";
 
-/// Makes the enum, its rows, and a callsite for each: `tracing` wants name, severity and the names of fields as
-/// constants.
+/// Makes the enum, its rows, and a callsite for each row: `tracing` needs name, severity and field names as constants.
 macro_rules! table {
     ($( $(#[$doc:meta])* $variant:ident: $name:literal, $level:ident, every $every_s:literal s; )*) => {
         /// An event for the operator.
@@ -53,35 +51,35 @@ macro_rules! table {
 }
 
 table! {
-    /// The daemon has begun.
+    /// The daemon has started.
     Started: "started", INFO, every 0 s;
-    /// Everything asked for is up.
+    /// Every required part is up.
     Ready: "ready", INFO, every 0 s;
-    /// Something asked for is not up yet.
+    /// A required part is not up yet.
     NotReady: "not_ready", WARN, every 30 s;
-    /// The end was asked for.
+    /// A stop was requested.
     Stopping: "stopping", INFO, every 0 s;
-    /// The end.
+    /// The daemon has stopped.
     Stopped: "stopped", INFO, every 0 s;
-    /// From exposure to estimate, over the whole flight; at its end.
+    /// Latency from exposure to estimate over the whole flight; sent at its end.
     Latencies: "latencies", INFO, every 0 s;
-    /// How everything does; once a second.
+    /// State of all parts; once a second.
     Health: "health", INFO, every 0 s;
     /// A device is open.
     DeviceUp: "device_up", INFO, every 0 s;
-    /// A device does not deliver; it is tried again.
+    /// A device does not deliver; it is opened again.
     DeviceDown: "device_down", WARN, every 30 s;
-    /// What arrives is not what this line speed and format should give.
+    /// The bytes that arrive do not fit the line's speed and format.
     DeviceGarbled: "device_garbled", WARN, every 10 s;
-    /// The driver's stamps cannot be used; arrival times stand in.
+    /// The driver's stamps cannot be used; arrival times replace them.
     CameraStampsUnusable: "camera_stamps_unusable", WARN, every 10 s;
     /// The driver flagged a frame as damaged.
     CameraFrameDamaged: "camera_frame_damaged", WARN, every 5 s;
-    /// The camera gives another format than asked for.
+    /// The camera delivers another format than requested.
     CameraFormatDiffers: "camera_format_differs", WARN, every 0 s;
-    /// Frames the driver counted and never delivered.
+    /// The driver counted frames that it did not deliver.
     CameraFramesMissed: "camera_frames_missed", WARN, every 5 s;
-    /// A receiver was configured as asked.
+    /// A receiver accepted its configuration.
     ReceiverConfigured: "receiver_configured", INFO, every 0 s;
     /// A receiver refused or ignored its configuration.
     ReceiverNotConfigured: "receiver_not_configured", WARN, every 0 s;
@@ -91,95 +89,95 @@ table! {
     FixAcquired: "fix_acquired", INFO, every 0 s;
     /// The receiver lost its position.
     FixLost: "fix_lost", WARN, every 0 s;
-    /// Nothing came from a source for longer than its time-out.
+    /// A source delivered nothing for longer than its time-out.
     SourceSilent: "source_silent", WARN, every 0 s;
     /// A silent source delivers again.
     SourceBack: "source_back", INFO, every 0 s;
     /// Bytes of a source were refused (checksum, range, grammar).
     BytesRefused: "bytes_refused", WARN, every 5 s;
-    /// A frame could not be read, or has the wrong size.
+    /// A frame could not be decoded, or has the wrong size.
     FrameUnusable: "frame_unusable", WARN, every 5 s;
     /// Parts of a frame are lost; the others are used.
     FrameDamaged: "frame_damaged", WARN, every 5 s;
     /// Frames or bytes were lost before they could be recorded.
     Dropped: "dropped", WARN, every 5 s;
-    /// The origin of the NED frame was settled.
+    /// The origin of the NED frame is settled.
     DatumSet: "datum_set", INFO, every 0 s;
-    /// Positions of the receiver cannot be used, and why.
+    /// Positions of the receiver cannot be used; the message gives the reason.
     PositionsUnused: "positions_unused", WARN, every 0 s;
-    /// The receiver's pulses come and are not used, and why.
+    /// The receiver's pulses arrive and are not used; the message gives the reason.
     PulseUnused: "pulse_unused", WARN, every 60 s;
-    /// The terrain tile of the configuration cannot be used here: the ground is level instead.
+    /// The terrain tile of the configuration cannot be used here: level ground is assumed instead.
     TerrainMissing: "terrain_missing", WARN, every 0 s;
     /// Declination was taken from the World Magnetic Model, or could not be.
     Declination: "declination", INFO, every 0 s;
-    /// A target was found and settled.
+    /// A target was found and its estimate has settled.
     TargetTracking: "target_tracking", INFO, every 0 s;
-    /// A target has not been seen for a moment.
+    /// A target is out of sight; its state is predicted.
     TargetCoasting: "target_coasting", INFO, every 5 s;
     /// A target is lost.
     TargetLost: "target_lost", WARN, every 0 s;
-    /// The filter started again.
+    /// The filter was reset.
     FilterReset: "filter_reset", WARN, every 0 s;
-    /// A stamp went back or leapt ahead.
+    /// A stamp went back or jumped ahead.
     ClockJump: "clock_jump", WARN, every 5 s;
-    /// Something measured does not fit the configuration, or the filter's model. The pipeline paces it.
+    /// A measurement does not fit the configuration or the filter's model. The pipeline limits the rate of this event.
     ModelMisfit: "model_misfit", WARN, every 0 s;
-    /// The same marker was seen at two places of a frame. The pipeline paces it.
+    /// The same marker was seen at two places of a frame. The pipeline limits the rate of this event.
     MarkerSeenTwice: "marker_seen_twice", WARN, every 0 s;
-    /// What the compass's tilt sensor feels was found out.
+    /// It was found out what the compass's tilt sensor measures.
     TiltFelt: "tilt_felt", INFO, every 0 s;
-    /// A flight was closed because power is going.
+    /// A flight was closed because power is failing.
     FlightClosed: "flight_closed", WARN, every 0 s;
     /// A flight began on the card.
     RecordingStarted: "recording_started", INFO, every 0 s;
-    /// Nothing goes to the card any more.
+    /// Recording to the card has stopped.
     RecordingStopped: "recording_stopped", WARN, every 5 s;
-    /// Recording goes on.
+    /// Recording continues.
     RecordingResumed: "recording_resumed", INFO, every 0 s;
-    /// The flight has its date.
+    /// The flight's directory was named by its date.
     FlightNamed: "flight_named", INFO, every 0 s;
-    /// Something was dropped because the card did not keep up.
+    /// Data was dropped because the card did not keep up.
     RecordingDropout: "recording_dropout", WARN, every 5 s;
-    /// Less is free than wanted, and nothing may be deleted.
+    /// Less space is free than required, and nothing may be deleted.
     CardAlmostFull: "card_almost_full", WARN, every 5 s;
-    /// A segment that was cut or holed was sealed.
+    /// A segment that was cut or had a gap was sealed.
     SegmentSealed: "segment_sealed", INFO, every 0 s;
-    /// A flight was deleted to make room or for its age.
+    /// A flight was deleted for space or for its age.
     FlightDeleted: "flight_deleted", INFO, every 0 s;
-    /// The index was unusable and is being made again.
+    /// The index was unusable and is being rebuilt.
     IndexRebuilding: "index_rebuilding", WARN, every 5 s;
     /// The index is complete.
     IndexReady: "index_ready", INFO, every 0 s;
-    /// Something of the store beside recording failed.
+    /// A part of the store other than recording failed.
     StoreFailed: "store_failed", WARN, every 5 s;
     /// A ground station is connected.
     LinkUp: "link_up", INFO, every 0 s;
-    /// A ground station went away.
+    /// A ground station is disconnected.
     LinkDown: "link_down", WARN, every 0 s;
     /// The link does not work.
     LinkFault: "link_fault", WARN, every 30 s;
-    /// MAVLink does not reach a station: its name is not found, or the system does not take its datagrams.
+    /// MAVLink does not reach a station: its name does not resolve, or the system refuses its datagrams.
     MavlinkFault: "mavlink_fault", WARN, every 30 s;
-    /// MAVLink goes to that station again.
+    /// MAVLink is sent to that station again.
     MavlinkUp: "mavlink_up", INFO, every 0 s;
-    /// The autopilot is followed, was started anew, or is not the only one.
+    /// An autopilot was found, was restarted, or is not the only one.
     AutopilotNote: "autopilot_note", WARN, every 5 s;
-    /// The supply voltage is going.
+    /// The supply voltage is failing.
     PowerGoing: "power_going", ERROR, every 0 s;
     /// The supply voltage is back.
     PowerBack: "power_back", INFO, every 0 s;
     /// The computer is hot.
     Hot: "hot", WARN, every 60 s;
-    /// There is a state of an earlier run; whether it is continued from.
+    /// A state of an earlier run exists; the message states whether it is used.
     WarmStart: "warm_start", INFO, every 0 s;
     /// The configuration was read again.
     Reloaded: "reloaded", INFO, every 0 s;
-    /// A changed value of the configuration takes a restart.
+    /// A changed value of the configuration needs a restart.
     NeedsRestart: "needs_restart", WARN, every 0 s;
-    /// The configuration could not be read again; the old one stays.
+    /// The configuration could not be read again; the previous one stays in use.
     ReloadRefused: "reload_refused", ERROR, every 0 s;
-    /// A task does not answer; the watchdog is not stroked.
+    /// A task does not answer; the watchdog is not notified.
     TaskSilent: "task_silent", ERROR, every 5 s;
     /// A task answers again.
     TaskBack: "task_back", INFO, every 0 s;
@@ -187,7 +185,7 @@ table! {
     TaskFailed: "task_failed", ERROR, every 0 s;
     /// The log's file cannot be written.
     LogFile: "log_file", WARN, every 30 s;
-    /// A sink of the log does not keep up: lines are missing there.
+    /// A sink of the log is too slow: lines are missing there.
     LogLinesLost: "log_lines_lost", WARN, every 30 s;
 }
 
@@ -195,11 +193,11 @@ table! {
 struct Row {
     name: &'static str,
     level: Level,
-    /// At most one line this often about the same thing; what came between is counted.
+    /// Shortest time between two lines about the same subject; those between are counted.
     every: time::Span,
 }
 
-/// Emits a row with fields of its own.
+/// Emits a row with additional fields.
 macro_rules! emit {
     ($variant:ident, { $($fields:tt)* }, $($words:tt)+) => {
         tracing::event!(
@@ -223,12 +221,12 @@ impl OperatorEvent {
         self.row().level
     }
 
-    /// At most one line this often about the same thing.
+    /// Shortest time between two lines about the same subject.
     pub const fn throttle(self) -> time::Span {
         self.row().every
     }
 
-    /// What is over with it, so that it is news when it happens to the same thing again.
+    /// The event that this one ends, so that its next occurrence for the same subject is shown at once.
     pub const fn ends(self) -> Option<Self> {
         match self {
             Self::DeviceUp => Some(Self::DeviceDown),
@@ -236,14 +234,14 @@ impl OperatorEvent {
         }
     }
 
-    /// Which row a `tracing` event comes from; `None` where a library emitted it.
+    /// The row that a `tracing` event comes from; `None` where a library emitted it.
     pub fn of(metadata: &Metadata<'_>) -> Option<Self> {
         let row = |name| Self::ALL.iter().copied().find(|event| event.name() == name);
         (metadata.target() == TARGET).then(|| row(metadata.name()))?
     }
 
-    /// Emits it now; `about` names what it is about (a source, a task, a peer), and is empty where that is the
-    /// daemon. The same event about the same thing is throttled.
+    /// Emits the event now; `about` names its subject (a source, a task, a peer), and is empty where that is the
+    /// daemon. The same event about the same subject is throttled.
     pub fn emit(self, about: &str, words: impl Display) {
         self.send(None, about, &words);
     }
@@ -311,7 +309,7 @@ impl From<&StoreNotice> for OperatorEvent {
     }
 }
 
-/// Emits the pipeline's notice, at its own time; replay and daemon show it alike.
+/// Emits the pipeline's notice, at its own time; replay and daemon show it in the same way.
 pub fn notice(notice: &Notice) {
     if let Some(misfit) = &notice.misfit {
         return model_misfit(notice.t, misfit);
@@ -325,13 +323,13 @@ fn model_misfit(t: MonoTime, misfit: &MisfitWords) {
     emit!(ModelMisfit, { t_ns = t.ns(), source, figure, cause }, "{advice}");
 }
 
-/// Emits that the daemon has begun.
+/// Emits that the daemon has started.
 pub fn started(config: &Path) {
     let version = env!("CARGO_PKG_VERSION");
     emit!(Started, { version, config = config.display().to_string() }, "");
 }
 
-/// Emits that a device does not deliver. The same fault of it is throttled; another one shows at once.
+/// Emits that a device does not deliver. The same fault of a device is throttled; another fault shows at once.
 pub fn device_down(about: &str, fault: &Fault) {
     emit!(DeviceDown, { about, fault = fault.kind.name() }, "{fault}");
 }
@@ -345,24 +343,24 @@ pub fn latencies(of: &OfFlight) {
     );
 }
 
-/// Emits how many lines a sink of the log is short of.
+/// Emits how many lines a sink of the log has lost.
 pub fn log_lines_lost(sink: &str, lines: u64) {
     emit!(LogLinesLost, { about = sink, lines }, "the sink does not keep up");
 }
 
-/// The span around everything that a run of the daemon does; the flight becomes known later.
+/// The span of a daemon's run; its flight becomes known later.
 pub fn run_span(began: MonoTime) -> Span {
     let run = UtcTime::from_unix_ns(began.ns()).compact();
-    // Of the gravest severity, to be there whatever is shown.
+    // At the highest severity, so that it exists whatever level is shown.
     tracing::error_span!(target: TARGET, "run", run, flight = Empty)
 }
 
-/// The flight that the card records from now on, for the span around the caller.
+/// Sets the flight that the card records from now on, in the caller's span.
 pub fn flight(name: &str) {
     Span::current().record("flight", name);
 }
 
-/// Decimals with which a field's figure is shown; those of a sigma are its figure's.
+/// Decimals of a field's value; a sigma has those of its value.
 pub fn decimals(field: &str) -> Option<usize> {
     Some(match field.strip_suffix("_sigma").unwrap_or(field) {
         "card_free_mb" | "cpu_pct" | "mem_mb" | "recording_s" | "card_left_s" => 0,

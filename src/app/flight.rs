@@ -1,4 +1,4 @@
-//! A flight read whole into memory for looking at: everything but the pictures.
+//! A flight read into memory for evaluation: everything except the pictures.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -16,16 +16,16 @@ use windhover_base::geo::Geodetic;
 use windhover_base::msg::{EventBody, FramePayload};
 use windhover_base::time::{MonoTime, UtcTime};
 
-/// What was estimated of one target.
+/// The estimates of one target.
 #[derive(Clone, Debug, Default)]
 pub struct Track {
-    /// As known in real time, one a frame.
+    /// In real time, one for each frame.
     pub filtered: Vec<wh::TargetState>,
     /// From the fixed-lag smoother.
     pub smoothed: Vec<wh::TargetState>,
     /// By the paper's method.
     pub paper: Vec<wh::TargetState>,
-    /// From the whole flight at once.
+    /// From the refinement of the whole flight.
     pub refined: Vec<wh::TargetState>,
 }
 
@@ -36,11 +36,11 @@ pub struct FrameArrival {
     pub t_recv: MonoTime,
     /// When it was exposed.
     pub t_exposure: MonoTime,
-    /// Its size as recorded.
+    /// Its size in the recording.
     pub bytes: usize,
 }
 
-/// Targets that are kept: a configuration has half as many at most.
+/// Most targets that are kept: a configuration has at most half as many.
 const TARGETS: usize = 64;
 
 /// A flight.
@@ -50,7 +50,7 @@ pub struct Flight {
     pub name: String,
     /// The configuration it was flown or replayed with, as text.
     pub config_text: Option<String>,
-    /// The same, understood.
+    /// The same, parsed.
     pub config: Option<Config>,
     /// Log time of the first message.
     pub began: MonoTime,
@@ -58,7 +58,7 @@ pub struct Flight {
     pub ended: MonoTime,
     /// UTC of the first epoch that had a date.
     pub utc: Option<UtcTime>,
-    /// What was damaged.
+    /// Damage that was found.
     pub warnings: Vec<String>,
     /// Origin of the NED frame.
     pub datum: Option<Geodetic>,
@@ -66,25 +66,25 @@ pub struct Flight {
     pub targets: BTreeMap<String, Track>,
     /// The helicopter's own state, at frames and between them, in order of time.
     pub ownship: Vec<wh::Ownship>,
-    /// The same from the whole flight at once.
+    /// The same from the refinement of the whole flight.
     pub ownship_refined: Vec<wh::Ownship>,
-    /// What a refinement says of the configuration.
+    /// What a refinement found about the configuration.
     pub refined: Option<wh::Refined>,
     /// GPS epochs.
     pub epochs: Vec<wh::GnssEpoch>,
     /// Compass samples.
     pub attitudes: Vec<wh::Attitude>,
-    /// What was seen in each frame.
+    /// The detections of each frame.
     pub detections: Vec<wh::Detections>,
-    /// What became of measurements.
+    /// What was done with each measurement.
     pub fusion: Vec<wh::Fusion>,
-    /// Once a second.
+    /// Health, once a second.
     pub health: Vec<wh::Health>,
     /// Operator's notices.
     pub notices: Vec<fox::Log>,
-    /// Losses, arrivals and departures of devices.
+    /// Losses, and devices that appeared and disappeared.
     pub source_events: Vec<wh::SourceEvent>,
-    /// Reads of bytes, of all sources.
+    /// Number of reads of bytes, from all sources.
     pub reads: usize,
     /// Frames, in the order of their numbers.
     pub frames: Vec<FrameArrival>,
@@ -160,7 +160,7 @@ impl Flight {
             return;
         }
         if self.targets.len() >= TARGETS && !self.targets.contains_key(name) {
-            let words = format!("there are more than {TARGETS} targets: the rest is left out");
+            let words = format!("there are more than {TARGETS} targets: the others are left out");
             if !self.warnings.contains(&words) {
                 self.warnings.push(words);
             }
@@ -177,12 +177,12 @@ impl Flight {
         states.pop_if(|state| !state.is_sound());
     }
 
-    /// Whether a frame came, be it kept or not.
+    /// Whether frames were received, stored or not.
     pub fn had_frames(&self) -> bool {
         !self.frames.is_empty() || !self.detections.is_empty()
     }
 
-    /// Seconds from the beginning.
+    /// Seconds from the start.
     pub fn seconds(&self, t: MonoTime) -> f64 {
         (t - self.began).s()
     }
@@ -199,7 +199,7 @@ impl Flight {
 }
 
 fn keep<M: Message + Default>(list: &mut Vec<M>, raw: &RawMessage) {
-    // A message that cannot be decoded is of another version; the reader tells of damage.
+    // A message that cannot be decoded is of another version; the reader reports damage.
     list.extend(M::decode(&raw.data[..]).ok());
 }
 

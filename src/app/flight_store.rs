@@ -1,4 +1,4 @@
-//! Handle on the flight store, and what the store's task is asked to do.
+//! Handle on the flight store, and the requests to the store's task.
 
 use std::sync::Arc;
 
@@ -7,18 +7,17 @@ use tokio_util::sync::CancellationToken;
 
 use crate::io::store::StoreHandle;
 
-/// The store while it runs; empty while it is closed because power is about to fail. Copies are the same
-/// handle.
+/// The store while it runs; empty while it is closed because power is about to fail. Copies share the same store.
 #[derive(Clone, Debug, Default)]
 pub struct FlightStore(Arc<watch::Sender<Option<StoreHandle>>>);
 
 impl FlightStore {
-    /// The store, where it runs.
+    /// The store, if it is running.
     pub fn get(&self) -> Option<StoreHandle> {
         self.0.borrow().clone()
     }
 
-    /// Waits until the store runs.
+    /// Waits until the store is running.
     pub async fn opened(&self) -> StoreHandle {
         let mut changes = self.0.subscribe();
         loop {
@@ -37,7 +36,7 @@ impl FlightStore {
     }
 }
 
-/// What the store's task is asked to do. Copies are the same orders.
+/// Requests to the store's task. Copies share the same requests.
 #[derive(Clone, Debug, Default)]
 pub struct StoreOrders {
     /// The pipeline has handed over its last output.

@@ -1,5 +1,5 @@
-//! Raw geo-positions of a flight's markers against the truth, as the paper compared them: the latest
-//! fix carried on by its velocity, the latest compass sample, one pixel; no filter.
+//! Raw geo-positions of a flight's markers against the truth, as the paper compared them: the latest fix extrapolated
+//! by its velocity, the latest compass sample, one pixel; no filter.
 
 use nalgebra::Vector3;
 
@@ -10,13 +10,13 @@ use windhover_base::geo::{Geodetic, Ground, LocalFrame, Tilt, locate, rot_z};
 use windhover_base::msg::{AttitudeSample, GnssEpoch, MarkerDetection, MarkerId, Stamped};
 use windhover_base::settings::{MarkerConfig, Rig};
 
-/// Farthest slant used, metres.
+/// Largest slant range used, metres.
 const LIMIT_M: f64 = 500.0;
-/// A fix or sample older than this is not carried on, seconds.
+/// A fix or sample older than this is not extrapolated, seconds.
 const OLDEST_S: f64 = 1.0;
 
-/// (north, east) errors, metres, of every sighting of a marker of the first target. The truth is of
-/// the target's reference point, or, where it is a single surveyed row, of that point at rest.
+/// (north, east) errors, metres, of every detection of a marker of the first target. The truth is that of the target's
+/// reference point, or, where it is a single surveyed row, of that point at rest.
 pub fn errors(
     flight: &Flight,
     (rig, ground_msl_m): (&Rig, f64),
@@ -82,7 +82,7 @@ fn error(
     let heading = heading + declination + compass.yaw_offset_deg.to_radians();
     let ned_from_body = compass.angles.ned_from_body(heading, level)?;
     let (lat_deg, lon_deg, alt) = (fix.value.lat_deg?, fix.value.lon_deg?, fix.value.alt_msl_m?);
-    // The frame of the truth, at the ground: heights are above mean sea level on both sides.
+    // The local frame of the truth, at the ground: heights are above mean sea level on both sides.
     let frame = LocalFrame::new(Geodetic { height_m: ground_msl_m, ..truth });
     let antenna = frame.ned(Geodetic { lat_deg, lon_deg, height_m: alt })
         + fix.value.vel_ned_mps.unwrap_or_default() * age_s;

@@ -1,4 +1,4 @@
-//! The health line: everything an operator wants to see, once a second, on one line.
+//! The health line: the state of every part, once a second, on one line.
 
 use tracing::Level;
 
@@ -10,18 +10,18 @@ use windhover_base::time::{MonoTime, Span};
 use super::callsite::RuntimeCallsite;
 use super::events::{OperatorEvent, TARGET};
 
-/// Figures that only a running daemon has.
+/// Values that only a running daemon has.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Figures {
     /// Exposure to estimate, median, of the last ten seconds.
     pub latency_p50: Option<Span>,
-    /// Exposure to estimate, 99 of 100.
+    /// Exposure to estimate, 99th percentile.
     pub latency_p99: Option<Span>,
-    /// State of the data card in a word, and its figures.
+    /// State of the data card, and its values.
     pub card: CardFigures,
-    /// State of the link in a word; empty where there is none.
+    /// State of the link; empty where there is none.
     pub link: String,
-    /// Where MAVLink goes, and how many datagrams did and did not, in words; empty where none is sent.
+    /// Where MAVLink is sent, and how many datagrams were and were not sent, as text; empty where it is off.
     pub mavlink: String,
     /// Temperature, degrees Celsius.
     pub temperature_c: Option<f64>,
@@ -31,11 +31,11 @@ pub struct Figures {
     pub cpu_percent: Option<f64>,
     /// Resident memory, megabytes.
     pub memory_mb: Option<f64>,
-    /// Whether something here deserves a warning.
+    /// Whether one of these values deserves a warning.
     pub warn: bool,
 }
 
-/// How the data card does.
+/// State of the data card.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct CardFigures {
     /// `ok`, `off`, `full`, `failed`, ….
@@ -44,18 +44,18 @@ pub struct CardFigures {
     pub flight: String,
     /// Free space, megabytes.
     pub free_mb: Option<f64>,
-    /// How long this flight is recorded already.
+    /// How long this flight has been recorded.
     pub recording: Option<Span>,
-    /// How long the free space lasts at the flight's pace.
+    /// How long the free space lasts at the flight's data rate.
     pub left: Option<Span>,
-    /// Time to make a second's data safe, 99 of 100.
+    /// Time to make a second's data durable, 99th percentile.
     pub sync_p99: Option<Span>,
-    /// Messages that could not be kept since the start.
+    /// Messages that could not be stored since the start.
     pub dropped: u64,
 }
 
 impl Figures {
-    /// Latency, card, computer, in this order; nothing where it is not known.
+    /// Latency, card, computer, in this order; empty where not known.
     fn numbers(&self) -> [(&'static str, Option<f64>); 11] {
         let ms = |span: Option<Span>| span.map(|span| span.ms());
         let dropped = (self.card.dropped > 0).then_some(self.card.dropped as f64);
@@ -74,7 +74,7 @@ impl Figures {
         ]
     }
 
-    /// As the flight's health messages have them: figures and words by name.
+    /// The form of the flight's health messages: numbers and texts by name.
     pub fn by_name(&self) -> DaemonFigures {
         let known = self.numbers().into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?)));
         let words = [
@@ -127,20 +127,20 @@ impl Fields {
         self.0.push((name.to_owned(), figure.map(Value::Figure)));
     }
 
-    /// A figure and its one-sigma, which is left out where it is not finite.
+    /// A value and its one-sigma, which is left out where it is not finite.
     fn estimate(&mut self, name: &str, figure: Option<f64>, sigma: Option<f64>) {
         self.figure(name, figure);
         self.figure(&format!("{name}_sigma"), sigma.filter(|sigma| sigma.is_finite()));
     }
 
-    /// Rate, and the age where there is one, of a source that there is.
+    /// Rate, and the age where there is one, of a configured source.
     fn source(&mut self, source: Source, health: Option<&SourceHealth>) {
         let name = source.name();
         self.figure(&format!("{name}_hz"), health.map(|health| health.rate_hz));
         self.figure(&format!("{name}_age_s"), health.and_then(|health| health.age).map(|age| age.s()));
     }
 
-    /// Status, figures and the age of a target's last estimate at `t`.
+    /// Status, values and the age of a target's last estimate at `t`.
     fn target(&mut self, name: &str, target: Option<&TargetHealth>, t: MonoTime) {
         self.text(name, target.map(|target| target.last.status.name()));
         self.count(&format!("{name}_seen"), target.map(|target| u64::from(target.frames_seen)));
@@ -178,7 +178,7 @@ impl Fields {
     }
 }
 
-/// The health line, as an event whose fields hold the names of the targets.
+/// The health line: an event whose fields contain the names of the targets.
 pub struct HealthLine {
     targets: Vec<String>,
     info: &'static RuntimeCallsite,
@@ -186,7 +186,7 @@ pub struct HealthLine {
 }
 
 impl HealthLine {
-    /// Of these targets; made once.
+    /// The line for these targets; made once.
     pub fn new(config: &Config) -> Self {
         Self::of(config.target.iter().map(|target| target.name.clone()).collect())
     }
@@ -198,8 +198,8 @@ impl HealthLine {
         Self { targets, info: callsite(Level::INFO), warn: callsite(Level::WARN) }
     }
 
-    /// Emits it, at its own time; `figures` where a daemon runs, none in replay. Normal flight is information; a
-    /// silent source, a misfit or a failing card is a warning.
+    /// Emits the line, at its own time; `figures` where a daemon runs, `None` in replay. Normal flight is information;
+    /// a silent source, a misfit or a failing card is a warning.
     pub fn emit(&self, health: &Health, figures: Option<&Figures>) {
         let silent = health.sources.iter().any(|source| source.rate_hz <= 0.0);
         let troubled = silent || !health.misfits.is_empty();
@@ -210,7 +210,7 @@ impl HealthLine {
     }
 }
 
-/// The fields and their values; the fields are the same whatever the health is.
+/// The fields and their values; the fields do not depend on the health.
 fn fields(health: &Health, targets: &[String], figures: Option<&Figures>) -> Fields {
     let mut fields = Fields::default();
     fields.0.push(("t_ns".into(), Some(Value::Time(health.t.ns()))));

@@ -1,4 +1,4 @@
-//! Import: recordings people already have, merged into one capture in order of time.
+//! Import: existing recordings, merged into one capture in order of time.
 
 use std::iter::Peekable;
 use std::path::{Path, PathBuf};
@@ -32,7 +32,7 @@ pub struct Sources {
     pub topics: Vec<String>,
     /// Video file, or folder of images.
     pub video: Option<PathBuf>,
-    /// When the video's first frame was taken; with the first line of the logs where absent.
+    /// When the video's first frame was taken; where absent, the time of the first line of the logs.
     pub video_start: Option<MonoTime>,
 }
 
@@ -45,13 +45,15 @@ pub enum ImportFailure {
     /// The capture could not be written.
     #[error(transparent)]
     Write(#[from] WriteError),
-    /// Nothing was asked for.
+    /// No source was given.
     #[error(
         "nothing to import: give at least one of --gps, --compass, --imu, --attitude, --log, --bag, --video"
     )]
     Nothing,
-    /// Two sources tell the same.
-    #[error("--log and --bag both tell of the helicopter: give one of them, or a bag of images alone")]
+    /// Two sources carry the same measurements.
+    #[error(
+        "--log and --bag both contain the helicopter's measurements: give one of them, or a bag of images alone"
+    )]
     Twice,
 }
 
@@ -68,15 +70,15 @@ pub struct Imported {
     pub attitude_samples: usize,
     /// Packets of the autopilot.
     pub packets: usize,
-    /// Fixes, attitudes and inertial samples of which packets were made.
+    /// Fixes, attitudes and inertial samples from which packets were made.
     pub measured: [usize; 3],
     /// Frames.
     pub frames: u32,
     /// How the video was read.
     pub video: Option<VideoSource>,
-    /// From first to last event.
+    /// Time from the first to the last event.
     pub length: Span,
-    /// What was left out, in words.
+    /// What was left out, as text.
     pub warnings: Vec<String>,
 }
 
@@ -146,7 +148,7 @@ pub fn import(sources: &Sources, config_toml: &str, out: &Path) -> Result<Import
     Ok(imported)
 }
 
-/// Takes a log's packets over; gives what they were made of.
+/// Takes over a log's packets; returns their origin.
 fn packets(log: ImportedLog, serial: &mut Vec<(MonoTime, EventBody)>, imported: &mut Imported) -> String {
     imported.packets += log.packets.len();
     imported.measured = std::array::from_fn(|k| imported.measured[k] + log.counts[k]);
@@ -156,12 +158,12 @@ fn packets(log: ImportedLog, serial: &mut Vec<(MonoTime, EventBody)>, imported: 
     log.made_of
 }
 
-/// What goes into a capture.
+/// The content of a capture.
 struct Merged {
     /// In order of time.
     serial: Vec<(MonoTime, EventBody)>,
     frames: Peekable<Frames>,
-    /// Of what the autopilot's packets were made; empty where they are its own.
+    /// The origin of the autopilot's packets; empty where they are its own.
     made_of: String,
 }
 
@@ -170,7 +172,7 @@ fn serial_lines(path: &Path, warnings: &mut Vec<String>) -> Result<Vec<(MonoTime
     if let Some(first) = log.untimed.first() {
         let count = log.untimed.len();
         warnings.push(format!(
-            "{}: {} without a time left out, line {first} first",
+            "{}: {} without a time left out, the first at line {first}",
             path.display(),
             counted(count, "line")
         ));
@@ -178,12 +180,12 @@ fn serial_lines(path: &Path, warnings: &mut Vec<String>) -> Result<Vec<(MonoTime
     Ok(log.lines)
 }
 
-/// The samples of a table; rows left out are warned of.
+/// The samples of a table; a warning reports rows that were left out.
 fn rows<T>(path: &Path, table: Samples<T>, warnings: &mut Vec<String>) -> Vec<(MonoTime, T)> {
     if let Some(first) = table.unread.first() {
         let count = table.unread.len();
         warnings.push(format!(
-            "{}: {} that cannot be read left out, line {first} first",
+            "{}: {} that cannot be read left out, the first at line {first}",
             path.display(),
             counted(count, "row")
         ));

@@ -1,4 +1,5 @@
-//! Exposure to estimate: the last frames for the health line, every frame for the last line of a flight.
+//! Latency from exposure to estimate: of the last frames for the health line, of every frame for the last event of a
+//! flight.
 
 use std::collections::VecDeque;
 
@@ -7,11 +8,11 @@ use windhover_base::time::Span;
 /// Ten seconds at thirty frames a second.
 const KEPT: usize = 300;
 
-/// Bounds of the classes that all frames are counted in grow by this factor from [`FIRST_MS`]: a quantile
-/// of the whole flight is known to two percent.
+/// The bounds of the classes in which all frames are counted grow by this factor from [`FIRST_MS`]: a quantile of the
+/// whole flight is exact to two percent.
 const GROWTH: f64 = 1.02;
 const FIRST_MS: f64 = 0.05;
-/// Up to some 20 s; what is longer counts in the last class.
+/// Up to some 20 s; longer latencies count in the last class.
 const CLASSES: usize = 650;
 
 /// Latencies of a flight's frames.
@@ -22,16 +23,16 @@ pub struct Latencies {
     longest: Span,
 }
 
-/// What a whole flight's frames took.
+/// The latencies of a whole flight.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct OfFlight {
     /// Frames counted.
     pub frames: u64,
-    /// Half took no longer.
+    /// Median.
     pub p50: Span,
-    /// 99 of 100 took no longer.
+    /// 99th percentile.
     pub p99: Span,
-    /// The longest.
+    /// Maximum.
     pub longest: Span,
 }
 
@@ -42,7 +43,7 @@ impl Default for Latencies {
 }
 
 impl Latencies {
-    /// Takes one in.
+    /// Adds a latency.
     pub fn push(&mut self, latency: Span) {
         if self.recent.len() == KEPT {
             self.recent.pop_front();
@@ -52,7 +53,7 @@ impl Latencies {
         self.longest = self.longest.max(latency);
     }
 
-    /// The smallest latency that `share` (0 to 1) of the last frames kept.
+    /// The smallest latency that is not exceeded by the share `share` (0 to 1) of the last frames.
     pub fn quantile(&self, share: f64) -> Option<Span> {
         let mut sorted: Vec<Span> = self.recent.iter().copied().collect();
         sorted.sort_unstable();
@@ -60,7 +61,7 @@ impl Latencies {
         sorted.get(rank.max(1) - 1).copied()
     }
 
-    /// All frames so far; `None` before the first.
+    /// Over all frames so far; `None` before the first.
     pub fn of_flight(&self) -> Option<OfFlight> {
         let frames = self.classes.iter().sum();
         let at = |share| Some(self.upper(share, frames)?.min(self.longest));
@@ -68,7 +69,7 @@ impl Latencies {
         Some(OfFlight { frames, p50: at(0.5)?, p99: at(0.99)?, longest: self.longest })
     }
 
-    /// Upper bound of the class in which `share` of all `frames` is reached.
+    /// Upper bound of the class in which the share `share` of all `frames` is reached.
     fn upper(&self, share: f64, frames: u64) -> Option<Span> {
         let rank = ((share * frames as f64).ceil() as u64).max(1);
         let mut so_far = 0;
@@ -80,7 +81,7 @@ impl Latencies {
     }
 }
 
-/// The class whose upper bound is the first not under `latency`.
+/// The first class whose upper bound is not below `latency`.
 fn class(latency: Span) -> usize {
     let steps = (latency.ms().max(FIRST_MS) / FIRST_MS).ln() / GROWTH.ln();
     (steps.ceil() as usize).min(CLASSES - 1)

@@ -1,4 +1,5 @@
-//! The metrics task: answers who asks on loopback for the daemon's health as OpenMetrics. One at a time, each briefly.
+//! The metrics task: answers requests on loopback for the daemon's health as OpenMetrics, one at a time, with a short
+//! time limit.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -8,26 +9,26 @@ use tokio::net::{TcpListener, TcpStream};
 
 use super::context::TaskContext;
 use super::events::OperatorEvent;
-use super::openmetrics::{self, Told};
+use super::openmetrics::{self, PayloadMetrics};
 use super::sinks::LatestHealth;
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 
-/// A question and its answer take no longer.
+/// Time limit of a request and its answer.
 const BRIEFLY: Duration = Duration::from_secs(2);
-/// Longest question.
+/// Longest request.
 const QUESTION: usize = 8 << 10;
-/// Pause before the port is tried again.
+/// Pause before the port is opened again.
 const PAUSE: Duration = Duration::from_secs(5);
 
-/// Answers until the end is asked for.
-pub async fn run(address: SocketAddr, latest: LatestHealth, context: TaskContext, heart: Heart) {
+/// Answers until a stop is requested.
+pub async fn run(address: SocketAddr, latest: LatestHealth, context: TaskContext, heartbeat: Heartbeat) {
     tokio::select! {
         () = context.stop.cancelled() => {}
-        () = serve(address, &latest, &heart) => {}
+        () = serve(address, &latest, &heartbeat) => {}
     }
 }
 
-async fn serve(address: SocketAddr, latest: &LatestHealth, heart: &Heart) {
+async fn serve(address: SocketAddr, latest: &LatestHealth, heartbeat: &Heartbeat) {
     let mut told = false;
     let listener = loop {
         match TcpListener::bind(address).await {
@@ -37,17 +38,17 @@ async fn serve(address: SocketAddr, latest: &LatestHealth, heart: &Heart) {
                     let words = format!("cannot listen on {address}: {error}; tried again");
                     OperatorEvent::LinkFault.emit("metrics", words);
                 }
-                heart.while_waiting(tokio::time::sleep(PAUSE)).await;
+                heartbeat.while_waiting(tokio::time::sleep(PAUSE)).await;
             }
         }
     };
     loop {
-        match heart.while_waiting(listener.accept()).await {
+        match heartbeat.while_waiting(listener.accept()).await {
             Ok((stream, _)) => {
-                // Who asks slowly, or goes, gets nothing.
-                let _ = heart.while_waiting(tokio::time::timeout(BRIEFLY, answer(stream, latest))).await;
+                // A client that is too slow or leaves gets no answer.
+                let _ = heartbeat.while_waiting(tokio::time::timeout(BRIEFLY, answer(stream, latest))).await;
             }
-            Err(_) => heart.while_waiting(tokio::time::sleep(PAUSE)).await,
+            Err(_) => heartbeat.while_waiting(tokio::time::sleep(PAUSE)).await,
         }
     }
 }
@@ -64,7 +65,7 @@ async fn answer(mut stream: TcpStream, latest: &LatestHealth) -> std::io::Result
     }
     let (status, body) = match question.strip_prefix(b"GET /metrics") {
         Some([b' ' | b'?', ..]) => ("200 OK", text(latest)),
-        _ => ("404 Not Found", "ask for /metrics\n".into()),
+        _ => ("404 Not Found", "request /metrics\n".into()),
     };
     let head = format!(
         "HTTP/1.1 {status}\r\nContent-Type: {}\r\nContent-Length: {}\r\nConnection: close\r\n\r\n",
@@ -78,6 +79,6 @@ async fn answer(mut stream: TcpStream, latest: &LatestHealth) -> std::io::Result
 
 fn text(latest: &LatestHealth) -> String {
     let health = latest.get();
-    let told = health.iter().map(|health| Told { payload: "", health, age_s: None, link: None });
+    let told = health.iter().map(|health| PayloadMetrics { payload: "", health, age_s: None, link: None });
     openmetrics::render(&told.collect::<Vec<_>>())
 }

@@ -1,42 +1,43 @@
-//! Health as OpenMetrics, for Prometheus and its kin (<https://github.com/prometheus/OpenMetrics>, version 1.0).
+//! Health as OpenMetrics, for Prometheus and compatible programs (<https://github.com/prometheus/OpenMetrics>, version
+//! 1.0).
 
 use std::fmt::Write as _;
 
 use crate::io::proto::windhover::{Health, TrackStatus};
 
-/// What answers name as their kind.
+/// The content type of answers.
 pub const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
-/// What is told of one payload.
+/// The state of one payload.
 #[derive(Clone, Debug)]
-pub struct Told<'a> {
-    /// Its name; empty where it tells of itself.
+pub struct PayloadMetrics<'a> {
+    /// Its name; empty where the payload itself answers.
     pub payload: &'a str,
     /// Its latest health.
     pub health: &'a Health,
-    /// How old that is, where somebody else tells it.
+    /// Its age, where a station answers for the payload.
     pub age_s: Option<f64>,
-    /// Whether it is connected, and the round trip, where there is a link.
+    /// Whether it is connected, and the round-trip time, where there is a link.
     pub link: Option<(bool, f64)>,
 }
 
-/// Labels and a figure.
+/// Labels and a value.
 type Sample = (Vec<(&'static str, String)>, f64);
 
-/// One kind of figure: name, gauge or counter, what it is, where it comes from.
+/// One kind of value: name, gauge or counter, description, source.
 struct Family {
     name: &'static str,
     kind: &'static str,
     help: &'static str,
-    samples: fn(&Told<'_>) -> Vec<Sample>,
+    samples: fn(&PayloadMetrics<'_>) -> Vec<Sample>,
 }
 
 const FAMILIES: &[Family] = &[
-    gauge("windhover_health_age_seconds", "Age of all that follows.", |t| one(t.age_s)),
+    gauge("windhover_health_age_seconds", "Age of all values of the payload.", |t| one(t.age_s)),
     gauge("windhover_link_up", "Whether the payload is connected.", |t| {
         one(t.link.map(|(up, _)| f64::from(u8::from(up))))
     }),
-    gauge("windhover_link_round_trip_seconds", "Round trip to the payload.", |t| {
+    gauge("windhover_link_round_trip_seconds", "Round-trip time to the payload.", |t| {
         one(t.link.map(|(_, ms)| ms * 1e-3))
     }),
     gauge("windhover_source_rate_hertz", "Messages of a source in the last second.", |t| {
@@ -52,7 +53,7 @@ const FAMILIES: &[Family] = &[
     counter("windhover_source_dropped", "Messages of a source lost before they were recorded.", |t| {
         sources(t, |s| Some(s.dropped as f64))
     }),
-    counter("windhover_measurements", "Measurements by what became of them in the filter.", |t| {
+    counter("windhover_measurements", "Measurements by their disposition in the filter.", |t| {
         let of = |(what, count): (&String, &u64)| (vec![("disposition", what.clone())], *count as f64);
         t.health.dispositions.iter().map(of).collect()
     }),
@@ -61,7 +62,7 @@ const FAMILIES: &[Family] = &[
     gauge("windhover_clock_sigma_seconds", "One sigma of the fit from UTC to host time.", |t| {
         one(Some(t.health.clock_sigma_ms).filter(|ms| *ms >= 0.0).map(|ms| ms * 1e-3))
     }),
-    gauge("windhover_target_status", "1 for the status that holds.", |t| {
+    gauge("windhover_target_status", "1 for the present status.", |t| {
         let all = [
             (TrackStatus::Lost, "lost"),
             (TrackStatus::Acquiring, "acquiring"),
@@ -76,7 +77,7 @@ const FAMILIES: &[Family] = &[
     }),
     gauge(
         "windhover_target_frames_seen",
-        "Frames of the last second in which a marker of it was seen.",
+        "Frames of the last second in which a marker of the target was seen.",
         |t| {
             let of = |target: &crate::io::proto::windhover::TargetHealth| {
                 (vec![("target", target.name.clone())], f64::from(target.frames_seen))
@@ -85,12 +86,12 @@ const FAMILIES: &[Family] = &[
         },
     ),
     gauge("windhover_target_sigma", "One sigma of a target's state, in metres, radians and seconds.", sigmas),
-    gauge("windhover_misfits", "What does not fit the configuration now.", |t| {
+    gauge("windhover_misfits", "Present misfits of the configuration.", |t| {
         one(Some(t.health.misfits.len() as f64))
     }),
     gauge(
         "windhover_figure",
-        "Figures of the daemon: card, link, temperature, latency; the name tells the unit.",
+        "Values of the daemon: card, link, temperature, latency; the name gives the unit.",
         |t| {
             let of = |(name, figure): (&String, &f64)| (vec![("name", name.clone())], *figure);
             let mut all: Vec<Sample> = t.health.figures.iter().map(of).collect();
@@ -100,11 +101,19 @@ const FAMILIES: &[Family] = &[
     ),
 ];
 
-const fn gauge(name: &'static str, help: &'static str, samples: fn(&Told<'_>) -> Vec<Sample>) -> Family {
+const fn gauge(
+    name: &'static str,
+    help: &'static str,
+    samples: fn(&PayloadMetrics<'_>) -> Vec<Sample>,
+) -> Family {
     Family { name, kind: "gauge", help, samples }
 }
 
-const fn counter(name: &'static str, help: &'static str, samples: fn(&Told<'_>) -> Vec<Sample>) -> Family {
+const fn counter(
+    name: &'static str,
+    help: &'static str,
+    samples: fn(&PayloadMetrics<'_>) -> Vec<Sample>,
+) -> Family {
     Family { name, kind: "counter", help, samples }
 }
 
@@ -113,22 +122,22 @@ fn one(figure: Option<f64>) -> Vec<Sample> {
 }
 
 fn sources(
-    told: &Told<'_>,
+    payload: &PayloadMetrics<'_>,
     of: fn(&crate::io::proto::windhover::SourceHealth) -> Option<f64>,
 ) -> Vec<Sample> {
     let sample = |s| {
         let s: &crate::io::proto::windhover::SourceHealth = s;
         Some((vec![("source", s.name.clone())], of(s)?))
     };
-    told.health.sources.iter().filter_map(sample).collect()
+    payload.health.sources.iter().filter_map(sample).collect()
 }
 
-/// Of the covariance's diagonal.
-fn sigmas(told: &Told<'_>) -> Vec<Sample> {
+/// One sigmas, from the covariance's diagonal.
+fn sigmas(payload: &PayloadMetrics<'_>) -> Vec<Sample> {
     const DIAGONAL: [(usize, &str); 5] =
         [(0, "north_m"), (5, "east_m"), (9, "heading_rad"), (12, "speed_mps"), (14, "yaw_rate_radps")];
     let mut all = Vec::new();
-    for target in &told.health.targets {
+    for target in &payload.health.targets {
         let covariance = target.state.as_ref().map_or(&[][..], |state| &state.covariance);
         for (at, figure) in DIAGONAL {
             if let Some(variance) = covariance.get(at).filter(|variance| **variance >= 0.0) {
@@ -141,12 +150,12 @@ fn sigmas(told: &Told<'_>) -> Vec<Sample> {
 }
 
 /// The text of all payloads.
-pub fn render(payloads: &[Told<'_>]) -> String {
+pub fn render(payloads: &[PayloadMetrics<'_>]) -> String {
     let mut text = String::new();
     for Family { name, kind, help, samples } in FAMILIES {
         let mut head = false;
-        for told in payloads {
-            for (mut labels, figure) in samples(told) {
+        for payload in payloads {
+            for (mut labels, figure) in samples(payload) {
                 if !figure.is_finite() {
                     continue;
                 }
@@ -154,8 +163,8 @@ pub fn render(payloads: &[Told<'_>]) -> String {
                     // Writing into a String cannot fail.
                     let _ = write!(text, "# TYPE {name} {kind}\n# HELP {name} {help}\n");
                 }
-                if !told.payload.is_empty() {
-                    labels.insert(0, ("payload", told.payload.to_owned()));
+                if !payload.payload.is_empty() {
+                    labels.insert(0, ("payload", payload.payload.to_owned()));
                 }
                 let suffix = if *kind == "counter" { "_total" } else { "" };
                 let _ = writeln!(text, "{name}{suffix}{} {figure}", braced(&labels));
@@ -191,8 +200,8 @@ mod tests {
         };
         let health =
             Health { sources: vec![source("gps", 120.0), source("a\"b\n", -1.0)], ..Default::default() };
-        let told = |payload| Told { payload, health: &health, age_s: None, link: None };
-        let text = render(&[told("one"), told("two")]);
+        let payload = |payload| PayloadMetrics { payload, health: &health, age_s: None, link: None };
+        let text = render(&[payload("one"), payload("two")]);
         assert_eq!(text.matches("# TYPE windhover_source_rate_hertz gauge\n").count(), 1);
         assert!(
             text.contains("windhover_source_messages_total{payload=\"two\",source=\"gps\"} 7\n"),
@@ -201,6 +210,9 @@ mod tests {
         assert!(text.contains("{payload=\"one\",source=\"a\\\"b\\n\"} 5\n"), "{text}");
         assert_eq!(text.matches("windhover_source_age_seconds{").count(), 2, "{text}");
         assert!(text.ends_with("# EOF\n") && !text.contains("link_up"));
-        assert!(render(&[Told { payload: "", ..told("one") }]).contains("windhover_gps_satellites 0\n"));
+        assert!(
+            render(&[PayloadMetrics { payload: "", ..payload("one") }])
+                .contains("windhover_gps_satellites 0\n")
+        );
     }
 }

@@ -8,8 +8,8 @@ use super::flight_store::FlightStore;
 use super::sink::{Outlets, Sink};
 use super::sinks::{CardSink, LatestHealth, LinkSink, MavlinkSink, MetricsSink, VideoQueue, VideoSink};
 
-/// The daemon's sinks, one row each. The link stands before the card: the ground gets a record before the card
-/// does, and the card keeps it under the number that the link gave it.
+/// The daemon's sinks, one for each row. The link comes before the card: the ground gets a record before the card does,
+/// and the card keeps it under the number that the link assigned.
 pub fn of_daemon(
     config: &Config,
     flight_store: &FlightStore,

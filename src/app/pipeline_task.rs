@@ -1,4 +1,4 @@
-//! The pipeline's task: takes events in order, has them recorded, handles them, passes on what follows.
+//! The pipeline's task: takes events in order, has them recorded, handles them, forwards the outputs.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -16,10 +16,10 @@ use super::health::HealthLine;
 use super::latencies::Latencies;
 use super::sink::{Outlets, Sink};
 use super::status::SharedStatus;
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 use super::warm_start::{self, Earlier, Origin};
 
-/// Longest that is spent on what waits when the end was asked for.
+/// Longest time spent on queued events after a stop was requested.
 const LAST_CALL: Span = Span::from_ns(500_000_000);
 
 /// What the pipeline's task works with.
@@ -28,23 +28,23 @@ pub struct Parts {
     pub config: Arc<Config>,
     /// Its terrain, where it names one.
     pub terrain: Option<Arc<Tile>>,
-    /// What every task is given.
+    /// The context of every task.
     pub context: TaskContext,
-    /// Where health is shown.
+    /// Where health is published.
     pub status: SharedStatus,
-    /// Where what an earlier run knew is kept.
+    /// Where the state of an earlier run is kept.
     pub flight_store: FlightStore,
     /// Where events and outputs go.
     pub outlets: Outlets<Box<dyn Sink>>,
-    /// What the store is asked to do.
+    /// Requests to the store.
     pub orders: StoreOrders,
-    /// Its heart.
-    pub heart: Heart,
+    /// The task's heartbeat.
+    pub heartbeat: Heartbeat,
 }
 
-/// Runs the pipeline on the calling thread until the end is asked for and everything that waits is handled.
+/// Runs the pipeline on the calling thread until a stop is requested and every queued event is handled.
 pub fn run(parts: Parts) {
-    let Parts { config, terrain, context, status, flight_store, outlets, orders, heart } = parts;
+    let Parts { config, terrain, context, status, flight_store, outlets, orders, heartbeat } = parts;
     let mut task = PipelineTask {
         config: &config,
         context: &context,
@@ -57,10 +57,10 @@ pub fn run(parts: Parts) {
         health_line: HealthLine::new(&config),
         outputs: Vec::new(),
     };
-    task.continue_from_earlier(&heart);
+    task.continue_from_earlier(&heartbeat);
     let mut end = None;
     loop {
-        heart.beat();
+        heartbeat.beat();
         let now = context.clock.now();
         if context.stop.is_cancelled() && now - *end.get_or_insert(now) > LAST_CALL {
             break;
@@ -75,7 +75,7 @@ pub fn run(parts: Parts) {
     orders.pipeline_done.cancel();
 }
 
-/// An event that was stamped before a tick may be queued this much after it and still comes first.
+/// An event that was stamped before a tick may be queued up to this much after it and still come first.
 const QUEUED_LATE: Span = Span::from_ns(5_000_000);
 
 struct PipelineTask<'a> {
@@ -92,30 +92,30 @@ struct PipelineTask<'a> {
 }
 
 impl PipelineTask<'_> {
-    /// Continues from what an earlier run left on the card, where that is fresh. It is an event like
-    /// every other, the first of all: what flew is what replays.
-    fn continue_from_earlier(&mut self, heart: &Heart) {
+    /// Continues from the state that an earlier run left on the card, where it is fresh. The state is an event like
+    /// every other, and the first: replay repeats it.
+    fn continue_from_earlier(&mut self, heartbeat: &Heartbeat) {
         if !self.config.store.enabled {
             return;
         }
         let report = |words: String| OperatorEvent::WarmStart.emit("", words);
-        match warm_start::wait_for(&self.flight_store, &self.origin, self.context, heart) {
+        match warm_start::wait_for(&self.flight_store, &self.origin, self.context, heartbeat) {
             Earlier::Known(state, age) => {
-                report(format!("continues from what was known {:.1} s ago", age.s()));
+                report(format!("continues from a state {:.1} s old", age.s()));
                 let body = EventBody::Warm(state);
                 let event = self.context.events.number(self.context.began, body);
                 self.handle(&event);
             }
-            Earlier::Unusable(stale) => report(format!("what an earlier run knew is not used: {stale}")),
-            Earlier::NotTold(patience) => report(format!(
-                "begins anew: the card did not tell within {:.0} s what an earlier run knew",
+            Earlier::Unusable(stale) => report(format!("the state of an earlier run is not used: {stale}")),
+            Earlier::NoAnswer(patience) => report(format!(
+                "starts without an earlier state: the card did not answer within {:.0} s",
                 patience.s()
             )),
             Earlier::Nothing => {}
         }
     }
 
-    /// Time from `now` until the next tick is due: so long the task may wait for an event.
+    /// Time from `now` until the next tick is due, which limits the wait for an event.
     fn until_tick(&self, now: MonoTime) -> Duration {
         let due = self.pipeline.next_tick(now - QUEUED_LATE) + QUEUED_LATE;
         Duration::from_nanos((due - now).ns().unsigned_abs())
@@ -130,7 +130,7 @@ impl PipelineTask<'_> {
     }
 
     fn handle(&mut self, event: &Event) {
-        // Recorded first: what the pipeline stumbles over is on the card.
+        // Recorded first: an event that makes the pipeline fail is then on the card.
         self.outlets.event(event);
         self.pipeline.handle(event, &mut self.outputs);
         self.pass_on();
@@ -144,7 +144,7 @@ impl PipelineTask<'_> {
         }
     }
 
-    /// Passes on what followed.
+    /// Forwards the outputs.
     fn pass_on(&mut self) {
         let outputs = std::mem::take(&mut self.outputs);
         for timed in &outputs {

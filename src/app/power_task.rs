@@ -1,4 +1,4 @@
-//! The power task: reads supply and temperature once a second, and waits for the line that tells of power going.
+//! The power task: reads supply and temperature once a second, and waits for the line that signals a power failure.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -7,7 +7,7 @@ use tokio::sync::watch;
 
 use super::context::TaskContext;
 use super::events::{self, OperatorEvent};
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 use crate::config::PowerConfig;
 use crate::io::device::{Report, blocking};
 use crate::io::power::{PowerReader, PowerReading};
@@ -17,7 +17,7 @@ use crate::io::process;
 /// How often supply and temperature are read.
 const READING: Duration = Duration::from_secs(1);
 
-/// What was read last.
+/// The last reading.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Supply {
     /// Supply and temperature.
@@ -26,14 +26,14 @@ pub struct Supply {
     pub memory_mb: Option<f64>,
 }
 
-/// The health task's side: what is read, and how.
+/// The health task's side: the readings and their settings.
 #[derive(Debug)]
 pub struct PowerView {
-    /// The settings in force; a change takes effect at once.
+    /// The current settings; a change takes effect at once.
     pub settings: watch::Sender<PowerConfig>,
-    /// What was read last; news once a second.
+    /// The last reading; updated once a second.
     pub supply: watch::Receiver<Supply>,
-    /// Whether the line that tells of power going is active.
+    /// Whether the line that signals a power failure is active.
     pub line: watch::Receiver<bool>,
 }
 
@@ -53,13 +53,14 @@ pub fn parts(config: &PowerConfig) -> (PowerTask, PowerView) {
     (task, PowerView { settings, supply: supply_read, line: line_level })
 }
 
-/// Reads and waits until the end is asked for.
-pub async fn run(mut task: PowerTask, context: TaskContext, heart: Heart) {
+/// Reads and waits until a stop is requested.
+pub async fn run(mut task: PowerTask, context: TaskContext, heartbeat: Heartbeat) {
     loop {
         let settings = task.settings.borrow_and_update().clone();
-        let watching =
-            async { tokio::join!(read(&settings, &task.supply, &heart), watch_line(&settings, &task.line)) };
-        // What is dropped ends first: a line is given to one reader.
+        let watching = async {
+            tokio::join!(read(&settings, &task.supply, &heartbeat), watch_line(&settings, &task.line))
+        };
+        // The branch that is dropped ends first: a line can have one reader only.
         tokio::select! {
             () = context.stop.cancelled() => return,
             Ok(()) = task.settings.changed() => {}
@@ -68,22 +69,22 @@ pub async fn run(mut task: PowerTask, context: TaskContext, heart: Heart) {
     }
 }
 
-/// Reads supply and temperature for ever. A sensor on a slow bus blocks, so a thread for that reads.
-async fn read(settings: &PowerConfig, supply: &watch::Sender<Supply>, heart: &Heart) {
+/// Reads supply and temperature without end. A sensor on a slow bus blocks, so a blocking thread reads it.
+async fn read(settings: &PowerConfig, supply: &watch::Sender<Supply>, heartbeat: &Heartbeat) {
     let path = |file: &Option<String>| file.as_ref().map(PathBuf::from);
     let files = (path(&settings.voltage_file), path(&settings.going_file));
     let reader = PowerReader::new(Path::new(&settings.sysfs), files.0, files.1);
     let mut round = tokio::time::interval(READING);
     round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
-        heart.while_waiting(round.tick()).await;
+        heartbeat.while_waiting(round.tick()).await;
         let reader = reader.clone();
         let read = move || Supply { reading: reader.read(), memory_mb: process::resident_mb() };
         supply.send_replace(blocking(read).await);
     }
 }
 
-/// Watches the line for ever, where one is configured.
+/// Waits for changes of the line without end, where one is configured.
 async fn watch_line(settings: &PowerConfig, level: &watch::Sender<bool>) {
     level.send_replace(false);
     let Some(line) = &settings.going_line else { return std::future::pending().await };

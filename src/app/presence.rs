@@ -1,4 +1,4 @@
-//! Which parts are up, and so whether the daemon is ready.
+//! Which parts are up, and from this whether the daemon is ready.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -14,12 +14,12 @@ pub enum PartState {
     Open,
     /// It delivers.
     Delivers,
-    /// It does not; in a word, why.
+    /// It does not deliver; the reason in one word.
     Down(String),
 }
 
 impl PartState {
-    /// In a word.
+    /// The state in one word.
     pub fn word(&self) -> &str {
         match self {
             Self::Waiting => "waiting",
@@ -30,12 +30,12 @@ impl PartState {
     }
 }
 
-/// Which parts are up. Copies are the same board.
+/// Which parts are up. Copies share the same state.
 #[derive(Clone, Debug, Default)]
 pub struct Presence(Arc<Mutex<[PartState; Part::ALL.len()]>>);
 
 impl Presence {
-    /// Notes a part's state; what it was before.
+    /// Sets a part's state; returns the previous one.
     pub fn set(&self, part: Part, state: PartState) -> PartState {
         let mut board = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         std::mem::replace(&mut board[part as usize], state)
@@ -46,14 +46,14 @@ impl Presence {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)[part as usize].clone()
     }
 
-    /// Parts that are not up and whose absence is not accepted.
+    /// Parts that are not up and are not optional.
     pub fn missing(&self, optional: &[Part]) -> Vec<(Part, PartState)> {
         let wanted = Part::ALL.into_iter().filter(|part| !optional.contains(part));
         let states = wanted.map(|part| (part, self.get(part)));
         states.filter(|(_, state)| *state != PartState::Delivers).collect()
     }
 
-    /// Missing parts in words: `gps missing, camera waiting`.
+    /// Missing parts as text: `gps missing, camera waiting`.
     pub fn words(missing: &[(Part, PartState)]) -> String {
         let words: Vec<String> =
             missing.iter().map(|(part, state)| format!("{} {}", part.name(), state.word())).collect();

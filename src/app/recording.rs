@@ -1,4 +1,4 @@
-//! A flight's messages as the measurements that calibration and refinement work on.
+//! A flight's messages as the measurements for calibration and refinement.
 
 use std::collections::BTreeMap;
 
@@ -28,7 +28,7 @@ pub fn recording(flight: &Flight) -> Recording {
     }
 }
 
-/// Everything that a refinement of the whole flight takes.
+/// All inputs for a refinement of the whole flight.
 pub fn whole(flight: &Flight) -> windhover_refine::Recording {
     let mut heard: BTreeMap<u32, MonoTime> = BTreeMap::new();
     for (number, arrival) in flight.frames.iter().enumerate() {
@@ -42,7 +42,7 @@ pub fn whole(flight: &Flight) -> windhover_refine::Recording {
             sigma_px: f.sigma_px,
         });
         let markers = d.markers.iter().filter_map(marker).collect();
-        // Where the frame itself was not kept it was looked at about then.
+        // Where the frame itself is not in the recording, its detections were made at about this time.
         let t_recv = heard.get(&d.frame).copied().filter(|t| *t >= t_valid).unwrap_or(t_valid + LOOKED_AT);
         let value = FrameObservations { frame: d.frame, markers, features: features.collect() };
         Stamped { t_valid, t_recv, seq: 0, value }
@@ -56,7 +56,7 @@ pub fn whole(flight: &Flight) -> windhover_refine::Recording {
     }
 }
 
-/// From a frame's exposure until it is looked at, where that is not recorded.
+/// Time from a frame's exposure to its detection, where that is not recorded.
 const LOOKED_AT: Span = Span::from_ns(60_000_000);
 
 fn stamped<T>(t: &Option<Timestamp>, heard: &Option<Timestamp>, value: T) -> Stamped<T> {
@@ -99,7 +99,7 @@ fn three(values: &[f64]) -> Option<Vector3<f64>> {
     <[f64; 3]>::try_from(values).ok().map(Vector3::from)
 }
 
-/// `None` for kinds and families this version does not know.
+/// `None` for kinds and families that this version does not know.
 fn marker(m: &wh::Marker) -> Option<MarkerDetection> {
     let id = match m.kind.as_str() {
         "apriltag" => MarkerId::Tag { family: m.family.parse::<TagFamily>().ok()?, id: m.id },

@@ -1,4 +1,4 @@
-//! The configuration read again: what changes then, and what takes a restart.
+//! Reload of the configuration: what changes at once, and what needs a restart.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -9,22 +9,22 @@ use super::config_file::{self, ConfigFileError, Loaded};
 use crate::config::Config;
 use crate::io::device::blocking;
 
-/// A configuration file that is read on a thread for what blocks, as often as it is asked for.
+/// A configuration file that is read on a blocking thread, as often as requested.
 #[derive(Debug)]
 pub struct Reloading {
     path: PathBuf,
     running: Option<JoinHandle<Result<Loaded, ConfigFileError>>>,
-    /// Asked for once more while it was read: it may have changed since.
+    /// Requested again while it was read: it may have changed since.
     again: bool,
 }
 
 impl Reloading {
-    /// Of a file; nothing is read yet.
+    /// Reader of a file; nothing is read yet.
     pub fn new(path: &Path) -> Self {
         Self { path: path.to_owned(), running: None, again: false }
     }
 
-    /// Has the file read; once more afterwards where it is being read.
+    /// Requests a read; where one is in progress, another follows it.
     pub fn ask(&mut self) {
         if self.running.is_some() {
             self.again = true;
@@ -39,7 +39,8 @@ impl Reloading {
         self.running.is_some()
     }
 
-    /// Waits until the file was read; for ever where nobody asked for it. Nothing is lost where the future is dropped.
+    /// Waits until the file was read; without end where no read was requested. Nothing is lost where the future is
+    /// dropped.
     pub async fn read(&mut self) -> Result<Loaded, ConfigFileError> {
         let Some(running) = &mut self.running else { return std::future::pending().await };
         let read = running.await;
@@ -58,7 +59,7 @@ impl Reloading {
     }
 }
 
-/// Keys that change in flight. A table's name stands for all its keys.
+/// Keys that can change in flight. A table's name stands for all its keys.
 const CHANGEABLE: [&str; 9] = [
     "log.level",
     "daemon.answer_within_s",
@@ -76,11 +77,11 @@ const CHANGEABLE: [&str; 9] = [
 pub struct Differences {
     /// Those that take effect now: `key: old → new`.
     pub now: Vec<String>,
-    /// Those that take a restart.
+    /// Those that need a restart.
     pub restart: Vec<String>,
 }
 
-/// What differs between the running configuration and the one read again.
+/// The differences between the running configuration and the one read again.
 pub fn differences(running: &Config, read: &Config) -> Differences {
     let (old, new) = (flat(running), flat(read));
     let mut differences = Differences::default();
@@ -116,7 +117,7 @@ pub fn merged(running: &Config, read: &Config) -> Config {
     merged
 }
 
-/// Every value by its dotted key, as TOML writes it.
+/// Every value by its dotted key, in TOML notation.
 fn flat(config: &Config) -> BTreeMap<String, String> {
     let mut out = BTreeMap::new();
     if let Ok(value) = toml::Value::try_from(config) {

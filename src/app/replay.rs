@@ -1,4 +1,4 @@
-//! Replay: a recording through the very pipeline that flies.
+//! Replay: a recording through the pipeline that runs in flight.
 
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -20,9 +20,9 @@ use crate::pixels::{self, DecodedFrame, FrameFault};
 use windhover_base::msg::{EventBody, Output, TimedOutput};
 use windhover_base::time::{MonoTime, Span};
 
-/// Events read and frames decoded ahead of the pipeline.
+/// Events that are read, and frames that are decoded, ahead of the pipeline.
 const AHEAD: usize = 16;
-/// Bytes of their pixels: sixteen frames of 4K, or one of any size.
+/// Bytes of their pixels: sixteen 4K frames, or one of any size.
 const AHEAD_BYTES: usize = 256 << 20;
 
 /// Why a recording could not be replayed.
@@ -48,7 +48,7 @@ pub enum ReplayError {
         /// What is wrong with it.
         source: ConfigError,
     },
-    /// Nothing in the recording is of use.
+    /// The recording has no usable messages.
     #[error("{} holds no serial bytes and no frames", path.display())]
     Nothing {
         /// The recording.
@@ -56,17 +56,17 @@ pub enum ReplayError {
     },
 }
 
-/// What happens during a replay, for whoever watches.
+/// A step of a replay, for progress displays.
 pub enum ReplayStep<'a> {
-    /// The pipeline said something.
+    /// An output of the pipeline.
     Output(&'a Output),
-    /// Bytes of the recording done, and in all.
+    /// Bytes of the recording that are processed, and in total.
     Progress(u64, u64),
-    /// Damage met in the recording.
+    /// Damage found in the recording.
     Warning(&'a str),
 }
 
-/// What a replay did.
+/// The result of a replay.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct ReplaySummary {
     /// Events replayed.
@@ -86,8 +86,7 @@ pub fn config_of(recording: &Path) -> Result<Config, ReplayError> {
     Config::parse(&text).map_err(|source| ReplayError::BadConfig { path: recording.to_owned(), source })
 }
 
-/// Replays a recording; writes a flight where `out` says so; with `realtime`, at the pace at which it
-/// was recorded.
+/// Replays a recording; writes a flight to `out` where it is given; with `realtime`, at the pace of the recording.
 pub fn replay(
     recording: &Path,
     config: &Config,
@@ -101,9 +100,9 @@ pub fn replay(
     let (sender, receiver) = sync_channel(AHEAD);
     let room = Room::new();
     thread::scope(|scope| {
-        let taker = LastTaker(&room);
+        let taker = RoomGuard(&room);
         scope.spawn(|| read_ahead(reader, want_rgb, sender, &room));
-        // By value: a flight that cannot be written ends the reader too, which waits for room.
+        // By value: a flight that cannot be written also ends the reader, which waits for room.
         run.all(receiver, taker, watch)
     })?;
     if run.summary.events == 0 {
@@ -113,9 +112,9 @@ pub fn replay(
     Ok(run.summary)
 }
 
-/// Bytes of decoded frames that wait for the pipeline: what is read ahead is bounded by bytes as well as by number.
+/// Bytes of decoded frames that wait for the pipeline: reading ahead is bounded by bytes as well as by number.
 struct Room {
-    /// Bytes that wait; `None` when nobody takes any more.
+    /// Bytes that wait; `None` when the taker has ended.
     taken: Mutex<Option<usize>>,
     freed: Condvar,
 }
@@ -129,7 +128,7 @@ impl Room {
         self.taken.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits until there is room for so many bytes; one frame has room alone, whatever its size.
+    /// Waits until there is room for this many bytes; a single frame always has room, whatever its size.
     fn take(&self, bytes: usize) {
         let full = |taken: &mut Option<usize>| {
             taken.is_some_and(|taken| taken > 0 && taken.saturating_add(bytes) > AHEAD_BYTES)
@@ -146,10 +145,10 @@ impl Room {
     }
 }
 
-/// Lets the reader go, which may wait for room that nobody gives any more.
-struct LastTaker<'a>(&'a Room);
+/// Releases the reader, which may wait for room, when the taker ends.
+struct RoomGuard<'a>(&'a Room);
 
-impl Drop for LastTaker<'_> {
+impl Drop for RoomGuard<'_> {
     fn drop(&mut self) {
         *self.0.lock() = None;
         self.0.freed.notify_all();
@@ -163,13 +162,13 @@ fn bytes_of(prepared: Option<&Result<DecodedFrame, FrameFault>>) -> usize {
     width * height * if frame.rgb.is_some() { 4 } else { 1 }
 }
 
-/// What the reading thread hands over.
+/// What the reading thread passes on.
 enum Ahead {
     Item(Box<CaptureItem>, Option<Result<DecodedFrame, FrameFault>>, (u64, u64)),
     Warning(String),
 }
 
-/// Reads and decodes ahead; the pipeline's thread sees items in order whatever this one's pace.
+/// Reads and decodes ahead; the pipeline's thread sees items in order, however fast this thread is.
 fn read_ahead(mut reader: CaptureReader, want_rgb: bool, sender: SyncSender<Ahead>, room: &Room) {
     while let Some(item) = reader.next() {
         let prepared = match item.event.as_ref().map(|e| &e.body) {
@@ -207,7 +206,7 @@ struct ReplayRun {
 impl ReplayRun {
     fn new(recording: &Path, config: &Config, out: Option<&Path>, realtime: bool) -> Self {
         let clock = HostClock::start();
-        // A configuration that was checked can be written.
+        // A configuration that passed its checks can be written as TOML.
         let text = config.to_toml().unwrap_or_default();
         let file = out.map(|path| FlightFile::new(path.to_owned(), text, config.camera.clone()));
         Self {
@@ -225,7 +224,7 @@ impl ReplayRun {
     fn all(
         &mut self,
         receiver: Receiver<Ahead>,
-        taker: LastTaker<'_>,
+        taker: RoomGuard<'_>,
         watch: &mut dyn FnMut(ReplayStep<'_>),
     ) -> Result<(), ReplayError> {
         for ahead in receiver {
@@ -271,14 +270,14 @@ impl ReplayRun {
     }
 }
 
-/// Holds a replay to the pace at which it was recorded.
+/// Holds a replay at the pace of the recording.
 #[derive(Default)]
 struct Pace {
     behind: Option<Span>,
 }
 
 impl Pace {
-    /// Longest single wait: a gap in the recording is not sat through.
+    /// Longest single wait: longer gaps of the recording are shortened.
     const LONGEST: Span = Span::from_ns(2_000_000_000);
 
     fn wait_until(&mut self, recorded: MonoTime, clock: &HostClock) {

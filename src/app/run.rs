@@ -1,4 +1,4 @@
-//! `windhover run`: start the graph, watch over it, end it cleanly.
+//! `windhover run`: starts the task graph, supervises it, ends it cleanly.
 
 use std::path::Path;
 use std::time::Duration;
@@ -11,7 +11,7 @@ use super::context::TaskContext;
 use super::events::{self, OperatorEvent};
 use super::log::{self, Log};
 use super::reload::Reloading;
-use super::signals::{Asked, Signals};
+use super::signals::{SignalRequest, Signals};
 use super::supervise::{Supervisor, running_task};
 use super::topology::{self, Graph};
 use super::watch::Watch;
@@ -19,53 +19,54 @@ use crate::io::clock::HostClock;
 use crate::io::device::panics_are_caught;
 use crate::io::notify::ServiceManager;
 
-/// Why the daemon ended other than by being asked to.
+/// Why the daemon ended without a request.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
-    /// No configuration, no daemon.
+    /// The configuration could not be loaded.
     #[error(transparent)]
     Config(#[from] ConfigFileError),
     /// The system refused a thread or a signal.
     #[error("cannot start: {0}")]
     Start(#[from] std::io::Error),
-    /// A task panicked; the service manager starts the daemon again.
+    /// A task panicked; the service manager restarts the daemon.
     #[error("task {0} failed; see the log")]
     TaskFailed(&'static str),
-    /// The card took longer than there was time for.
-    #[error("the card is too slow: the end of the flight is not on it; the next start seals what is")]
+    /// The card took longer than the time available.
+    #[error(
+        "the card is too slow: the end of the flight is not on it; the next start seals the part that is"
+    )]
     NotWritten,
     /// The card was gone, full or failing at the end.
     #[error("the end of the flight is not on the card: {0}")]
     Lost(String),
 }
 
-/// How often the health task looks round.
+/// Period of the health task's checks.
 const ROUND: Duration = Duration::from_millis(250);
 
-/// Longest the tasks get to end; with the store's flush inside, well under two seconds.
+/// Longest time for the tasks to end; with the store's flush included, well under two seconds.
 const ENDING: Duration = Duration::from_millis(1_600);
 
-/// Longest a slow card gets on top of that to take the end of the flight; together less than the unit's
-/// `TimeoutStopSec`.
+/// Additional time for a slow card to take the end of the flight; together less than the unit's `TimeoutStopSec`.
 const WRITING: Duration = Duration::from_millis(2_400);
 
-/// Threads of the runtime that poll tasks. One is enough for what they do; with two a task that copies a frame or
-/// encrypts a packet delays no other task's stamp.
+/// Threads of the runtime that poll tasks. One is enough for the load; with two, a task that copies a frame or encrypts
+/// a packet does not delay another task's stamp.
 const WORKERS: usize = 2;
 
-/// Threads at most for what blocks: opening and closing devices, reading files, thumbnails, back-fill. Those that hang
-/// make their tasks silent.
+/// Most threads for blocking operations: opening and closing devices, reading files, thumbnails, back-fill. An
+/// operation that hangs makes its task silent.
 const BLOCKING: usize = 32;
 
-/// The runtime, and the signals from the moment it was made.
+/// The runtime, and the signals received since it was made.
 #[derive(Debug)]
 pub struct Prepared {
     runtime: Runtime,
     signals: Signals,
 }
 
-/// Makes the runtime and takes the signals over: the first thing that the program does where it is to be the daemon,
-/// so that a signal of its first millisecond is answered like any other.
+/// Makes the runtime and takes over the signals. The daemon does this first, so that a signal within its first
+/// millisecond is handled like any other.
 pub fn prepare() -> std::io::Result<Prepared> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(WORKERS)
@@ -80,11 +81,11 @@ pub fn prepare() -> std::io::Result<Prepared> {
     Ok(Prepared { runtime, signals })
 }
 
-/// Runs until asked to end.
+/// Runs until a stop is requested.
 pub fn run(prepared: Prepared, config_path: &Path) -> Result<(), RunError> {
     let Prepared { runtime, mut signals } = prepared;
     let result = runtime.block_on(daemon(config_path, &mut signals));
-    // Whoever still reads a slow file is left behind.
+    // A thread that still reads a slow file is abandoned.
     runtime.shutdown_background();
     result
 }
@@ -106,7 +107,7 @@ async fn daemon(path: &Path, signals: &mut Signals) -> Result<(), RunError> {
     result.map(drop)
 }
 
-/// Reads the configuration; `None` where the end was asked for meanwhile.
+/// Reads the configuration; `None` where a stop was requested meanwhile.
 async fn first_load(
     reloading: &mut Reloading,
     signals: &mut Signals,
@@ -115,19 +116,19 @@ async fn first_load(
     loop {
         tokio::select! {
             loaded = reloading.read() => match loaded {
-                // A signal asked for it once more meanwhile.
+                // A signal requested another read meanwhile.
                 _ if reloading.reads() => {}
                 loaded => return loaded.map(Some),
             },
             asked = signals.next() => match asked {
-                Asked::End(_) => return Ok(None),
-                Asked::Reload => reloading.ask(),
+                SignalRequest::End(_) => return Ok(None),
+                SignalRequest::Reload => reloading.ask(),
             },
         }
     }
 }
 
-/// A panic is reported with its place before it unwinds, unless it is caught.
+/// Reports a panic with its place before it unwinds, unless it is caught.
 fn report_panics() {
     std::panic::set_hook(Box::new(|panic| {
         if !panics_are_caught() {
@@ -136,8 +137,8 @@ fn report_panics() {
     }));
 }
 
-/// Runs the task graph; this is the health task, which hears signals and strokes the watchdog. Gives what was
-/// written, in words.
+/// Runs the task graph; this is the health task, which handles signals and notifies the watchdog. Returns what was
+/// written, as text.
 async fn fly(
     loaded: Loaded,
     mut reloading: Reloading,
@@ -153,14 +154,14 @@ async fn fly(
     let (why, result) = loop {
         tokio::select! {
             asked = signals.next() => match asked {
-                Asked::End(signal) => break (signal, Ok(())),
-                Asked::Reload => {
+                SignalRequest::End(signal) => break (signal, Ok(())),
+                SignalRequest::Reload => {
                     watch.reloading();
                     reloading.ask();
                 }
             },
             task = tasks.ended() => {
-                OperatorEvent::TaskFailed.emit(task, "ended by itself");
+                OperatorEvent::TaskFailed.emit(task, "ended unexpectedly");
                 break ("a task failed", Err(RunError::TaskFailed(task)));
             }
             news = watch.power_news() => watch.power(news),
@@ -178,7 +179,7 @@ async fn fly(
     }
 }
 
-/// Ends the tasks: devices first, then what waits is handled, then the card is flushed; whether it was.
+/// Ends the tasks: first the devices, then queued events are handled, then the card is flushed; returns whether it was.
 async fn end(tasks: &mut Supervisor, context: &TaskContext, why: &str) -> bool {
     ServiceManager.stopping(&format!("stopping: {why}"));
     OperatorEvent::Stopping.emit("", why);

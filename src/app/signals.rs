@@ -1,17 +1,17 @@
-//! The signals that the daemon answers to.
+//! The signals that the daemon handles.
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-/// What a signal asks for.
+/// What a signal requests.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Asked {
-    /// The end; the signal's name.
+pub enum SignalRequest {
+    /// Stop; the signal's name.
     End(&'static str),
-    /// That the configuration be read again.
+    /// Read the configuration again.
     Reload,
 }
 
-/// Receives signals from when it is made; one that comes while nobody waits is kept.
+/// Receives signals from the time it is made; one that arrives while nothing waits is kept.
 #[derive(Debug)]
 pub struct Signals {
     terminate: Signal,
@@ -20,7 +20,7 @@ pub struct Signals {
 }
 
 impl Signals {
-    /// Takes the signals over; called on a runtime.
+    /// Takes over the signals; called on a runtime.
     pub fn new() -> std::io::Result<Self> {
         Ok(Self {
             terminate: signal(SignalKind::terminate())?,
@@ -30,11 +30,11 @@ impl Signals {
     }
 
     /// Waits for the next signal.
-    pub async fn next(&mut self) -> Asked {
+    pub async fn next(&mut self) -> SignalRequest {
         tokio::select! {
-            Some(()) = self.terminate.recv() => Asked::End("SIGTERM"),
-            Some(()) = self.interrupt.recv() => Asked::End("SIGINT"),
-            Some(()) = self.hang_up.recv() => Asked::Reload,
+            Some(()) = self.terminate.recv() => SignalRequest::End("SIGTERM"),
+            Some(()) = self.interrupt.recv() => SignalRequest::End("SIGINT"),
+            Some(()) = self.hang_up.recv() => SignalRequest::Reload,
             else => std::future::pending().await,
         }
     }

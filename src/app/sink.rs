@@ -1,4 +1,4 @@
-//! What takes what the pipeline is given and what it says: the trait of every output, and a row of them.
+//! The trait of every output: it takes the pipeline's events, outputs and records; and a list of outputs.
 
 use std::sync::Arc;
 
@@ -8,14 +8,13 @@ use windhover_base::msg::{Event, TimedOutput};
 /// A record on its way out.
 #[derive(Clone, Debug)]
 pub struct OutgoingRecord {
-    /// It.
+    /// The record.
     pub record: Arc<Record>,
-    /// The number under which ground stations may ask for it again; the link's sink gives it.
+    /// The number by which ground stations may request it again; the link's sink assigns it.
     pub number: Option<u32>,
 }
 
-/// What takes what the pipeline is given and what it says. A sink never waits: the pipeline's thread calls it.
-/// Each takes what it needs of three kinds of things.
+/// An output of the program. A sink never waits: the pipeline's thread calls it. It implements the calls that it needs.
 pub trait Sink: Send {
     /// An event, before the pipeline handles it.
     fn event(&mut self, _event: &Event) {}
@@ -41,7 +40,7 @@ impl Sink for Box<dyn Sink> {
     }
 }
 
-/// Sinks in a row: what one of them does to a record, those after it see.
+/// Sinks in order: what one of them does to a record, those after it see.
 pub struct Outlets<S> {
     /// The sinks.
     pub sinks: Vec<S>,
@@ -55,17 +54,17 @@ impl<S: Sink> Outlets<S> {
         Self { sinks, encoder, records: Vec::new() }
     }
 
-    /// Gives an event to every sink.
+    /// Passes an event to every sink.
     pub fn event(&mut self, event: &Event) {
         self.sinks.iter_mut().for_each(|sink| sink.event(event));
     }
 
-    /// What the next health messages tell of the daemon.
+    /// Values of the daemon for the next health messages.
     pub fn figures(&mut self, figures: DaemonFigures) {
         self.encoder.figures = figures;
     }
 
-    /// Gives an output and its records to every sink.
+    /// Passes an output and its records to every sink.
     pub fn output(&mut self, output: &TimedOutput) {
         if self.sinks.is_empty() {
             return;
@@ -87,7 +86,7 @@ mod tests {
     use windhover_base::msg::{EventBody, Output};
     use windhover_base::time::MonoTime;
 
-    /// Counts what it is given; numbers records where it is told to, and keeps the numbers it sees.
+    /// Counts its calls; numbers records where configured, and keeps the numbers that it sees.
     #[derive(Default)]
     struct Counter {
         events: usize,

@@ -1,4 +1,4 @@
-//! Status that the tasks share: figures of the running daemon, and the pipeline's health.
+//! Status that the tasks share: values of the running daemon, and the pipeline's health.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -6,19 +6,19 @@ use windhover_base::msg::Health;
 
 use super::health::Figures;
 
-/// Status that the tasks share. Copies are the same status.
+/// Status that the tasks share. Copies share the same status.
 #[derive(Clone, Debug, Default)]
 pub struct SharedStatus(Arc<Mutex<Status>>);
 
 /// What is shared.
 #[derive(Clone, Debug, Default)]
 pub struct Status {
-    /// Figures that only a running daemon has. Each task writes its own.
+    /// Values that only a running daemon has. Each task writes its own.
     pub figures: Figures,
     /// The pipeline's last health. The pipeline's task writes it.
     pub health: Option<Health>,
-    /// What the last flight's end came to: in words, or why it is not on the card. The store's task writes it; `None`
-    /// where nothing is recorded.
+    /// How the last flight ended: as text, or why its end is not on the card. The store's task writes it; `None` where
+    /// nothing is recorded.
     pub outcome: Option<Result<String, String>>,
 }
 

@@ -11,18 +11,18 @@ use tracing::Instrument as _;
 use crate::io::clock::HostClock;
 use windhover_base::time::{MonoTime, Span};
 
-/// What happens when a task cannot go on.
+/// What happens when a task cannot continue.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Restart {
-    /// It tries again by itself, waiting longer each time: devices, card, link.
+    /// It tries again itself, with growing pauses: devices, card, link.
     Retries,
-    /// The process ends and the service manager starts it again: what computes has no other way to a
-    /// state that is known to be good.
+    /// The process ends and the service manager restarts it: a task that computes has no other way to a known good
+    /// state.
     EndsProcess,
 }
 
 impl Restart {
-    /// In a word, for the log.
+    /// The rule in words, for the log.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Retries => "retries",
@@ -34,36 +34,36 @@ impl Restart {
 /// A task as the topology lists it. A task of either rule that panics ends the process.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct TaskRule {
-    /// Its name: in the log, and of its thread where it has one.
+    /// Its name, in the log and of its thread where it has one.
     pub name: &'static str,
-    /// What happens when it cannot go on.
+    /// What happens when it cannot continue.
     pub restart: Restart,
 }
 
-/// How often a task that waits beats.
+/// Heartbeat period of a waiting task.
 const BEAT: Duration = Duration::from_millis(250);
 
-/// A task's heartbeat. Copies are the same heart.
+/// A task's heartbeat. Copies share the same heartbeat.
 #[derive(Clone, Debug)]
-pub struct Heart {
+pub struct Heartbeat {
     last_ns: Arc<AtomicI64>,
     clock: HostClock,
 }
 
-impl Heart {
-    /// A heart that beat just now.
+impl Heartbeat {
+    /// A heartbeat with a beat now.
     pub fn new(clock: HostClock) -> Self {
-        let heart = Self { last_ns: Arc::new(AtomicI64::new(0)), clock };
-        heart.beat();
-        heart
+        let heartbeat = Self { last_ns: Arc::new(AtomicI64::new(0)), clock };
+        heartbeat.beat();
+        heartbeat
     }
 
-    /// The task answers.
+    /// Records that the task answers.
     pub fn beat(&self) {
         self.last_ns.store(self.clock.now().ns(), Ordering::Relaxed);
     }
 
-    /// Waits, and beats meanwhile.
+    /// Waits, with heartbeats meanwhile.
     pub async fn while_waiting<T>(&self, work: impl Future<Output = T>) -> T {
         let mut work = std::pin::pin!(work);
         loop {
@@ -74,7 +74,7 @@ impl Heart {
         }
     }
 
-    /// How long ago the task last answered.
+    /// Time since the task last answered.
     pub fn silence(&self) -> Span {
         self.clock.now() - MonoTime::from_ns(self.last_ns.load(Ordering::Relaxed))
     }
@@ -85,7 +85,7 @@ tokio::task_local! {
     static NAME: &'static str;
 }
 
-/// Name of the task that runs on the calling thread: of an async task, else of the thread.
+/// Name of the task on the calling thread: of an async task, else of the thread.
 pub fn running_task() -> String {
     let thread = || std::thread::current().name().unwrap_or("unnamed").to_owned();
     NAME.try_with(|name| (*name).to_owned()).unwrap_or_else(|_| thread())
@@ -93,11 +93,11 @@ pub fn running_task() -> String {
 
 struct Task {
     rule: TaskRule,
-    heart: Heart,
+    heartbeat: Heartbeat,
     id: tokio::task::Id,
 }
 
-/// All tasks, on the runtime and on threads of their own.
+/// All tasks, on the runtime and on their own threads.
 pub struct Supervisor {
     clock: HostClock,
     running: JoinSet<()>,
@@ -105,29 +105,29 @@ pub struct Supervisor {
 }
 
 impl Supervisor {
-    /// No tasks yet.
+    /// A supervisor without tasks.
     pub fn new(clock: HostClock) -> Self {
         Self { clock, running: JoinSet::new(), tasks: Vec::new() }
     }
 
-    /// Starts a task on the runtime; `body` beats the heart it is given and does nothing that blocks.
-    pub fn spawn<F>(&mut self, rule: TaskRule, body: impl FnOnce(Heart) -> F)
+    /// Starts a task on the runtime; `body` beats the heartbeat that it gets and never blocks.
+    pub fn spawn<F>(&mut self, rule: TaskRule, body: impl FnOnce(Heartbeat) -> F)
     where
         F: Future<Output = ()> + Send + 'static,
     {
-        let heart = Heart::new(self.clock);
-        let task = NAME.scope(rule.name, body(heart.clone()));
-        self.keep(rule, heart, task);
+        let heartbeat = Heartbeat::new(self.clock);
+        let task = NAME.scope(rule.name, body(heartbeat.clone()));
+        self.keep(rule, heartbeat, task);
     }
 
-    /// Starts a task that computes or blocks, on a thread of its own; `body` beats the heart it is given.
+    /// Starts a task that computes or blocks, on its own thread; `body` beats the heartbeat that it gets.
     pub fn spawn_thread(
         &mut self,
         rule: TaskRule,
-        body: impl FnOnce(Heart) + Send + 'static,
+        body: impl FnOnce(Heartbeat) + Send + 'static,
     ) -> std::io::Result<()> {
-        let heart = Heart::new(self.clock);
-        let beating = heart.clone();
+        let heartbeat = Heartbeat::new(self.clock);
+        let beating = heartbeat.clone();
         // Dropped when the body returns and when it panics.
         let (running, ended) = oneshot::channel::<()>();
         let span = tracing::Span::current();
@@ -135,24 +135,29 @@ impl Supervisor {
             let _running = running;
             span.in_scope(|| body(beating));
         })?;
-        self.keep(rule, heart, async move {
+        self.keep(rule, heartbeat, async move {
             let _ = ended.await;
         });
         Ok(())
     }
 
-    fn keep(&mut self, rule: TaskRule, heart: Heart, task: impl Future<Output = ()> + Send + 'static) {
+    fn keep(
+        &mut self,
+        rule: TaskRule,
+        heartbeat: Heartbeat,
+        task: impl Future<Output = ()> + Send + 'static,
+    ) {
         let id = self.running.spawn(task.in_current_span()).id();
-        self.tasks.push(Task { rule, heart, id });
+        self.tasks.push(Task { rule, heartbeat, id });
     }
 
-    /// Tasks that have not answered for longer than `limit`, and for how long.
+    /// Tasks that have not answered for longer than `limit`, each with that time.
     pub fn silent(&self, limit: Span) -> Vec<(&'static str, Span)> {
-        let silences = self.tasks.iter().map(|task| (task.rule.name, task.heart.silence()));
+        let silences = self.tasks.iter().map(|task| (task.rule.name, task.heartbeat.silence()));
         silences.filter(|(_, silence)| *silence > limit).collect()
     }
 
-    /// Waits until a task ends, by itself or by a panic; its name. For ever where there is none.
+    /// Waits until a task ends, with or without a panic; returns its name. Without end where there is no task.
     pub async fn ended(&mut self) -> &'static str {
         loop {
             let id = match self.running.join_next_with_id().await {
@@ -166,7 +171,7 @@ impl Supervisor {
         }
     }
 
-    /// Waits for the tasks to end, until `patience` is over; names of those that did not.
+    /// Waits for the tasks to end, until `patience` is over; returns the names of those that did not.
     pub async fn join(&mut self, patience: Duration) -> Vec<&'static str> {
         let limit = tokio::time::Instant::now() + patience;
         while !self.tasks.is_empty() && tokio::time::timeout_at(limit, self.ended()).await.is_ok() {}
@@ -185,8 +190,8 @@ mod tests {
         let mut tasks = Supervisor::new(HostClock::start());
         let (sender, receiver) = std::sync::mpsc::channel::<()>();
         tasks
-            .spawn_thread(RULE, move |heart| {
-                heart.beat();
+            .spawn_thread(RULE, move |heartbeat| {
+                heartbeat.beat();
                 let _ = receiver.recv();
             })
             .expect("a thread");
@@ -201,10 +206,10 @@ mod tests {
         tasks.spawn(RULE, |_| std::future::pending());
         tasks.spawn(named, |_| async {
             assert_eq!(running_task(), "named");
-            panic!("as a task does that fails");
+            panic!("the panic of a task");
         });
         assert_eq!(tasks.ended().await, "named");
-        tasks.spawn_thread(named, |_| panic!("as a thread does that fails")).expect("a thread");
+        tasks.spawn_thread(named, |_| panic!("the panic of a thread")).expect("a thread");
         assert_eq!(tasks.ended().await, "named");
         assert_eq!(tasks.join(Duration::from_millis(10)).await, ["test"]);
     }

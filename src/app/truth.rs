@@ -1,19 +1,19 @@
-//! The truth of a flight from a CSV file, to compare estimates with.
+//! The truth of a flight from a CSV file, to compare with estimates.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use crate::text;
 
-/// Why a truth file gave no truth.
+/// Why a truth file could not be used.
 #[derive(Debug, thiserror::Error)]
 pub enum TruthError {
     /// The file could not be read.
     #[error("cannot read truth {}: {source}", path.display())]
     Unreadable {
-        /// The file.
+        /// The system's error.
         path: PathBuf,
-        /// What the system said.
+        /// The header or a row is malformed.
         source: std::io::Error,
     },
     /// The header or a row is not as it should be.
@@ -28,14 +28,14 @@ pub enum TruthError {
     },
 }
 
-/// Where a vehicle truly was at a frame.
+/// The true state of a vehicle at a frame.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct TruthRow {
     /// Latitude of the reference point, degrees.
     pub lat_deg: f64,
     /// Longitude, degrees.
     pub lon_deg: f64,
-    /// Heading, radians; `None` where not told.
+    /// Heading, radians; `None` where not given.
     pub heading_rad: Option<f64>,
     /// Speed, m/s.
     pub speed_mps: Option<f64>,
@@ -46,16 +46,16 @@ pub struct TruthRow {
 /// The truth of one vehicle.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Truth {
-    /// A row a frame.
+    /// A row for each frame.
     Moving(BTreeMap<u32, TruthRow>),
     /// At rest all the time.
     AtRest(TruthRow),
 }
 
 impl Truth {
-    /// Reads a CSV file with a header. It needs `lat_deg` and `lon_deg`; `heading_rad`, `speed_mps`
-    /// and `yaw_rate_radps` are compared where present. With a column `frame` each row belongs to
-    /// that frame; without, the file has one row: a surveyed point at rest.
+    /// Reads a CSV file with a header. It must have `lat_deg` and `lon_deg`; `heading_rad`, `speed_mps` and
+    /// `yaw_rate_radps` are compared where present. With a column `frame` each row belongs to that frame; without, the
+    /// file has one row: a surveyed point at rest.
     pub fn read(path: &Path) -> Result<Self, TruthError> {
         let content = std::fs::read_to_string(path)
             .map_err(|source| TruthError::Unreadable { path: path.to_owned(), source })?;
@@ -66,13 +66,13 @@ impl Truth {
         })
     }
 
-    /// As [`Self::read`], of the file's text; the error is line and reason.
+    /// As [`Self::read`], from the file's text; the error is the line and the reason.
     pub fn parse(content: &str) -> Result<Self, (usize, String)> {
         let mut lines = content.lines().enumerate().filter(|(_, l)| !l.trim().is_empty());
         let (_, header) = lines.next().ok_or((1, "it is empty".to_owned()))?;
         let names: Vec<&str> = header.split(',').map(str::trim).collect();
         let column = |name: &str| names.iter().position(|n| *n == name);
-        let must = |name: &str| column(name).ok_or((1, format!("there is no column {name}")));
+        let must = |name: &str| column(name).ok_or((1, format!("the column {name} is missing")));
         let (lat, lon) = (must("lat_deg")?, must("lon_deg")?);
         let (heading, speed, rate) = (column("heading_rad"), column("speed_mps"), column("yaw_rate_radps"));
         let frame = column("frame");
@@ -97,7 +97,7 @@ impl Truth {
                 Some(c) => {
                     let frame = number(c)?;
                     if !(0.0..=f64::from(u32::MAX)).contains(&frame) || frame.fract() != 0.0 {
-                        return Err((k + 1, format!("{frame} is no frame: they count from 0")));
+                        return Err((k + 1, format!("{frame} is not a frame: frames count from 0")));
                     }
                     rows.insert(frame as u32, row);
                 }
@@ -110,7 +110,9 @@ impl Truth {
                 let still = TruthRow { speed_mps: Some(0.0), yaw_rate_radps: Some(0.0), ..*one };
                 Ok(Self::AtRest(still))
             }
-            (None, [_, _, ..]) => Err((1, "there is no column frame, and more than one row".to_owned())),
+            (None, [_, _, ..]) => {
+                Err((1, "the column frame is missing, and there is more than one row".to_owned()))
+            }
             _ => Err((1, "it has a header but no rows".to_owned())),
         }
     }

@@ -12,7 +12,7 @@ use super::events::OperatorEvent;
 use super::film::{Film, Known};
 use super::flight_store::FlightStore;
 use super::sinks::VideoQueue;
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 use crate::config::Config;
 use crate::io::process;
 use crate::io::proto::{foxglove::CompressedVideo, timestamp};
@@ -26,29 +26,29 @@ const ROUND: Duration = Duration::from_millis(250);
 /// The thread yields to all others of the program.
 const NICE: i32 = 10;
 
-/// What the thread works with.
+/// Inputs of the thread.
 pub struct VideoTask {
     /// The configuration.
     pub config: Arc<Config>,
-    /// What every task is given.
+    /// The context of every task.
     pub context: TaskContext,
     /// Where frames come from.
     pub queue: VideoQueue,
     /// Where they are recorded.
     pub flight_store: FlightStore,
-    /// Its heart.
-    pub heart: Heart,
+    /// Its heartbeat.
+    pub heartbeat: Heartbeat,
 }
 
 /// Makes the film on the calling thread until the end is asked for.
 pub fn run(task: VideoTask) {
-    let VideoTask { config, context, queue, flight_store, heart } = task;
+    let VideoTask { config, context, queue, flight_store, heartbeat } = task;
     process::be_nice(NICE);
     let known = Known::new(&config.target);
     let mut film = Film::new(String::new(), Some(config.camera.clone()), Some(config.video.rate_hz), known);
     let mut sender = None;
     while !context.stop.is_cancelled() {
-        heart.beat();
+        heartbeat.beat();
         let Some((frame, records)) = queue.take(ROUND) else { continue };
         for record in records {
             film.known.message(&record.topic, &record.data);

@@ -1,4 +1,4 @@
-//! What outlives a restart: saved to the card once a second, taken back at the start where it is fresh.
+//! State that survives a restart: saved to the card once a second, restored at the start where it is fresh.
 
 use std::time::Duration;
 
@@ -6,7 +6,7 @@ use prost::Message as _;
 
 use super::context::TaskContext;
 use super::flight_store::FlightStore;
-use super::supervise::Heart;
+use super::supervise::Heartbeat;
 use crate::config::Config;
 use crate::io::clock::HostClock;
 use crate::io::process;
@@ -16,31 +16,31 @@ use crate::io::store::{Recording, StoreHandle};
 use windhover_base::msg::WarmState;
 use windhover_base::time::{MonoTime, Span};
 
-/// Its name among the store's last known states.
+/// Its name among the states in the store.
 const STATE: &str = "warm";
 
-/// A state older than this is of another flight: the service manager restarts a daemon in seconds.
+/// A state older than this is not used: the service manager restarts a daemon within seconds.
 const OLDEST: Span = Span::from_ns(120_000_000_000);
 
-/// Longest the pipeline waits at the start for the card to tell the state. What devices deliver meanwhile
-/// waits in the events, which holds twice as much. The state is the first thing read of a card: only one that
-/// is slow beyond use, or an index that another program holds, takes so long.
+/// Longest wait of the pipeline at the start for the card's answer. Events of the devices wait meanwhile in the queue,
+/// which holds twice as much. The state is the first thing that is read from a card: only an extremely slow card, or an
+/// index that another program holds, takes this long.
 const PATIENCE: Span = Span::from_ns(5_000_000_000);
 
-/// What the card tells of an earlier run.
+/// The card's answer about an earlier run.
 #[derive(Debug)]
 pub enum Earlier {
-    /// What it knew, and how long ago.
+    /// Its state, and the age of it.
     Known(Box<WarmState>, Span),
-    /// It left what is not to be used.
+    /// A state that must not be used.
     Unusable(Stale),
-    /// Nothing: there was none, nothing is recorded, or the end was asked for.
+    /// None: there was none, nothing is recorded, or a stop was requested.
     Nothing,
-    /// The card did not answer within this.
-    NotTold(Span),
+    /// The card did not answer within this time.
+    NoAnswer(Span),
 }
 
-/// Where and as what this process runs: what a state must have in common with it.
+/// Identity of this process: boot, program and configuration. A state must agree with it.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Origin {
     boot_id: Option<String>,
@@ -48,27 +48,27 @@ pub struct Origin {
     config_crc: u32,
 }
 
-/// Why a state is not continued from.
+/// Why a state is not used.
 #[derive(Clone, Copy, PartialEq, Debug, thiserror::Error)]
 pub enum Stale {
-    /// Not a state of this program.
-    #[error("it is not one of this version")]
+    /// Not a state of this version of the program.
+    #[error("it is not of this version")]
     Unreadable,
-    /// The computer was booted between; the clocks of two boots do not compare.
-    #[error("the computer has been booted since")]
+    /// The computer was rebooted; the clocks of two boots do not compare.
+    #[error("the computer was rebooted since")]
     AnotherBoot,
-    /// It knows other devices or other mounts.
-    #[error("the configuration has been changed since")]
+    /// Its devices or mounts differ.
+    #[error("the configuration was changed since")]
     AnotherConfiguration,
-    /// Of another flight, or the future.
+    /// It is too old, or from the future.
     #[error("it is {:.0} s old", .0.s())]
     Age(Span),
 }
 
 impl Origin {
-    /// This process.
+    /// The identity of this process.
     pub fn here(config: &Config, clock: HostClock) -> Self {
-        // A configuration that was checked can be written.
+        // A configuration that passed its checks can be written as TOML.
         let text = config.to_toml().unwrap_or_default();
         Self {
             boot_id: process::boot_id(),
@@ -77,7 +77,7 @@ impl Origin {
         }
     }
 
-    /// A state of time `t`, as it is kept.
+    /// A state of time `t`, as it is stored.
     pub fn sign(&self, t: MonoTime, state: &WarmState) -> Vec<u8> {
         let message = windhover::WarmState {
             boot_id: self.boot_id.clone().unwrap_or_default(),
@@ -88,8 +88,8 @@ impl Origin {
         message.encode_to_vec()
     }
 
-    /// A state that was kept, on this process's clock, where it is fresh at `now`; and its age. The age
-    /// is told by the monotonic clock, so the computer's date may have been set between.
+    /// A stored state, on this process's clock, where it is fresh at `now`; and its age. The age is by the monotonic
+    /// clock, so the computer's date may have been set in between.
     pub fn take_back(&self, kept: &[u8], now: MonoTime) -> Result<(WarmState, Span), Stale> {
         let message = windhover::WarmState::decode(kept).map_err(|_| Stale::Unreadable)?;
         let mut state = warm_message::state(&message).ok_or(Stale::Unreadable)?;
@@ -121,16 +121,16 @@ pub fn save(store: &StoreHandle, origin: &Origin, t: MonoTime, state: &WarmState
     store.put_state(STATE, origin.sign(t, state));
 }
 
-/// Waits for the card to tell what an earlier run knew.
+/// Waits for the card's answer about an earlier run.
 pub fn wait_for(
     flight_store: &FlightStore,
     origin: &Origin,
     context: &TaskContext,
-    heart: &Heart,
+    heartbeat: &Heartbeat,
 ) -> Earlier {
     let end = context.clock.now() + PATIENCE;
     while !context.stop.is_cancelled() && context.clock.now() < end {
-        heart.beat();
+        heartbeat.beat();
         if let Some(store) = flight_store.get() {
             if let Some(index) = store.index() {
                 let kept = index.state(STATE).map(|kept| origin.take_back(&kept, context.clock.now()));
@@ -146,7 +146,7 @@ pub fn wait_for(
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    if context.stop.is_cancelled() { Earlier::Nothing } else { Earlier::NotTold(PATIENCE) }
+    if context.stop.is_cancelled() { Earlier::Nothing } else { Earlier::NoAnswer(PATIENCE) }
 }
 
 #[cfg(test)]
@@ -189,7 +189,7 @@ mod tests {
         assert_eq!(taken.arrivals[0].offset_ns, at(1500.0 + year).ns());
     }
 
-    /// The card outlives the boot, the clock does not: it begins anew, here at a minute.
+    /// The card survives a reboot, the clock does not: it starts again, here at a minute.
     #[test]
     fn a_state_on_the_card_is_taken_by_the_next_run_of_this_boot_only() {
         let dir = tempfile::tempdir().expect("a scratch directory");
@@ -212,7 +212,7 @@ mod tests {
         let booted =
             Origin { boot_id: Some("c".into()), host_from_monotonic: Span::from_s(2940.0), ..origin() };
         assert_eq!(booted.take_back(&kept(&store), at(3000.0)), Err(Stale::AnotherBoot));
-        // What this boot then learns is this boot's, and the old one's is gone.
+        // States that this boot then saves belong to it, and the old state is gone.
         save(&store.handle(), &booted, at(3001.0), &state());
         store.stop();
         let (store, _notices) = start();

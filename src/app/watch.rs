@@ -1,4 +1,4 @@
-//! The health task's work: readiness, watchdog, power, a configuration read again. Nothing here blocks.
+//! The health task's work: readiness, watchdog, power, reload of the configuration. Nothing here blocks.
 
 use std::collections::BTreeSet;
 
@@ -31,21 +31,21 @@ pub(super) struct Watch {
     missing: String,
     silent: BTreeSet<&'static str>,
     power_watch: PowerWatch,
-    /// What the last reading means, the line left aside.
+    /// The judgement of the last reading, without the line.
     judged: PowerState,
     power_state: PowerState,
     second: Option<MonoTime>,
     processor: Span,
 }
 
-/// Not being ready is worth a line only after devices had time to be opened.
+/// `not_ready` is reported only after devices had time to open.
 const SETTLING: Span = Span::from_ns(3_000_000_000);
 
-/// News of the power task.
-pub(super) enum PowerNews {
-    /// Supply and temperature were read again.
+/// A change from the power task.
+pub(super) enum PowerChange {
+    /// A new reading of supply and temperature.
     Supply(Supply),
-    /// The line that tells of power going may have changed.
+    /// The line that signals a power failure may have changed.
     Line,
 }
 
@@ -74,7 +74,7 @@ impl Watch {
         }
     }
 
-    /// One round: strokes the watchdog while every task answers.
+    /// One check: notifies the watchdog while every task answers.
     pub(super) fn look_round(&mut self, tasks: &Supervisor) {
         if self.all_answer(tasks) {
             ServiceManager.alive();
@@ -116,21 +116,21 @@ impl Watch {
         self.missing = missing;
     }
 
-    /// Waits for news of the power task.
-    pub(super) async fn power_news(&mut self) -> PowerNews {
+    /// Waits for a change from the power task.
+    pub(super) async fn power_news(&mut self) -> PowerChange {
         tokio::select! {
             Ok(()) = self.power.supply.changed() => {
-                PowerNews::Supply(self.power.supply.borrow_and_update().clone())
+                PowerChange::Supply(self.power.supply.borrow_and_update().clone())
             }
-            Ok(()) = self.power.line.changed() => PowerNews::Line,
+            Ok(()) = self.power.line.changed() => PowerChange::Line,
             // The power task has ended, which ends the process.
             else => std::future::pending().await,
         }
     }
 
-    /// Takes news of the power task in.
-    pub(super) fn power(&mut self, news: PowerNews) {
-        if let PowerNews::Supply(supply) = news {
+    /// Handles a change from the power task.
+    pub(super) fn power(&mut self, news: PowerChange) {
+        if let PowerChange::Supply(supply) = news {
             self.supply(&supply);
         }
         let line_set = *self.power.line.borrow_and_update();
@@ -145,7 +145,7 @@ impl Watch {
         let supply = self.power.supply.borrow();
         let reading = &supply.reading;
         let what = match reading.voltage_v {
-            _ if line_set || reading.line_set => "the line that tells of it is set".to_owned(),
+            _ if line_set || reading.line_set => "the power-failure line is active".to_owned(),
             Some(volts) => format!("{volts:.2} V"),
             None => "mains off".to_owned(),
         };
@@ -157,7 +157,7 @@ impl Watch {
         }
     }
 
-    /// Takes a second's reading in.
+    /// Handles a reading.
     fn supply(&mut self, supply: &Supply) {
         let reading = &supply.reading;
         let now = self.context.clock.now();
@@ -201,20 +201,21 @@ impl Watch {
         ServiceManager.status(&text);
     }
 
-    /// A configuration is being read again.
+    /// Reports that the configuration is being read again.
     pub(super) fn reloading(&self) {
         ServiceManager.reloading();
         self.log.reopen();
     }
 
-    /// The configuration was read again: what can change changes, the rest is reported.
+    /// Handles the configuration that was read again: keys that can change are applied, the others are reported.
     pub(super) fn reload(&mut self, read: Result<Config, ConfigFileError>) {
         match read {
-            Err(error) => OperatorEvent::ReloadRefused.emit("", format!("{error}; the old one stays")),
+            Err(error) => OperatorEvent::ReloadRefused
+                .emit("", format!("{error}; the previous configuration stays in use")),
             Ok(read) => {
                 let told = reload::differences(&self.config, &read);
                 let changes = match told.now.as_slice() {
-                    [] => "nothing that can change in flight has changed".to_owned(),
+                    [] => "no key that can change in flight has changed".to_owned(),
                     changes => changes.join(", "),
                 };
                 OperatorEvent::Reloaded.emit("", changes);

@@ -7,10 +7,10 @@ mod target;
 
 use super::CliResult;
 
-/// Calibrate the camera and how it is mounted.
+/// Calibrate the camera and its mounting.
 ///
-/// First the lens, from photographs of a printed board; then, from a flight over a tag at rest, how
-/// camera and compass sit on the aircraft and how late each sensor is.
+/// First the lens, from photographs of a printed board; then, from a flight over a tag at rest, the mounting angles of
+/// camera and compass and the latency of each sensor.
 #[derive(clap::Args, Debug)]
 pub(super) struct Args {
     #[command(subcommand)]

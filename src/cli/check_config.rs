@@ -6,10 +6,10 @@ use super::{CliError, CliResult};
 use crate::app::config_file;
 use crate::cli::out::out;
 
-/// Say what is wrong with a configuration, or print the effective one with every default filled in.
+/// Check a configuration, and print the effective one with every default filled in.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Example:
-  windhover check-config /etc/windhover/windhover.toml && echo it flies
+  windhover check-config /etc/windhover/windhover.toml && echo ok
 
 Errors name the line or the key; the exit code is then 78.")]
 pub(super) struct Args {

@@ -12,12 +12,12 @@ use windhover_base::msg::GnssEpoch;
 use windhover_base::settings::{CompassFormat, GpsFormat};
 use windhover_base::time::{MonoTime, NS_PER_S, UtcTime};
 use windhover_decode::{
-    CompassDecoder, CompassReading, DecodeCounts, GnssDecoder, HeardAttitude, HeardEpoch,
+    CompassDecoder, CompassReading, DecodeCounts, GnssDecoder, ReceivedAttitude, ReceivedEpoch,
 };
 
-/// Decode a raw serial log: what the receiver or compass said, and what was refused.
+/// Decode a raw serial log: the values of the receiver or compass, and what was refused.
 ///
-/// A log in which nothing is understood is an error.
+/// A log without any decodable data is an error.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
   windhover decode gps gps.log
@@ -40,13 +40,13 @@ enum Device {
 struct GpsArgs {
     /// Serial log
     file: PathBuf,
-    /// One JSON object an epoch
+    /// One JSON object for each epoch
     #[arg(long)]
     json: bool,
-    /// What the receiver speaks: NMEA with Garmin's own sentences, u-blox's packets, or either
+    /// Format of the receiver: NMEA with Garmin's own sentences, u-blox's packets, or either
     #[arg(long, value_enum, default_value = "auto")]
     format: Speech,
-    /// Take sentences without a checksum too, of a receiver that sends none
+    /// Also accept sentences without a checksum, from a receiver that sends none
     #[arg(long)]
     checksum_optional: bool,
 }
@@ -72,18 +72,18 @@ impl From<Speech> for GpsFormat {
 struct CompassArgs {
     /// Serial log
     file: PathBuf,
-    /// One JSON object a reading
+    /// One JSON object for each reading
     #[arg(long)]
     json: bool,
-    /// What the compass speaks; by default the format that understands most of the log
+    /// Format of the compass; by default the format that decodes most of the log
     #[arg(long, value_parser = formats())]
     format: Option<CompassFormat>,
-    /// Take sentences without a checksum too, of a device that sends none
+    /// Also accept sentences without a checksum, from a device that sends none
     #[arg(long)]
     checksum_optional: bool,
 }
 
-/// Formats as the configuration names them.
+/// Formats by their names in the configuration.
 fn formats() -> impl clap::builder::TypedValueParser<Value = CompassFormat> {
     use clap::builder::TypedValueParser;
     clap::builder::PossibleValuesParser::new(CompassFormat::ALL.map(CompassFormat::name))
@@ -95,7 +95,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     let (file, likely) = match &args.device {
         Device::Gps(gps) => (&gps.file, "a GPS receiver's log, recorded at the right speed"),
         Device::Compass(compass) if compass.format.is_some() => {
-            (&compass.file, "of the format that --format says")
+            (&compass.file, "of the format given by --format")
         }
         Device::Compass(compass) => (&compass.file, "a compass's log, recorded at the right speed"),
     };
@@ -108,7 +108,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     note!("{counts}");
     if counts.understood_nothing() {
         let file = file.display();
-        return Err(CliError::failed(format!("{file}: nothing in it is understood: is it {likely}?")));
+        return Err(CliError::failed(format!("{file}: it has nothing decodable: is it {likely}?")));
     }
     Ok(())
 }
@@ -117,7 +117,7 @@ fn read(file: &Path) -> Result<Vec<u8>, CliError> {
     std::fs::read(file).map_err(|error| CliError::failed(format!("{}: {error}", file.display())))
 }
 
-/// A JSON object an epoch, in the contract's order.
+/// One JSON object for each epoch, in the contract's order.
 #[derive(Serialize)]
 struct EpochJson {
     utc: Option<String>,
@@ -155,7 +155,7 @@ impl EpochJson {
     }
 }
 
-/// UTC with its date; second 60 of a leap minute as the receiver said it.
+/// UTC with its date; second 60 of a leap minute as the receiver reported it.
 fn utc_text(epoch: &GnssEpoch) -> Option<String> {
     let utc = epoch.utc?;
     if epoch.time_of_day_ns.is_some_and(|ns| ns >= 86_400 * NS_PER_S) {
@@ -190,7 +190,7 @@ fn decode_gps(bytes: &[u8], args: &GpsArgs, out: &mut impl Write) -> std::io::Re
             "hdop"
         )?;
     }
-    for HeardEpoch { epoch, .. } in &heard {
+    for ReceivedEpoch { epoch, .. } in &heard {
         if json {
             let line = serde_json::to_string(&EpochJson::of(epoch)).map_err(std::io::Error::other)?;
             writeln!(out, "{line}")?;
@@ -230,7 +230,7 @@ fn or_dash(value: Option<impl Display>) -> String {
     value.map_or_else(|| "-".to_owned(), |value| value.to_string())
 }
 
-/// A JSON object a reading, in the contract's order.
+/// One JSON object for each reading, in the contract's order.
 #[derive(Serialize)]
 struct ReadingJson {
     heading_deg: Option<f64>,
@@ -254,7 +254,7 @@ fn decode_compass(bytes: &[u8], args: &CompassArgs, out: &mut impl Write) -> std
             "heading_deg", "pitch_deg", "roll_deg", "true", "valid"
         )?;
     }
-    for HeardAttitude { reading, .. } in &heard {
+    for ReceivedAttitude { reading, .. } in &heard {
         let CompassReading { heading_deg, pitch_deg, roll_deg, heading_is_true, .. } = *reading;
         let valid = reading.is_valid();
         if json {
@@ -269,18 +269,18 @@ fn decode_compass(bytes: &[u8], args: &CompassArgs, out: &mut impl Write) -> std
     Ok(counts)
 }
 
-fn decode_as(bytes: &[u8], format: CompassFormat, required: bool) -> (Vec<HeardAttitude>, DecodeCounts) {
+fn decode_as(bytes: &[u8], format: CompassFormat, required: bool) -> (Vec<ReceivedAttitude>, DecodeCounts) {
     let (mut decoder, mut heard) = (CompassDecoder::new(format).checksums_required(required), Vec::new());
     decoder.push(bytes, MonoTime::default(), &mut heard);
     decoder.flush(&mut heard);
     (heard, decoder.counts().clone())
 }
 
-/// The decoding by the format that understands most: whole attitudes first, then any reading. A
-/// device's own format goes before plain NMEA.
-fn likeliest(bytes: &[u8], required: bool) -> (Vec<HeardAttitude>, DecodeCounts) {
+/// The decoding in the format that decodes most: first by complete attitudes, then by any readings. A device's own
+/// format takes precedence over plain NMEA.
+fn likeliest(bytes: &[u8], required: bool) -> (Vec<ReceivedAttitude>, DecodeCounts) {
     let own = CompassFormat::ALL.into_iter().filter(|format| *format != CompassFormat::Nmea);
-    let understood = |heard: &[HeardAttitude]| {
+    let understood = |heard: &[ReceivedAttitude]| {
         let angles = |r: &CompassReading| [r.heading_deg, r.pitch_deg, r.roll_deg].iter().flatten().count();
         heard.iter().map(|heard| angles(&heard.reading)).sum::<usize>()
     };
@@ -339,7 +339,7 @@ mod tests {
         let object: serde_json::Value = serde_json::from_slice(&out).expect("JSON");
         assert!((object["heading_deg"].as_f64().expect("a figure") - 78.13).abs() < 0.01);
         assert_eq!((&object["true"], &object["valid"]), (&false.into(), &true.into()));
-        // Without its checksum it is nothing, unless that is accepted.
+        // Without its checksum a sentence is not used, unless that is accepted.
         for (is_accepted, used) in [(false, 0), (true, 1)] {
             args.checksum_optional = is_accepted;
             let counts = decode_compass(&line[..line.len() - 5], &args, &mut Vec::new()).expect("memory");

@@ -25,16 +25,16 @@ pub(super) struct Args {
     /// Family of the tags
     #[arg(long, default_value = "36h11", value_parser = family)]
     family: TagFamily,
-    /// Width of the border, cells: 1 as AprilTags are printed, 2 as Kalibr prints them
+    /// Width of the border, cells: 1 as for AprilTags, 2 as printed by Kalibr
     #[arg(long, value_name = "CELLS", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=2))]
     border: u8,
-    /// Smallest edge of a tag's black square that is looked for, pixels
+    /// Smallest edge of a tag's black square that is detected, pixels
     #[arg(long, value_name = "N", default_value_t = 16.0, value_parser = min_px)]
     min_px: f64,
-    /// Most wrong bits corrected; families with few bits correct fewer
+    /// Most wrong bits that are corrected; families with few bits correct fewer
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u8).range(0..=3))]
     max_hamming: u8,
-    /// One JSON object an image on standard output; its `ms` is the processor time that detection took
+    /// One JSON object for each image on standard output; its `ms` is the processor time of the detection
     #[arg(long)]
     json: bool,
 }
@@ -44,7 +44,7 @@ fn family(name: &str) -> Result<TagFamily, String> {
     TagFamily::ALL
         .into_iter()
         .find(|f| f.name() == name)
-        .ok_or_else(|| format!("no such family; there are {}", known()))
+        .ok_or_else(|| format!("unknown family; the families are {}", known()))
 }
 
 fn min_px(text: &str) -> Result<f64, String> {

@@ -7,9 +7,9 @@ use super::out;
 use crate::app::log::last_words;
 use crate::text;
 
-/// Done.
+/// Success.
 pub const DONE: u8 = 0;
-/// Tried and failed.
+/// Failure.
 pub const FAILED: u8 = 1;
 /// Wrong usage.
 pub const WRONG_USAGE: u8 = 2;
@@ -19,16 +19,16 @@ pub const BAD_CONFIG: u8 = 78;
 /// Result of a command.
 pub type CliResult = Result<(), CliError>;
 
-/// A message for people, of one line or two, and the exit code that goes with it.
+/// A message of one or two lines, and its exit code.
 #[derive(Debug)]
 pub struct CliError {
-    /// Empty where there is nothing to say.
+    /// Empty where there is no message.
     message: String,
     code: u8,
 }
 
 impl CliError {
-    /// Tried and failed.
+    /// A failure.
     pub fn failed(message: impl Display) -> Self {
         Self { message: message.to_string(), code: FAILED }
     }
@@ -38,7 +38,7 @@ impl CliError {
         Self { message: message.to_string(), code: WRONG_USAGE }
     }
 
-    /// Whoever read standard output went: nothing failed, and there is nobody to say it to.
+    /// The reader of standard output has closed it: nothing failed, and no message can be shown.
     pub(super) fn unread() -> Self {
         Self { message: String::new(), code: DONE }
     }
@@ -55,7 +55,7 @@ impl<E: std::error::Error> From<E> for CliError {
     }
 }
 
-/// Prints the error, if any, and gives the exit code.
+/// Prints the error, if any, and returns the exit code.
 pub(super) fn exit_code(result: CliResult) -> ExitCode {
     match result.and_then(|()| out::flush()) {
         Ok(()) => ExitCode::from(DONE),

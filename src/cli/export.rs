@@ -30,7 +30,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     write(&args.flight, args.format, &out)
 }
 
-/// Writes the outputs of a flight into a directory, and says what was written.
+/// Writes the outputs of a flight into a directory, and prints what was written.
 pub(super) fn write(flight: &Path, format: Format, out: &Path) -> CliResult {
     let inputs = Inputs::of([flight]);
     format.files().iter().try_for_each(|(file, mark)| place::check(&out.join(file), &inputs, &[*mark]))?;
@@ -44,8 +44,8 @@ pub(super) fn write(flight: &Path, format: Format, out: &Path) -> CliResult {
     Ok(())
 }
 
-/// `flight.mcap` and `FLIGHTS/flight/` both give `flight` in the working directory; a directory of
-/// segments of that very name gets `flight-export`, so that a flight is never written into.
+/// `flight.mcap` and `FLIGHTS/flight/` both give `flight` in the working directory; a directory of segments of the same
+/// name gets `flight-export`, so that nothing is written into a flight.
 fn named_after(flight: &Path) -> PathBuf {
     let stem = flight.file_stem().unwrap_or(flight.as_os_str());
     let out = PathBuf::from(stem);

@@ -1,4 +1,4 @@
-//! `windhover generate`: manual pages and shell completions out of the command line itself.
+//! `windhover generate`: manual pages and shell completions from the command line's definition.
 
 use std::path::{Path, PathBuf};
 
@@ -7,19 +7,19 @@ use clap_complete::Shell;
 
 use super::{Cli, CliError, CliResult};
 
-/// Write manual pages or shell completions, made from the command line itself, into a directory.
+/// Write manual pages or shell completions, made from the command line's definition, into a directory.
 #[derive(clap::Args, Debug)]
 pub(super) struct Args {
     /// What to write
     #[arg(value_enum)]
     what: What,
-    /// Directory, made where missing
+    /// Directory, made if missing
     directory: PathBuf,
 }
 
 #[derive(Clone, Copy, Debug, clap::ValueEnum)]
 enum What {
-    /// Manual pages, one a command
+    /// Manual pages, one for each command
     Man,
     /// Completions for bash, zsh and fish
     Completions,
@@ -43,7 +43,7 @@ fn man(directory: &Path) -> std::io::Result<()> {
     man_of(&command, directory)
 }
 
-/// A page of the command and of each below it; not of `help`, whose pages would say it all again.
+/// A page of the command and of each subcommand; not of `help`, whose pages would repeat the others.
 fn man_of(command: &clap::Command, directory: &Path) -> std::io::Result<()> {
     let name = command.get_display_name().unwrap_or_else(|| command.get_name());
     let mut page = Vec::new();

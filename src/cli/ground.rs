@@ -12,16 +12,16 @@ use crate::io::link::StationSettings;
 use crate::io::link::tls::KeyFiles;
 use crate::text::number;
 
-/// Receive from payloads: keep their flights, show them on a web page, feed other programs.
+/// Receive from payloads: store their flights, show them on a web page, feed other programs.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Example:
   windhover keys authority && windhover keys payload bird && windhover keys station hut
   windhover ground --certificate keys/station-hut.pem --connect 10.0.0.2:4433")]
 pub(super) struct Args {
-    /// Payload to call; may be given several times
+    /// Payload to connect to; may be given several times
     #[arg(long, value_name = "HOST:PORT", value_parser = host_and_port)]
     connect: Vec<String>,
-    /// Address at which payloads that call reach this station
+    /// Address at which payloads connect to this station
     #[arg(long, value_name = "ADDRESS:PORT")]
     listen: Option<SocketAddr>,
     /// Certificate of the authority
@@ -30,62 +30,62 @@ pub(super) struct Args {
     /// Certificate of this station, from `windhover keys station`
     #[arg(long, value_name = "FILE")]
     certificate: PathBuf,
-    /// Private key of this station; beside the certificate when not given
+    /// Private key of this station [default: the file beside the certificate]
     #[arg(long, value_name = "FILE")]
     key: Option<PathBuf>,
-    /// Revocation list; beside the authority's certificate when not given, if there is one
+    /// Revocation list [default: the file beside the authority's certificate, if there is one]
     #[arg(long, value_name = "FILE")]
     revoked: Option<PathBuf>,
-    /// Directory for the flights received
+    /// Directory for the received flights
     #[arg(long, value_name = "DIR", default_value = "ground")]
     out: PathBuf,
-    /// Where to serve the web page; elsewhere than on loopback a token is asked for
+    /// Address of the web page; other addresses than loopback require a token
     #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:8080")]
     web: SocketAddr,
     /// Serve no web page
     #[arg(long)]
     no_web: bool,
-    /// Token visitors of the page must know; made up and printed when the page is not on loopback
+    /// Token that visitors of the page must send; random and printed when the page is not on loopback
     #[arg(long)]
     token: Option<String>,
     /// Folder with map tiles (Z/X/Y.png, Web Mercator)
     #[arg(long, value_name = "DIR")]
     tiles: Option<PathBuf>,
-    /// Where the station stands, in degrees: the page tells distance and bearing from there [default: from where the
-    /// helicopter was first seen]
+    /// Position of the station, degrees: the page shows distance and bearing from there [default: the first position of
+    /// the helicopter]
     #[arg(long, value_name = "LAT,LON", value_parser = position, allow_hyphen_values = true)]
     position: Option<[f64; 2]>,
     /// Serve the vehicles as NMEA (RMC, GGA, GSA, GST) over TCP here, for example 127.0.0.1:10110
     #[arg(long, value_name = "ADDRESS:PORT")]
     nmea: Option<SocketAddr>,
-    /// Send vehicles and helicopters as Cursor on Target, for TAK: udp://ADDRESS:PORT (239.2.3.1:6969 is TAK's group),
+    /// Send vehicles and helicopters as Cursor on Target, for TAK: udp://ADDRESS:PORT (TAK's group is 239.2.3.1:6969),
     /// tcp://HOST:PORT or tls://HOST:PORT; may be given several times
     #[arg(long, value_name = "URL")]
     cot: Vec<CotTo>,
-    /// Certificate of the authority that signed the TAK server's
+    /// Certificate of the authority that signed the TAK server's certificate
     #[arg(long, value_name = "FILE")]
     cot_authority: Option<PathBuf>,
-    /// Own certificate for the TAK server
+    /// Client certificate for the TAK server
     #[arg(long, value_name = "FILE", requires = "cot_key")]
     cot_certificate: Option<PathBuf>,
     /// Private key of that certificate
     #[arg(long, value_name = "FILE", requires = "cot_certificate")]
     cot_key: Option<PathBuf>,
-    /// Serve Foxglove over its WebSocket; elsewhere than on loopback the token is asked for
+    /// Serve Foxglove over its WebSocket; other addresses than loopback require the token
     #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1:8765")]
     foxglove: Option<SocketAddr>,
     /// Publish on Zenoh and answer queries there: without a value on loopback only, else a router's endpoint
-    /// (tcp/HOST:PORT) or a file with Zenoh's configuration; only where built with the feature `zenoh`
+    /// (tcp/HOST:PORT) or a file with Zenoh's configuration; needs a build with the feature `zenoh`
     #[arg(long, value_name = "ENDPOINT|FILE", num_args = 0..=1, default_missing_value = "tcp/127.0.0.1:7447")]
     zenoh: Option<String>,
-    /// Ask for no thumbnails of the camera image
+    /// Request no thumbnails of the camera image
     #[arg(long)]
     no_thumbnails: bool,
 }
 
-/// An address to call: a name, an IPv4 address or an IPv6 address in brackets, with a port.
+/// An address to connect to: a name, an IPv4 address or an IPv6 address in brackets, with a port.
 fn host_and_port(text: &str) -> Result<String, String> {
-    let advice = "give HOST:PORT; the port is that of the payload's [link] listen";
+    let advice = "give HOST:PORT; the port is that of `listen` in the payload's [link]";
     let (host, port) = text.rsplit_once(':').ok_or(advice)?;
     let bracketed = host.starts_with('[') && host.ends_with(']');
     let port_fits = port.parse::<u16>().is_ok_and(|port| port > 0);
@@ -101,19 +101,21 @@ fn position(text: &str) -> Result<[f64; 2], String> {
         text.split_once(',').ok_or("give latitude and longitude in degrees, such as 48.1,11.6")?;
     let [lat, lon] = [number(lat)?, number(lon)?];
     let fits = lat.abs() <= 90.0 && lon.abs() <= 180.0;
-    fits.then_some([lat, lon]).ok_or_else(|| format!("{lat}, {lon} is no place on the Earth"))
+    fits.then_some([lat, lon]).ok_or_else(|| format!("{lat}, {lon} is not a place on the Earth"))
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
     if args.connect.is_empty() && args.listen.is_none() {
         return Err(CliError::usage(
-            "say which payload to call (--connect) or where payloads call (--listen)",
+            "give the payload to connect to (--connect) or the address for payloads (--listen)",
         ));
     }
     let token_fits =
         |t: &String| t.len() >= 8 && t.chars().all(|c| c.is_ascii_alphanumeric() || "-_.~".contains(c));
     if args.token.as_ref().is_some_and(|token| !token_fits(token)) {
-        return Err(CliError::usage("--token must be at least 8 letters, digits and -_.~"));
+        return Err(CliError::usage(
+            "--token must have at least 8 characters, only letters, digits and -_.~",
+        ));
     }
     if args.zenoh.is_some() && !cfg!(feature = "zenoh") {
         return Err(CliError::usage(

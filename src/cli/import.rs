@@ -11,15 +11,16 @@ use crate::io::new_file::Inputs;
 use crate::text::{counted, one_line};
 use windhover_base::time::MonoTime;
 
-/// Make a capture of recordings you already have: serial logs with a time a line, autopilots' logs, bags of ROS, a video.
+/// Make a capture from existing recordings: serial logs with a time on each line, logs of autopilots, bags of ROS, a
+/// video.
 #[derive(clap::Args, Debug)]
 #[command(
     after_help = "Serial logs: each line starts with a time (seconds since any epoch, ISO 8601 with T or a blank, or
-as gpspipe -t writes it) and a blank or tab, then what came over the line. Tables: comma-separated, with a header; the
-sections [imu] and [attitude] of the configuration say how the sensors are mounted and how good they are. Video: a folder
+as gpspipe -t writes it) and a blank or tab, then the received bytes. Tables: comma-separated, with a header; the
+sections [imu] and [attitude] of the configuration describe the sensors' mounting and noise. Video: a folder
 of images with times.csv (time_s,file), Motion
-JPEG in AVI, Y4M, or whatever an installed ffmpeg reads. All times are on one clock. Logs and bags become what the
-autopilot would have sent over MAVLink: the section [autopilot] of the configuration says what of it is used.
+JPEG in AVI, Y4M, or any format that an installed ffmpeg reads. All times are on one clock. Logs and bags become the
+MAVLink messages of an autopilot: the section [autopilot] of the configuration selects which of them are used.
 
 Example:
   windhover import --gps gps.log --compass compass.log --video frames/ \\
@@ -46,16 +47,16 @@ pub(super) struct Args {
     /// Bag of ROS 1, or of ROS 2 (MCAP or SQLite; a file or the bag's folder): images, NavSatFix, Imu, MagneticField
     #[arg(long, value_name = "FILE|FOLDER")]
     bag: Option<PathBuf>,
-    /// Topic of the bag to use; may be given several times [default: of each kind the one with the shortest name]
+    /// Topic of the bag to use; may be given several times [default: for each kind the one with the shortest name]
     #[arg(long, value_name = "NAME", requires = "bag")]
     topic: Vec<String>,
     /// Video file, or folder of images with times.csv
     #[arg(long, value_name = "FILE|FOLDER")]
     video: Option<PathBuf>,
-    /// When a video file's first frame was taken [default: as its .SRT says, else with the first line of the logs]
+    /// Time of a video file's first frame [default: from its .SRT, else the first line of the logs]
     #[arg(long, value_name = "TIME", value_parser = time)]
     video_start: Option<MonoTime>,
-    /// Configuration to attach, so that the capture replays by itself
+    /// Configuration to attach, so that the capture can be replayed without another file
     #[arg(long)]
     config: Option<PathBuf>,
     /// Capture to write
@@ -64,7 +65,8 @@ pub(super) struct Args {
 }
 
 fn time(text: &str) -> Result<MonoTime, String> {
-    parse_time(text).ok_or_else(|| format!("{text:?} is no time: give seconds or a date and time (ISO 8601)"))
+    parse_time(text)
+        .ok_or_else(|| format!("{text:?} is not a time: give seconds or a date and time (ISO 8601)"))
 }
 
 pub(super) fn run(args: &Args) -> CliResult {

@@ -9,9 +9,9 @@ use crate::cli::out::outln;
 use crate::io::link::keys::{Authority, Role};
 use windhover_base::time::{NS_PER_S, UtcTime};
 
-/// Make the certificates with which payloads and ground stations know each other.
+/// Make the certificates by which payloads and ground stations authenticate each other.
 ///
-/// Make the authority once, keep its directory at home, and copy to each payload or station only its own
+/// Make the authority once, keep its directory in a safe place, and copy to each payload or station only its own
 /// certificate and key, authority.pem and revoked.pem.
 #[derive(ClapArgs, Debug)]
 pub(super) struct Args {
@@ -25,7 +25,7 @@ enum Action {
     Authority {
         #[command(flatten)]
         place: Place,
-        /// Name that stands in its certificate
+        /// Name in its certificate
         #[arg(long, default_value = "windhover authority")]
         name: String,
         /// Days until it expires
@@ -38,7 +38,7 @@ enum Action {
     Station(Issue),
     /// Put a payload or station on the revocation list
     Revoke {
-        /// Which kind
+        /// Role
         #[arg(value_parser = ["payload", "station"])]
         role: String,
         /// Its name
@@ -59,7 +59,7 @@ struct Place {
 
 #[derive(ClapArgs, Debug)]
 struct Issue {
-    /// Name of it: letters, digits and -
+    /// Name: letters, digits and -
     name: String,
     #[command(flatten)]
     place: Place,
@@ -74,7 +74,7 @@ pub(super) fn run(args: &Args) -> CliResult {
         Action::Authority { place, name, days } => {
             let authority = Authority::at(&place.dir);
             authority.create(name, *days, now)?;
-            outln!("authority in {}: keep authority.key at home", place.dir.display())?;
+            outln!("authority in {}: keep authority.key in a safe place", place.dir.display())?;
             Ok(())
         }
         Action::Payload(issue) => make(Role::Payload, issue, now),
@@ -108,7 +108,7 @@ fn list(dir: &Path, now: UtcTime) -> CliResult {
     let authority = Authority::at(dir);
     if !authority.certificate_file().exists() {
         return Err(CliError::failed(format!(
-            "{}: no authority here; make one with `windhover keys authority`",
+            "{}: there is no authority here; make one with `windhover keys authority`",
             dir.display()
         )));
     }
@@ -123,7 +123,7 @@ fn list(dir: &Path, now: UtcTime) -> CliResult {
     Ok(())
 }
 
-/// The date, which certificates are about.
+/// The date, for the validity of certificates.
 fn wall_clock() -> UtcTime {
     let seconds = rustls::pki_types::UnixTime::now().as_secs();
     UtcTime::from_unix_ns(i64::try_from(seconds).unwrap_or(i64::MAX).saturating_mul(NS_PER_S))

@@ -14,20 +14,20 @@ use crate::io::new_file::Inputs;
 use windhover_base::time::{NS_PER_S, UtcTime};
 use windhover_simulate::Scenario;
 
-/// How long certificates of a simulation are good, days.
+/// Validity of a simulation's certificates, days.
 const DAYS: i64 = 30;
 /// Where the payload's link listens.
 const LINK_AT: &str = "127.0.0.1:7447";
 
-/// What a live simulation is asked for.
+/// The options of a live simulation.
 pub(super) struct Live<'a> {
-    /// Where its lines, its card and its keys are.
+    /// The folder of its lines, its card and its keys.
     pub(super) folder: &'a Path,
     /// Draws every random error.
     pub(super) seed: u64,
-    /// Another program flies the helicopter, by datagrams here.
+    /// Address for another program that flies the helicopter by datagrams.
     pub(super) driver: Option<&'a str>,
-    /// The daemon is started by somebody else.
+    /// Whether the daemon is started separately.
     pub(super) no_daemon: bool,
 }
 
@@ -67,7 +67,7 @@ pub(super) fn run(scenario: Scenario, live: &Live<'_>) -> CliResult {
     daemon.map_or(Ok(()), stop)?;
     let score = score.map_err(CliError::failed)?;
     note!(
-        "follow error {:.2} m rms, {:.2} m most; tilt {:.1} deg rms, {:.1} deg most; velocity told wrong by {:.3} m/s rms ({} times told)",
+        "follow error {:.2} m rms, {:.2} m most; tilt {:.1} deg rms, {:.1} deg most; velocity error in the messages {:.3} m/s rms ({} messages)",
         score.follow_rms_m,
         score.follow_max_m,
         score.tilt_rms_deg,
@@ -105,7 +105,7 @@ fn start(config: &Path) -> Result<Child, CliError> {
     command.spawn().map_err(|e| CliError::failed(format!("cannot start the daemon: {e}")))
 }
 
-/// Asks the daemon to end, and waits for it.
+/// Asks the daemon to stop, and waits for it.
 fn stop(mut daemon: Child) -> CliResult {
     if let Some(pid) = i32::try_from(daemon.id()).ok().and_then(Pid::from_raw) {
         let _ = kill_process(pid, Signal::TERM);

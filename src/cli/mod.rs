@@ -29,19 +29,19 @@ use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
 use crate::app::run::prepare;
 
-/// Watches a ground vehicle from a small helicopter: where it is, where it points, how it moves.
+/// Watches a ground vehicle from a small helicopter: its position, heading and motion.
 #[derive(Parser, Debug)]
 #[command(
     name = "windhover",
     version,
     max_term_width = 100,
     propagate_version = true,
-    after_help = "Begin without hardware:
-  windhover simulate flight.mcap --duration 20            a flight, with its truth beside it
-  windhover replay flight.mcap --out result.mcap          the pipeline that flies, over it
-  windhover report result.mcap --truth flight.truth.csv   a page about it: report.html
+    after_help = "Start without hardware:
+  windhover simulate flight.mcap --duration 20            a simulated flight, and its truth
+  windhover replay flight.mcap --out result.mcap          runs the pipeline on it
+  windhover report result.mcap --truth flight.truth.csv   writes a page: report.html
 
-`windhover COMMAND --help` tells of each command, with examples. Exit codes: 0 done, 1 failed,
+`windhover COMMAND --help` describes each command, with examples. Exit codes: 0 done, 1 failed,
 2 wrong usage, 78 bad configuration."
 )]
 pub struct Cli {
@@ -73,14 +73,14 @@ enum Command {
 
 /// Runs the command line of this process.
 pub fn main() -> ExitCode {
-    // The daemon takes its signals over first of all: to understand the command line takes milliseconds.
+    // The daemon takes over its signals before anything else: parsing the command line takes milliseconds.
     let prepared = std::env::args_os().nth(1).is_some_and(|first| first == "run").then(prepare);
     let matches = with_negative_numbers(Cli::command()).try_get_matches();
     let cli = match matches.and_then(|matches| Cli::from_arg_matches(&matches)) {
         Ok(cli) => cli,
         Err(error) => {
             let code = if error.use_stderr() { error::WRONG_USAGE } else { error::DONE };
-            // Nothing can be done where even the message cannot be written.
+            // Where even the message cannot be written, nothing can be done.
             let _ = error.print();
             return ExitCode::from(code);
         }
@@ -106,7 +106,7 @@ pub fn main() -> ExitCode {
     error::exit_code(result)
 }
 
-/// The command, and all below it, with options that take `-5` as their value and not for another option.
+/// The command and all its subcommands, with options that take `-5` as a value and not as another option.
 fn with_negative_numbers(command: clap::Command) -> clap::Command {
     let command = command.mut_args(|arg| match arg.get_action().takes_values() {
         true => arg.allow_negative_numbers(true),

@@ -18,11 +18,11 @@ use windhover_calibrate::montecarlo::{Analysis, Setup, radii};
 /// The configuration shipped with the program: the paper's camera.
 const SHIPPED: &str = include_str!("../../config/windhover.toml");
 
-/// Predict how well the ground is located: draw errors of GPS, compass, pixel and camera, run
-/// geo-positioning on each draw, and compare with the closed form.
+/// Predict the accuracy of geo-positioning: draw errors of GPS, compass, pixel and camera, compute the position for
+/// each draw, and compare with the closed form.
 ///
-/// Pose, pixel and error sigmas are the section `[montecarlo]` of the configuration; by default the
-/// paper's: the camera level, 10 m above ground, GPS 3 m (95 %), tilt 0.2 degrees.
+/// Pose, pixel and error sigmas are in the section `[montecarlo]` of the configuration; the default is the paper's: the
+/// camera level, 10 m above ground, GPS 3 m (95 %), tilt 0.2 degrees.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
   windhover montecarlo                                          # the paper's camera and condition
@@ -35,13 +35,13 @@ pub(super) struct Args {
     /// Number of draws
     #[arg(long, value_name = "N", default_value_t = 100_000, value_parser = clap::value_parser!(u64).range(2..=100_000_000))]
     samples: u64,
-    /// Seed of the draws; the same seed gives the same figures
+    /// Seed of the draws; the same seed gives the same results
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
-    /// Lay the raw geo-positions of this flight's first target over the simulation
+    /// Draw the raw geo-positions of this flight's first target over the simulation
     #[arg(long, value_name = "FLIGHT", requires = "truth")]
     flight: Option<PathBuf>,
-    /// Where the target truly was: as for report; one row for a surveyed marker at rest
+    /// True position of the target: as for report; one row for a surveyed marker at rest
     #[arg(long, value_name = "TRUTH.csv", requires = "flight")]
     truth: Option<PathBuf>,
     /// One JSON object on standard output
@@ -88,7 +88,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     Ok(())
 }
 
-/// The flight's raw geo-positions against the truth given.
+/// The flight's raw geo-positions against the given truth.
 fn overlay(args: &Args, flight: Option<&Flight>, config: &Config) -> Result<Option<Overlay>, CliError> {
     let (Some(flight), Some(path)) = (flight, &args.truth) else { return Ok(None) };
     let truth = Truth::read(path)?;
@@ -100,7 +100,7 @@ fn overlay(args: &Args, flight: Option<&Flight>, config: &Config) -> Result<Opti
     );
     if errors_m.is_empty() {
         return Err(CliError::failed(format!(
-            "{} has no marker of the first target beside a fix, a compass sample and a row of truth (a bare capture must be replayed first)",
+            "{} has no marker of the first target together with a fix, a compass sample and a row of truth (a capture must be replayed first)",
             flight.name
         )));
     }
@@ -169,7 +169,7 @@ fn print_text(setup: &Setup, analysis: &Analysis, seed: u64) -> CliResult {
     let drawn = analysis.errors_m.len() + analysis.missed;
     outln!("{drawn} draws, {} errors, seed {seed}", setup.distribution.name())?;
     if analysis.missed > 0 {
-        outln!("{} draws looked past the ground and are left out", analysis.missed)?;
+        outln!("{} draws did not meet the ground and are left out", analysis.missed)?;
     }
     outln!("\n               north m    east m")?;
     outln!("sigma drawn   {:8.4}  {:8.4}", sample[(0, 0)].sqrt(), sample[(1, 1)].sqrt())?;

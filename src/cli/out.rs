@@ -1,5 +1,5 @@
-//! What commands print: standard output for results, standard error for remarks. Nothing of others steers the terminal; a
-//! reader who goes ends the command quietly, a disk that is full is an error.
+//! Output of commands: results on standard output, remarks on standard error. Control sequences in foreign text are
+//! escaped. A reader that closes its end ends the command without a message; a full disk is an error.
 
 use std::fmt::Arguments;
 use std::io::{self, ErrorKind, Write as _};
@@ -18,7 +18,7 @@ macro_rules! out {
     ($($words:tt)*) => { $crate::cli::out::print(format_args!($($words)*)) };
 }
 
-/// Prints a remark on standard error, as `eprintln!` does. Where nobody takes it, it is lost.
+/// Prints a remark on standard error, as `eprintln!` does. It is lost where nothing reads it.
 macro_rules! note {
     ($($words:tt)*) => { $crate::cli::out::remark(format_args!($($words)*)) };
 }
@@ -28,12 +28,12 @@ pub(super) use {note, out, outln};
 /// Prints text of one or more lines on standard output.
 ///
 /// # Errors
-/// Nobody reads it any more ([`CliError::unread`]), or it cannot be written.
+/// Its reader has closed it ([`CliError::unread`]), or it cannot be written.
 pub(super) fn print(words: Arguments<'_>) -> Result<(), CliError> {
     written(io::stdout().write_all(text::printable(&words.to_string()).as_bytes()))
 }
 
-/// What became of something written to standard output.
+/// The result of writing to standard output.
 ///
 /// # Errors
 /// As [`print()`].
@@ -44,7 +44,7 @@ pub(super) fn written<T>(outcome: io::Result<T>) -> Result<T, CliError> {
     })
 }
 
-/// Writes what standard output still holds.
+/// Flushes standard output.
 ///
 /// # Errors
 /// As [`print()`].
@@ -56,6 +56,6 @@ pub(super) fn flush() -> Result<(), CliError> {
 pub(super) fn remark(words: Arguments<'_>) {
     let words = words.to_string();
     let line = format!("{}\n", text::printable(&text::without_numbers(&words)));
-    // Nobody may listen; the command's work is another thing.
+    // There may be no reader; the command continues.
     let _ = io::stderr().write_all(line.as_bytes());
 }

@@ -1,4 +1,5 @@
-//! Where commands write: never over what they read, and over what they did not make only where the person says so.
+//! Output files of commands: an input is never overwritten, and another file that the command did not make only with
+//! the user's consent.
 
 use std::io::{BufRead as _, IsTerminal as _, Write as _};
 use std::path::Path;
@@ -10,21 +11,22 @@ use crate::text;
 /// Marks of drawings that `plot::standalone` makes.
 pub(super) const DRAWING: [&str; 2] = ["<svg", crate::plot::MADE_BY];
 
-/// Whether a command that reads `inputs` may write to `output`. What it wrote there before carries the `marks`.
+/// Checks whether a command that reads `inputs` may write to `output`. Its own earlier output is recognised by the
+/// `marks`.
 ///
 /// # Errors
-/// It may not, and why; nothing was written.
+/// The reason why it may not; nothing was written.
 pub(super) fn check(output: &Path, inputs: &Inputs, marks: &[&str]) -> CliResult {
     inputs.allow(output).map_err(CliError::usage)?;
     if new_file::is_free(output, marks) {
         return Ok(());
     }
     let name = output.display();
-    match asked(&format!("{name} is there and was not made by this command; write over it?"))? {
+    match asked(&format!("{name} exists and was not made by this command; overwrite it?"))? {
         Some(true) => Ok(()),
-        Some(false) => Err(CliError::failed(format!("{name}: left as it is"))),
+        Some(false) => Err(CliError::failed(format!("{name}: left unchanged"))),
         None => Err(CliError::failed(format!(
-            "{name} is there and was not made by this command; remove it first, or name another file"
+            "{name} exists and was not made by this command; remove it first, or choose another file"
         ))),
     }
 }
@@ -32,7 +34,7 @@ pub(super) fn check(output: &Path, inputs: &Inputs, marks: &[&str]) -> CliResult
 /// Writes a small file to a place that was checked.
 ///
 /// # Errors
-/// It cannot be written; what was there before is there still.
+/// It cannot be written; an earlier file remains.
 pub(super) fn write(output: &Path, content: &str) -> CliResult {
     NewFile::write(output, content.as_bytes())
         .map_err(|error| CliError::failed(format!("cannot write {}: {error}", output.display())))

@@ -17,15 +17,15 @@ use crate::io::mcap_write::Maker;
 use crate::io::new_file::Inputs;
 use crate::text::one_line;
 
-/// Estimate a whole flight at once, afterwards: the paths of helicopter and vehicles as well as they can be known, and what
-/// the flight says of its own configuration.
+/// Estimate a whole flight at once, afterwards: the paths of helicopter and vehicles, and constants of the
+/// configuration.
 ///
-/// The flight must hold what the pipeline saw: replay a bare capture first. What is written holds the flight without its
-/// pictures, and beside the real-time estimates the refined ones: `windhover report` and `windhover export` show both.
+/// The flight must have the pipeline's detections: replay a capture first. The output has the flight without its
+/// pictures, and the refined estimates beside the real-time ones: `windhover report` and `windhover export` show both.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
   windhover refine flight.mcap                              # flight.refined.mcap
-  windhover refine flight.mcap --adopt                      # and TOML of what the flight settles
+  windhover refine flight.mcap --adopt                      # and the determined constants as TOML
   windhover refine flight.mcap --truth flight.truth.csv --out refined.mcap
   windhover refine monday.mcap tuesday.mcap                 # two flights over the same markers, with constants in common
   windhover refine flight.mcap --positions base.pos         # with a base station's solution (RTKLIB, GPX, CSV)
@@ -34,13 +34,13 @@ pub(super) struct Args {
     /// Flights: .mcap files, or directories of segments; several are of the same vehicles and configuration
     #[arg(required = true, value_name = "FLIGHT")]
     flights: Vec<PathBuf>,
-    /// What is written, of one flight [default: FLIGHT.refined.mcap beside each flight]
+    /// Output file, for one flight [default: FLIGHT.refined.mcap beside each flight]
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Print, as TOML to paste, what the flight settles of its configuration (beyond three sigmas)
+    /// Print the constants that the flight determines (beyond three sigmas) as TOML for the configuration
     #[arg(long)]
     adopt: bool,
-    /// Positions of the antenna from outside: RTKLIB's .pos, a .gpx track, or .csv with time_ns or utc, lat_deg, lon_deg,
+    /// External positions of the antenna: RTKLIB's .pos, a .gpx track, or .csv with time_ns or utc, lat_deg, lon_deg,
     /// height_m (above the ellipsoid), sigma_m
     #[arg(long, value_name = "FILE")]
     positions: Option<PathBuf>,
@@ -52,7 +52,7 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args) -> CliResult {
     if args.out.is_some() && args.flights.len() > 1 {
         return Err(CliError::usage(
-            "--out names one file: of several flights each result stands beside its flight",
+            "--out names one file: with several flights each result is written beside its flight",
         ));
     }
     let outs: Vec<PathBuf> = match &args.out {
@@ -87,7 +87,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     }
     if let (Some(truth), Some(first)) = (&truth, outs.first()) {
         let table = report::error_text(&Flight::read(first)?, truth);
-        out!("\n{}", table.unwrap_or_else(|| "nothing to compare with the truth\n".to_owned()))?;
+        out!("\n{}", table.unwrap_or_else(|| "there is nothing to compare with the truth\n".to_owned()))?;
     }
     outs.iter().for_each(|to| note!("wrote {}", to.display()));
     Ok(())
@@ -96,7 +96,7 @@ pub(super) fn run(args: &Args) -> CliResult {
 fn print_adopted(done: &RefinedFlight) -> CliResult {
     let toml = adopted(&done.refined, &done.config);
     if toml.is_empty() {
-        note!("the flight settles nothing that is otherwise than configured");
+        note!("the flight determines no constant that differs from the configuration");
     }
     out!("{toml}")
 }
@@ -104,8 +104,8 @@ fn print_adopted(done: &RefinedFlight) -> CliResult {
 fn print_found(done: &RefinedFlight) -> CliResult {
     let targets = &done.config.target[..];
     let estimated = || done.refined.constants.iter().filter(|constant| constant.prior_sigma > 0.0);
-    outln!("what the flight tells of its configuration      value  one sigma  expected")?;
-    for constant in estimated().filter(|constant| constant.is_told()) {
+    outln!("constants of the configuration                  value  one sigma  expected")?;
+    for constant in estimated().filter(|constant| constant.is_determined()) {
         let words = constant_words(constant.kind, targets);
         let [value, sigma, prior, prior_sigma] =
             [constant.value, constant.sigma, constant.prior, constant.prior_sigma].map(|x| x / words.scale);
@@ -117,15 +117,15 @@ fn print_found(done: &RefinedFlight) -> CliResult {
         )?;
     }
     let silent: Vec<String> = estimated()
-        .filter(|constant| !constant.is_told())
+        .filter(|constant| !constant.is_determined())
         .map(|constant| constant_words(constant.kind, targets).name)
         .collect();
     if !silent.is_empty() {
-        outln!("\nnot told by this flight, at what was expected: {}", silent.join(", "))?;
+        outln!("\nnot determined by this flight, at the expected value: {}", silent.join(", "))?;
     }
     for tally in done.refined.tallies.iter().filter(|tally| tally.outliers > 0) {
         let name = source_name(tally.source, targets);
-        outln!("{name}: {} of {} measurements lie outside the gate", tally.outliers, tally.taken)?;
+        outln!("{name}: {} of {} measurements are outside the gate", tally.outliers, tally.taken)?;
     }
     Ok(())
 }

@@ -16,11 +16,10 @@ use crate::io::new_file::Inputs;
 use crate::text::{counted, one_line};
 use windhover_base::msg::Output;
 
-/// Run a recorded capture or flight through the pipeline that flies: the same bytes and frames give
-/// the same estimates.
+/// Run a recorded capture or flight through the pipeline: the same bytes and frames give the same estimates.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
-  windhover replay capture.mcap --out flight.mcap      # with the configuration attached to it
+  windhover replay capture.mcap --out flight.mcap      # with its attached configuration
   windhover replay capture.mcap --config other.toml --out flight.mcap
   windhover replay FLIGHTS/20261118T150405Z --log --realtime   # watch yesterday's flight again")]
 pub(super) struct Args {
@@ -29,13 +28,13 @@ pub(super) struct Args {
     /// Configuration [default: the one attached to the capture]
     #[arg(long)]
     config: Option<PathBuf>,
-    /// Write the flight: everything the capture has, and the outputs
+    /// Write the flight: all messages of the capture, and the outputs
     #[arg(long)]
     out: Option<PathBuf>,
-    /// At the pace at which it was recorded, instead of as fast as it goes
+    /// Replay at the recorded pace instead of as fast as possible
     #[arg(long)]
     realtime: bool,
-    /// Print the log an operator would have tailed, on standard error
+    /// Print the operator's log on standard error
     #[arg(long)]
     log: bool,
 }
@@ -79,7 +78,7 @@ pub(super) fn run(args: &Args) -> CliResult {
         summary.recorded.s() / summary.took.s().max(1e-3)
     );
     if summary.frames == 0 {
-        note!("no frame came from the camera: the helicopter's own state is all that was estimated");
+        note!("no frame was received from the camera: only the helicopter's own state was estimated");
     }
     if let Some(out) = &args.out {
         note!("wrote {}", out.display());
@@ -87,7 +86,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     Ok(())
 }
 
-/// The line an operator would tail, if the output makes one.
+/// The operator's log line, if the output makes one.
 fn log_output(output: &Output, health_line: &HealthLine) {
     match output {
         Output::Notice(notice) => events::notice(notice),

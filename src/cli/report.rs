@@ -10,8 +10,8 @@ use crate::cli::out::{note, out, outln};
 use crate::io::new_file::Inputs;
 use crate::plot::MADE_BY;
 
-/// Write a page about a flight: map, states with their bands, measurements, sensors, frames; errors
-/// where truth is given.
+/// Write a page about a flight: map, states with their one-sigma bands, measurements, sensors, frames; errors where
+/// truth is given.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
   windhover report flight.mcap                              # report.html, one file, for any browser
@@ -24,12 +24,12 @@ pub(super) struct Args {
     /// one row without frame for a surveyed point at rest
     #[arg(long, value_name = "TRUTH.csv")]
     truth: Option<PathBuf>,
-    /// The page
+    /// Output file
     #[arg(long, value_name = "FILE.html", default_value = "report.html")]
     out: PathBuf,
 }
 
-/// What a report says near its begin.
+/// The marks of a report near its start.
 const REPORT: [&str; 2] = ["<meta name=\"generator\" content=\"report ", MADE_BY];
 
 pub(super) fn run(args: &Args) -> CliResult {
@@ -41,7 +41,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     let page = report::render(&args.flight, &flight, truth.as_ref())?;
     place::write(&args.out, &page)?;
     if replaced {
-        note!("the report that was there is replaced");
+        note!("the earlier report is replaced");
     }
     if let Some(table) = truth.as_ref().and_then(|truth| report::error_text(&flight, truth)) {
         out!("{table}")?;

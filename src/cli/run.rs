@@ -5,8 +5,7 @@ use std::path::PathBuf;
 use super::{CliError, CliResult};
 use crate::app::run::{self, Prepared, RunError};
 
-/// Run the daemon: read the sensors, estimate, record, send, until SIGTERM. SIGHUP reads the
-/// configuration again.
+/// Run the daemon: read the sensors, estimate, record, send, until SIGTERM. SIGHUP reloads the configuration.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
   windhover check-config windhover.toml && windhover run --config windhover.toml

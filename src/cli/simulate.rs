@@ -17,38 +17,37 @@ use windhover_simulate::{Deviation, Flight, FrameStorage, FrameTruth, Scenario, 
 
 /// Make a capture of a simulated flight, with the truth beside it.
 ///
-/// OUT.mcap holds what real devices would have delivered: the bytes of the serial lines as reads
-/// returned them, camera frames, and the configuration. Beside it, OUT.truth.csv tells where the
-/// vehicle really was at each frame (OUT.truth_NAME.csv for each further vehicle) and
-/// OUT.truth_ownship.csv where the helicopter was. The same scenario and seed always make the same
+/// OUT.mcap has the data that real devices would deliver: bytes of the serial lines by reads, camera frames, and the
+/// configuration. Beside it, OUT.truth.csv has the true state of the vehicle at each frame (OUT.truth_NAME.csv for each
+/// further vehicle) and OUT.truth_ownship.csv that of the helicopter. The same scenario and seed always give the same
 /// flight.
 ///
-/// With --with the flight differs from the configuration that OUT.mcap holds: tags larger than it says, people who walk
-/// about, stamps that jitter. Each such deviation is a scenario too, under its own name.
+/// With --with the flight deviates from the configuration in OUT.mcap: for example tags of another size, walking
+/// people, jittering stamps. Each such deviation is also a scenario under its own name.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "\
 Examples:
   windhover simulate flight.mcap                          a minute of following a vehicle at 15 m
-  windhover simulate a.mcap --scenario hover10 --seed 7   another draw of every error
+  windhover simulate a.mcap --scenario hover10 --seed 7   with other random errors
   windhover simulate b.mcap --duration 10 --scale 0.5     short, at half the resolution: a small file
   windhover simulate --live --duration 120                the helicopter follows, in real time; then windhover ground
-  windhover simulate --list                               what scenarios and deviations there are
+  windhover simulate --list                               lists scenarios and deviations
   windhover simulate c.mcap --with people=3 --with readout=15   a flight that its configuration does not fit
 
 Then:
   windhover replay flight.mcap --out result.mcap          run the pipeline over it
-  windhover report result.mcap --truth flight.truth.csv   how far the estimates are from the truth")]
+  windhover report result.mcap --truth flight.truth.csv   compare the estimates with the truth")]
 pub(super) struct Args {
     /// Capture to write
     #[arg(required_unless_present_any = ["list", "live"], value_name = "OUT.mcap")]
     out: Option<PathBuf>,
-    /// What happens in the flight (see --list)
+    /// Scenario of the flight (see --list)
     #[arg(long, default_value = "follow", value_name = "NAME")]
     scenario: String,
     /// Length of the flight, seconds [default: the scenario's own, 60]
     #[arg(long, value_name = "S")]
     duration: Option<f64>,
-    /// Draws every random error: latencies, biases, noise, wind, routes
+    /// Seed of all random errors: latencies, biases, noise, wind, routes
     #[arg(long, default_value_t = 1, value_name = "N")]
     seed: u64,
     /// Camera resolution as a share of 1280 x 1024
@@ -57,7 +56,7 @@ pub(super) struct Args {
     /// Frames a second [default: the scenario's own, 15]
     #[arg(long, value_name = "FPS")]
     fps: Option<f64>,
-    /// Let the flight differ from its configuration (see --list); again for more
+    /// Let the flight deviate from its configuration (see --list); may be repeated
     #[arg(long, value_name = "NAME[=FIGURE]")]
     with: Vec<String>,
     /// JPEG quality of the frames, 1 to 100
@@ -66,8 +65,8 @@ pub(super) struct Args {
     /// Store frames as raw grey pixels instead of JPEG (large)
     #[arg(long, conflicts_with = "quality")]
     lossless: bool,
-    /// Fly in real time with a daemon on pseudo-terminals: the helicopter follows the vehicle by what the daemon says over
-    /// MAVLink
+    /// Fly in real time with a daemon on pseudo-terminals: the helicopter follows the vehicle by the daemon's MAVLink
+    /// messages
     #[arg(long, conflicts_with_all = ["out", "lossless"])]
     live: bool,
     /// With --live: folder for lines, configuration, keys and card
@@ -97,7 +96,7 @@ pub(super) fn run(args: &Args) -> CliResult {
         };
         return live::run(scenario(args)?, &live);
     }
-    let out = args.out.as_deref().ok_or_else(|| CliError::usage("say which capture to write"))?;
+    let out = args.out.as_deref().ok_or_else(|| CliError::usage("give the capture to write"))?;
     let scenario = scenario(args)?;
     check_places(out, &scenario)?;
     let quality = args.quality;
@@ -106,7 +105,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     write_flight(scenario, args.seed, storage, out)
 }
 
-/// A line each, which begins with a name that `--scenario` takes.
+/// One line for each, which begins with a name for `--scenario`.
 fn list() -> CliResult {
     for (name, about) in Scenario::names().iter().copied().chain(Scenario::composed()) {
         outln!("{name:18} {about}")?;
@@ -125,7 +124,7 @@ fn list() -> CliResult {
 fn scenario(args: &Args) -> Result<Scenario, CliError> {
     let unknown = || {
         CliError::usage(format!(
-            "no scenario is called {:?}; `windhover simulate --list` names them",
+            "unknown scenario {:?}; `windhover simulate --list` lists them",
             args.scenario
         ))
     };
@@ -147,16 +146,16 @@ fn scenario(args: &Args) -> Result<Scenario, CliError> {
     }
     for text in &args.with {
         let refused =
-            |e| CliError::usage(format!("--with {text}: {e}; `windhover simulate --list` names them"));
+            |e| CliError::usage(format!("--with {text}: {e}; `windhover simulate --list` lists them"));
         scenario.deviate_as(text).map_err(refused)?;
     }
     config_of(&scenario)
         .check()
-        .map_err(|e| CliError::usage(format!("this flight cannot be configured: {e}")))?;
+        .map_err(|e| CliError::usage(format!("there is no valid configuration for this flight: {e}")))?;
     Ok(scenario)
 }
 
-/// The configuration that a daemon would fly with.
+/// The daemon's configuration for the scenario.
 fn config_of(scenario: &Scenario) -> Config {
     Config::of_rig(scenario.rig.clone(), scenario.ground())
 }
@@ -176,7 +175,7 @@ fn truth_paths(out: &Path, scenario: &Scenario) -> Vec<PathBuf> {
     vehicles.chain([beside(out, "truth_ownship")]).collect()
 }
 
-/// A flight and its truth are written over older ones of a simulation, and over nothing else.
+/// A flight and its truth overwrite older ones of a simulation, and no other files.
 fn check_places(out: &Path, scenario: &Scenario) -> CliResult {
     place::check(out, &Inputs::default(), &Maker::Capture.marks())?;
     let truths = truth_paths(out, scenario);

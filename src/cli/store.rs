@@ -17,13 +17,13 @@ use crate::io::store::volume::Volume;
 /// The daemon's configuration.
 const CONFIG: &str = "/etc/windhover/windhover.toml";
 
-/// See and tend the flights on the data card.
+/// Show and manage the flights on the data card.
 ///
-/// FLIGHT is a directory name as `store list` shows it, or the beginning of one that no other has.
-/// Everything but `rebuild` works while the daemon records; it never touches the flight in the air.
+/// FLIGHT is a directory name as `store list` shows it, or a unique prefix of one. Everything except `rebuild` works
+/// while the daemon records; the flight being recorded is never touched.
 #[derive(ClapArgs, Debug)]
 pub(super) struct Args {
-    /// Configuration that tells where the store is
+    /// Configuration that names the store
     #[arg(long, global = true, value_name = "FILE", default_value = CONFIG)]
     config: PathBuf,
     /// Directory of the store, instead of the configuration's store.path
@@ -37,11 +37,11 @@ pub(super) struct Args {
 enum Action {
     /// List all flights, oldest first
     List {
-        /// One JSON object a line
+        /// One JSON object on each line
         #[arg(long)]
         json: bool,
     },
-    /// Tell all about a flight: durations, sizes, gaps, dropouts, and what it costs the card
+    /// Describe a flight: durations, sizes, gaps, dropouts, and its effect on the card's life
     Show {
         /// Flight
         flight: String,
@@ -49,26 +49,26 @@ enum Action {
         #[arg(long)]
         json: bool,
     },
-    /// Read flights whole and compare them with the index; changes nothing
+    /// Read every byte of flights and compare them with the index; changes nothing
     Verify {
         /// Flights [default: all]
         flight: Vec<String>,
     },
-    /// Seal segments that are cut or holed, keeping every whole chunk
+    /// Seal segments that are cut or have gaps, keeping every complete chunk
     Repair {
         /// Flights [default: all]
         flight: Vec<String>,
     },
-    /// Make the index again from the segments (the daemon must not run)
+    /// Rebuild the index from the segments (the daemon must not run)
     Rebuild,
     /// Write the outputs of a flight for other tools
     Export(Export),
-    /// Never delete a flight to make room
+    /// Protect flights from deletion
     Keep {
         /// Flights
         #[arg(required = true)]
         flight: Vec<String>,
-        /// Take the mark away again
+        /// Remove the protection again
         #[arg(long)]
         undo: bool,
     },
@@ -77,7 +77,7 @@ enum Action {
         /// Flights
         #[arg(required = true)]
         flight: Vec<String>,
-        /// Do not ask
+        /// Do not ask for confirmation
         #[arg(long, short)]
         yes: bool,
     },
@@ -119,7 +119,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     }
 }
 
-/// How `store` was called, so that advice can be typed as it stands.
+/// The command line of `store`, for advice that can be typed as it is.
 fn called(args: &Args) -> String {
     let quoted = |path: &Path| {
         let path = path.display().to_string();
@@ -135,9 +135,9 @@ fn called(args: &Args) -> String {
     }
 }
 
-/// The flight of that name, or the only one whose name begins so.
+/// The flight of that name, or the only one whose name begins with it.
 fn resolve(root: &Path, asked: &str, called: &str) -> Result<String, CliError> {
-    // Shells complete to paths: the last part counts.
+    // Shells complete to paths: only the last part is the name.
     let asked = asked.trim_end_matches('/').rsplit('/').next().unwrap_or(asked);
     let names = flight::flight_names(root)?;
     if names.iter().any(|name| name == asked) {
@@ -147,9 +147,10 @@ fn resolve(root: &Path, asked: &str, called: &str) -> Result<String, CliError> {
     like.sort_unstable();
     match like[..] {
         [one] => Ok(one.clone()),
-        [] => {
-            Err(CliError::failed(format!("no flight {asked:?} in {}; see `{called} list`", root.display())))
-        }
+        [] => Err(CliError::failed(format!(
+            "there is no flight {asked:?} in {}; see `{called} list`",
+            root.display()
+        ))),
         _ => Err(CliError::failed(format!(
             "{asked:?} may be {} or {}; give more of the name",
             like[0], like[1]
@@ -157,7 +158,7 @@ fn resolve(root: &Path, asked: &str, called: &str) -> Result<String, CliError> {
     }
 }
 
-/// The flights asked for; all, oldest first, where none was.
+/// The requested flights; all, oldest first, where none was given.
 fn resolve_all(root: &Path, asked: &[String], called: &str) -> Result<Vec<String>, CliError> {
     if asked.is_empty() {
         return Ok(inspect::list(root)?.0.into_iter().map(|info| info.name).collect());
@@ -191,9 +192,9 @@ fn delete(root: &Path, names: &[String], yes: bool, called: &str) -> CliResult {
             )));
         }
         let question = || place::asked(&format!("delete {name}, {}?", show::size(info.bytes)));
-        let no_terminal = || CliError::usage("there is no terminal to ask on; say --yes");
+        let no_terminal = || CliError::usage("there is no terminal to ask on; give --yes");
         if !yes && !question()?.ok_or_else(no_terminal)? {
-            outln!("{name}: left as it is")?;
+            outln!("{name}: left unchanged")?;
             continue;
         }
         flight::delete(&volume, name)?;

@@ -1,4 +1,4 @@
-//! What a configuration must satisfy beyond its syntax.
+//! Checks of a configuration beyond its syntax.
 
 use windhover_base::settings::{
     AttitudeConfig, AutopilotUse, GpsFormat, GroundConfig, ImuConfig, MarkerConfig, MarkerKind, TargetConfig,
@@ -10,13 +10,13 @@ use super::{AUTOPILOT, Config};
 /// What is wrong with a configuration.
 #[derive(Clone, PartialEq, Debug, thiserror::Error)]
 pub enum ConfigError {
-    /// Not TOML, an unknown key, or a value of the wrong kind. The text carries the line.
+    /// Not TOML, an unknown key, or a value of the wrong type. The text contains the line.
     #[error("{0}")]
     Syntax(String),
-    /// A value that cannot be.
+    /// An impossible value.
     #[error("{}{key}: {reason}", line.map_or(String::new(), |n| format!("line {n}, ")))]
     Value {
-        /// Where it stands, from 1; `None` where a default or several places may be meant.
+        /// Its line, from 1; `None` where it may be a default or at several places.
         line: Option<usize>,
         /// The key, with its table.
         key: String,
@@ -35,7 +35,7 @@ impl ConfigError {
             return Self::Syntax(words);
         };
         let line = 1 + before.matches('\n').count();
-        // The line itself shows what is meant; a missing key has none of its own.
+        // The line itself shows the key; a missing key has no line.
         let written = text.lines().nth(line - 1).unwrap_or_default().trim();
         if words.starts_with("missing field") || written.is_empty() {
             Self::Syntax(format!("line {line}: {words}"))
@@ -44,7 +44,7 @@ impl ConfigError {
         }
     }
 
-    /// The same with the line at which the key stands, where it stands at one only.
+    /// The same with the line of the key, where the key is on one line only.
     pub(super) fn at_line(self, text: &str) -> Self {
         match self {
             Self::Value { key, reason, line: None } => {
@@ -60,7 +60,7 @@ pub(super) fn refuse(key: impl Into<String>, reason: impl Into<String>) -> Resul
     Err(ConfigError::Value { line: None, key: key.into(), reason: reason.into() })
 }
 
-/// The line of a dotted key in a text of tables; `None` where no line or several would fit.
+/// The line of a dotted key in a text of tables; `None` where no line or several would match.
 fn line_of(key: &str, text: &str) -> Option<usize> {
     let plain = key.split('[').next().unwrap_or(key);
     let (table, name) = plain.rsplit_once('.').unwrap_or(("", plain));
@@ -81,7 +81,7 @@ fn line_of(key: &str, text: &str) -> Option<usize> {
     found
 }
 
-/// A figure must be finite and within bounds.
+/// A value must be finite and within bounds.
 pub(super) fn within(key: impl Into<String>, value: f64, low: f64, high: f64) -> Result<(), ConfigError> {
     if value.is_finite() && (low..=high).contains(&value) {
         return Ok(());
@@ -89,9 +89,9 @@ pub(super) fn within(key: impl Into<String>, value: f64, low: f64, high: f64) ->
     refuse(key, format!("{value} is not between {low} and {high}"))
 }
 
-/// Targets: all are states of one filter, whose memory grows with their square.
+/// Most targets: all are states of one filter, whose memory grows with the square of their number.
 const MOST_TARGETS: usize = 32;
-/// Markers of all targets together.
+/// Most markers of all targets together.
 const MOST_MARKERS: usize = 256;
 
 /// Line speeds a UART can be set to.
@@ -113,11 +113,11 @@ fn network_device(key: &str, device: &str) -> Result<(), ConfigError> {
     if matches!(protocol, "tcp" | "udp") && has_port {
         return Ok(());
     }
-    refuse(key, format!("{device} is no device; give a path, tcp://HOST:PORT or udp://ADDRESS:PORT"))
+    refuse(key, format!("{device} is not a device; give a path, tcp://HOST:PORT or udp://ADDRESS:PORT"))
 }
 
 impl Config {
-    /// Checks every value; the first that cannot be is the error.
+    /// Checks every value; the error is the first impossible one.
     pub fn check(&self) -> Result<(), ConfigError> {
         self.check_sensors()?;
         self.check_camera()?;
@@ -213,7 +213,7 @@ impl Config {
             ("camera.device", &self.camera.device, None),
         ] {
             if device.is_empty() && !what.is_some_and(given) {
-                refuse(key, "names no device; give a path such as /dev/ttyS0")?;
+                refuse(key, "is empty; give a path such as /dev/ttyS0")?;
             }
         }
         network_device("gps.device", &self.gps.device)?;
@@ -231,7 +231,7 @@ impl Config {
         match (compass.declination_deg, compass.declination) {
             (Some(_), Some(_)) => refuse(
                 "compass.declination",
-                "declination_deg is given too; keep the figure or the model, not both",
+                "declination_deg is given too; keep either the value or the model",
             )?,
             (Some(figure), None) => within("compass.declination_deg", figure, -180.0, 180.0)?,
             _ => {}
@@ -247,11 +247,11 @@ impl Config {
         self.attitude.as_ref().map_or(Ok(()), check_attitude)
     }
 
-    /// A receiver may tell the heading too; another device cannot be on its line.
+    /// A receiver may also provide the heading; another device cannot be on its line.
     fn check_shared_line(&self) -> Result<(), ConfigError> {
         let (gps, compass) = (&self.gps, &self.compass);
         if compass.imu && !compass.format.has_inertial() {
-            refuse("compass.imu", format!("{} tells no rates; leave this out", compass.format.name()))?;
+            refuse("compass.imu", format!("{} has no rates; remove this key", compass.format.name()))?;
         }
         if !shares_line(gps, compass) {
             return Ok(());
@@ -259,13 +259,15 @@ impl Config {
         let device = &compass.device;
         if !compass.format.is_of_receivers() {
             let format = compass.format.name();
-            let words = "the GPS receiver's line too, and a receiver tells its heading as format nmea or ubx";
+            let words = "is the GPS receiver's line too, whose heading needs format nmea or ubx";
             refuse("compass.device", format!("{device} is {words}, not {format}"))?;
         }
         if (gps.baud, gps.framing) != (compass.baud, compass.framing) {
             refuse(
                 "compass.baud",
-                format!("{device} is the GPS receiver's line too: say the same of it twice"),
+                format!(
+                    "{device} is the GPS receiver's line too: both sections must have the same line settings"
+                ),
             )?;
         }
         Ok(())
@@ -278,7 +280,7 @@ impl Config {
             [("gps.configure_garmin", gps.configure_garmin), ("gps.configure", gps.configure)]
         {
             if is_asked && is_network {
-                refuse(key, "a receiver behind the network is not configured; leave this out")?;
+                refuse(key, "a receiver on the network cannot be configured; remove this key")?;
             }
         }
         if gps.configure && gps.configure_garmin {
@@ -294,7 +296,7 @@ impl Config {
         let to_autopilot = self.mavlink.send_to.iter().any(|station| station == AUTOPILOT);
         let Some(autopilot) = &self.autopilot else {
             if to_autopilot {
-                refuse("mavlink.send_to", "names the autopilot, and there is no [autopilot]")?;
+                refuse("mavlink.send_to", "names the autopilot, but there is no [autopilot]")?;
             }
             return Ok(());
         };
@@ -312,7 +314,7 @@ impl Config {
         }
         let mavlink = &self.mavlink;
         if autopilot.system_id.is_some_and(|id| id == mavlink.system_id) {
-            refuse("autopilot.system_id", "is that of the first target, mavlink.system_id")?;
+            refuse("autopilot.system_id", "is the system id of the first target, mavlink.system_id")?;
         }
         Ok(())
     }
@@ -346,7 +348,7 @@ impl Config {
         if let Some(address) = self.daemon.metrics.filter(|address| !address.ip().is_loopback()) {
             refuse(
                 "daemon.metrics",
-                format!("{address} is not on loopback; the station tells metrics to others"),
+                format!("{address} is not on loopback; for other machines the station serves the metrics"),
             )?;
         }
         if let Some(volts) = self.power.low_voltage_v {
@@ -359,14 +361,14 @@ impl Config {
 
     fn check_targets(&self) -> Result<(), ConfigError> {
         if self.target.is_empty() {
-            return refuse("target", "no [[target]]: say which vehicle to watch");
+            return refuse("target", "there is no [[target]]: name the vehicle to watch");
         }
         let markers: usize = self.target.iter().map(|target| target.marker.len()).sum();
         for (key, count, most) in
             [("target", self.target.len(), MOST_TARGETS), ("target.marker", markers, MOST_MARKERS)]
         {
             if count > most {
-                refuse(key, format!("there are {count}; one helicopter watches {most} at most"))?;
+                refuse(key, format!("there are {count}; the most for one helicopter is {most}"))?;
             }
         }
         let mut names = std::collections::BTreeSet::new();
@@ -421,7 +423,7 @@ fn check_target(target: &TargetConfig) -> Result<(), ConfigError> {
     }
     match (target.model, target.wheelbase_m) {
         (TargetModel::Ackermann, None) => {
-            refuse("target.wheelbase_m", "an ackermann target needs its wheelbase")?;
+            refuse("target.wheelbase_m", "an ackermann target needs wheelbase_m")?;
         }
         (_, Some(wheelbase)) => within("target.wheelbase_m", wheelbase, 0.05, 50.0)?,
         (_, None) => {}
@@ -475,7 +477,7 @@ fn check_marker(marker: &MarkerConfig) -> Result<(), ConfigError> {
 mod tests {
     use super::*;
 
-    /// What is said of the shipped configuration with these replacements; `None` where it is taken.
+    /// The error for the shipped configuration with these replacements; `None` where it is accepted.
     fn refusal(replaced: &[(&str, &str)]) -> Option<String> {
         let mut text = include_str!("../../config/windhover.toml").to_owned();
         for (from, to) in replaced {
@@ -513,7 +515,7 @@ mod tests {
             let told = refusal(&[ublox, more]).expect(key);
             assert!(told.contains(key), "{told}");
         }
-        let imu = refusal(&[on("#imu = false", "imu = true")]).expect("a TCM2 tells no rates");
+        let imu = refusal(&[on("#imu = false", "imu = true")]).expect("a TCM2 has no rates");
         assert!(imu.contains("compass.imu"), "{imu}");
     }
 }

@@ -1,4 +1,4 @@
-//! `[daemon]` and `[power]`: what running unattended needs.
+//! `[daemon]` and `[power]`: operation without an operator.
 
 use std::net::SocketAddr;
 
@@ -8,15 +8,15 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DaemonConfig {
-    /// Parts whose absence is accepted: the service is ready without them, and uses them when they come.
+    /// Parts that are optional: the daemon is ready without them, and uses them when they appear.
     pub optional: Vec<Part>,
-    /// Longest a task may go without answering before the watchdog is no longer stroked, seconds.
+    /// Longest time without an answer of a task before the watchdog is no longer notified, seconds.
     pub answer_within_s: f64,
-    /// Frames that wait for a pipeline that does not catch up; when one more comes, the oldest is dropped and
-    /// recorded as dropped. More frames mean more latency under load, never more throughput. (A burst of up
-    /// to 16 frames that is handled within half a second loses none.)
+    /// Frames that wait for a pipeline that does not catch up; when one more comes, the oldest is dropped and recorded
+    /// as dropped. More frames mean more latency under load, never more throughput. (A burst of up to 16 frames that is
+    /// handled within half a second loses none.)
     pub frame_queue: usize,
-    /// Where health is told as OpenMetrics (`/metrics`), on loopback; nowhere where absent.
+    /// Address on loopback where health is served as OpenMetrics (`/metrics`); not served where absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub metrics: Option<SocketAddr>,
 }
@@ -37,7 +37,7 @@ pub enum Part {
     Compass,
     /// The camera.
     Camera,
-    /// The link to the autopilot.
+    /// The connection to the autopilot.
     Autopilot,
     /// The data card.
     Store,
@@ -63,21 +63,21 @@ impl Part {
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PowerConfig {
-    /// Below this supply voltage for three seconds the flight is flushed and its segment closed, volts;
-    /// none: the voltage is shown and not acted on.
+    /// Below this supply voltage for three seconds the flight is flushed and its segment closed, volts; absent: the
+    /// voltage is only shown.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub low_voltage_v: Option<f64>,
-    /// Whether a mains or external supply going off line counts as power going.
+    /// Whether a mains or external supply going off line counts as a power failure.
     pub on_mains_off: bool,
-    /// A file that holds the supply voltage (hwmon `in*_input`, millivolts, or `voltage_now`,
-    /// microvolts); none: the lowest of all batteries the kernel knows.
+    /// A file with the supply voltage (hwmon `in*_input`, millivolts, or `voltage_now`, microvolts); absent: the lowest
+    /// of all batteries that the kernel knows.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub voltage_file: Option<String>,
-    /// A file that tells at once that power is going: it is there and holds something else than 0. The
-    /// value of a GPIO line in sysfs, or the flag a UPS program sets (POWERDOWNFLAG of NUT).
+    /// A file that signals a power failure at once, when it exists and contains anything but 0: the value of a GPIO
+    /// line in sysfs, or the flag of a UPS program (POWERDOWNFLAG of NUT).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub going_file: Option<String>,
-    /// A GPIO line that tells at once that power is going, by its chip's character device.
+    /// A GPIO line that signals a power failure at once, by its chip's character device.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub going_line: Option<GoingLine>,
     /// Temperature above which the health line is a warning, degrees Celsius.
@@ -94,7 +94,7 @@ pub struct GoingLine {
     pub chip: String,
     /// Its number on the chip, as `gpioinfo` shows it.
     pub line: u32,
-    /// Whether a low level means that power is going.
+    /// Whether a low level signals a power failure.
     #[serde(default)]
     pub active_low: bool,
 }

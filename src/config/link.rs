@@ -1,4 +1,4 @@
-//! `[link]` and `[mavlink]`: the wireless link and what pilots' own ground stations hear.
+//! `[link]` and `[mavlink]`: the wireless link, and messages for other ground stations.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,13 +9,13 @@ use super::check::{refuse, within};
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LinkConfig {
-    /// Whether the payload opens the link at all.
+    /// Whether the payload opens the link.
     pub enabled: bool,
     /// Address and UDP port at which stations reach the payload, for example `[::]:7447`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub listen: Option<String>,
-    /// Stations the payload calls by itself (`host:port`): for a payload behind a modem that cannot be
-    /// reached from outside.
+    /// Stations to which the payload connects (`host:port`): for a payload behind a modem that cannot be reached from
+    /// outside.
     pub dial: Vec<String>,
     /// Certificate of the authority that signed every payload and station (`windhover keys authority`).
     pub authority: String,
@@ -26,15 +26,15 @@ pub struct LinkConfig {
     /// Revocation list of the authority; read again when it changes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub revoked: Option<String>,
-    /// Most the link may send, kilobits a second over all stations, UDP and IP headers included; the
-    /// link finds what the path carries where absent.
+    /// Highest rate of the link, kilobits a second over all stations, including UDP and IP headers; where absent, the
+    /// link estimates the rate that the path carries.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ceiling_kbps: Option<f64>,
     /// Width of the camera's thumbnail, pixels; 0 sends none.
     pub thumbnail_width_px: u32,
-    /// Least time between two thumbnails, seconds. They never cost an estimate.
+    /// Least time between two thumbnails, seconds. They never delay an estimate.
     pub thumbnail_interval_s: f64,
-    /// Memory for what has not reached every station, megabytes; older records come from the store.
+    /// Memory for records that have not reached every station, megabytes; older records come from the store.
     pub backlog_mb: f64,
 }
 
@@ -56,7 +56,7 @@ impl Default for LinkConfig {
     }
 }
 
-/// The station that is the helicopter's autopilot: reached by the link of `[autopilot]`.
+/// The name that stands for the helicopter's autopilot, reached by the connection of `[autopilot]`.
 pub const AUTOPILOT: &str = "autopilot";
 
 /// `[mavlink]`: the vehicle as MAVLink 2 over UDP.
@@ -65,52 +65,54 @@ pub const AUTOPILOT: &str = "autopilot";
 pub struct MavlinkConfig {
     /// Whether anything is sent.
     pub enabled: bool,
-    /// Where to (`host:port`, or "autopilot": the link of `[autopilot]`); ground stations listen on UDP 14550.
+    /// Destinations (`host:port`, or "autopilot": the connection of `[autopilot]`); ground stations listen on UDP
+    /// 14550.
     pub send_to: Vec<String>,
     /// System id of the first target; the others follow. Must differ from the helicopter's own.
     pub system_id: u8,
-    /// System id of the helicopter's autopilot: what it carries (camera, landing target) goes out under it.
+    /// System id of the helicopter's autopilot: messages of the helicopter's components (camera, landing target) have
+    /// it.
     pub autopilot_id: u8,
-    /// What is sent of each target.
+    /// Messages that are sent for each target.
     pub messages: Vec<MavlinkMessage>,
     /// Axes of LANDING_TARGET.
     pub landing_frame: LandingFrame,
     /// Positions a second.
     pub rate_hz: f64,
-    /// An estimate older than this goes out no more, seconds.
+    /// An older estimate is not sent, seconds.
     pub max_age_s: f64,
-    /// A position known no better than this relative to the helicopter (one sigma) does not go out, metres.
+    /// A position with a larger one-sigma relative to the helicopter is not sent, metres.
     pub max_sigma_m: f64,
-    /// A vehicle out of sight is predicted for this long; then its positions stop, whatever `lost_after_s` is, seconds.
+    /// How long a vehicle out of sight is predicted; then its positions stop, whatever `lost_after_s` is, seconds.
     pub coast_s: f64,
     /// File with the 32 bytes of a signing key in hexadecimal; messages are signed with it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub signing_key: Option<String>,
-    /// Link id that goes with the signature.
+    /// Link id of the signature.
     pub signing_link_id: u8,
 }
 
-/// A message of which a target can be told.
+/// A message of a target.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]
 pub enum MavlinkMessage {
-    /// Place and velocity: maps of ground stations.
+    /// Position and velocity: maps of ground stations.
     GlobalPositionInt,
-    /// Heading and yaw rate: the same.
+    /// Heading and yaw rate: maps of ground stations.
     Attitude,
-    /// Place, velocity, acceleration, heading: ArduPilot's and PX4's following.
+    /// Position, velocity, acceleration, heading: follow modes of ArduPilot and PX4.
     FollowTarget,
     /// Vector from the helicopter: ArduPilot's precision landing.
     LandingTarget,
     /// Vector from the helicopter with its errors: PX4's target estimator.
     TargetRelative,
-    /// Place and motion with their errors: the same.
+    /// Position and motion with their errors: PX4's target estimator.
     TargetAbsolute,
-    /// What the camera tracks, on the ground: QGroundControl.
+    /// The tracked target on the ground: QGroundControl.
     CameraTrackingGeoStatus,
-    /// What the camera tracks, in the picture: QGroundControl.
+    /// The tracked target in the picture: QGroundControl.
     CameraTrackingImageStatus,
-    /// Place and motion in the datum's frame.
+    /// Position and motion in the datum's frame.
     Odometry,
 }
 
@@ -167,7 +169,7 @@ impl LinkConfig {
             }
         }
         if self.enabled && self.listen.is_none() && self.dial.is_empty() {
-            refuse("link", "enabled, but neither listen nor dial says how stations are reached")?;
+            refuse("link", "enabled, but neither listen nor dial is set, so no station can be reached")?;
         }
         if let Some(ceiling) = self.ceiling_kbps {
             within("link.ceiling_kbps", ceiling, 8.0, 1e6)?;

@@ -1,4 +1,4 @@
-//! `[log]`: what the operator tails.
+//! `[log]`: the operator's log.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,17 +6,17 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LogConfig {
-    /// Least severity shown: error, warn, info, debug or trace. Read again on SIGHUP.
+    /// Lowest severity that is shown: error, warn, info, debug or trace. Reloaded on SIGHUP.
     pub level: LogLevel,
-    /// How lines look on standard error: `auto` speaks the journal's own protocol where standard error
-    /// is the journal, and text elsewhere.
+    /// Form of lines on standard error: `auto` uses the journal's own protocol where standard error is the journal, and
+    /// text elsewhere.
     pub format: LogFormat,
-    /// File the log is written to as well, for systems without a journal; none by default.
+    /// File to which the log is also written, for systems without a journal; none by default.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub file: Option<String>,
-    /// Size at which the file is put aside and a new one begun, megabytes.
+    /// Size at which the file is rotated, megabytes.
     pub file_mb: f64,
-    /// Files put aside that are kept.
+    /// Rotated files that are kept.
     pub files_kept: u32,
 }
 
@@ -26,18 +26,18 @@ impl Default for LogConfig {
     }
 }
 
-/// Severities, the gravest first.
+/// Severities, highest first.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LogLevel {
     /// Something does not work and needs a person.
     Error,
-    /// Something does not work and is being dealt with.
+    /// Something does not work and is being handled.
     Warn,
-    /// What an operator wants to see in normal flight.
+    /// Events that an operator wants to see in normal flight.
     #[default]
     Info,
-    /// Details for finding out why.
+    /// Details for finding causes.
     Debug,
     /// Everything.
     Trace,
@@ -56,7 +56,7 @@ impl LogLevel {
     }
 }
 
-/// How lines look on standard error.
+/// Form of lines on standard error.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LogFormat {
@@ -65,7 +65,7 @@ pub enum LogFormat {
     Auto,
     /// logfmt: `key=value` words.
     Text,
-    /// One JSON object a line.
+    /// One JSON object on each line.
     Json,
     /// The journal's protocol.
     Journal,

@@ -1,7 +1,7 @@
-//! What was asked for: the configuration as values, its defaults and its checks.
+//! The configuration as values, its defaults and its checks.
 //!
-//! This is core: text in, values or errors out. Reading the file and reporting to people is `app`'s.
-//! Angles are degrees here, as people write them; each section converts where it is used.
+//! This is core: text in, values or errors out. Reading the file and reporting errors is `app`'s. Angles are degrees
+//! here, as people write them; each section converts where it is used.
 
 mod check;
 mod daemon;
@@ -33,7 +33,7 @@ pub struct Config {
     /// The digital compass.
     #[serde(default, skip_serializing_if = "CompassConfig::is_absent")]
     pub compass: CompassConfig,
-    /// The helicopter's autopilot, where it is heard.
+    /// The helicopter's autopilot, where one is connected.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub autopilot: Option<AutopilotConfig>,
     /// Gyros and accelerometers, where there are any.
@@ -63,7 +63,7 @@ pub struct Config {
     /// The wireless link.
     #[serde(default)]
     pub link: LinkConfig,
-    /// MAVLink for pilots' own ground stations.
+    /// MAVLink for other ground stations and autopilots.
     #[serde(default)]
     pub mavlink: MavlinkConfig,
     /// The camera's picture, live.
@@ -72,7 +72,7 @@ pub struct Config {
     /// The operator's log.
     #[serde(default)]
     pub log: LogConfig,
-    /// Running unattended.
+    /// Operation without an operator.
     #[serde(default)]
     pub daemon: DaemonConfig,
     /// Supply voltage and temperature.
@@ -84,7 +84,7 @@ pub struct Config {
 }
 
 impl Config {
-    /// The configuration of a rig over known ground, with every other section at its default.
+    /// The configuration of a rig over known ground, with defaults in every other section.
     pub fn of_rig(rig: Rig, ground: GroundConfig) -> Self {
         let Rig { gps, compass, autopilot, imu, attitude, camera, target } = rig;
         Self {
@@ -110,8 +110,8 @@ impl Config {
         }
     }
 
-    /// The filter's section. No more features are in use at once than the detector follows: without any
-    /// the filter has no states of them.
+    /// The filter's section. It has no more features than the detector follows: without any the filter has no states
+    /// for them.
     pub fn filter(&self) -> EstimatorConfig {
         let features = self.estimator.features.min(self.detector.ground_features);
         EstimatorConfig { features, ..self.estimator.clone() }
@@ -132,7 +132,7 @@ impl Config {
         }
     }
 
-    /// Parts that the daemon is ready without: those whose absence is accepted, and those that are not configured.
+    /// Parts that the daemon is ready without: the optional ones, and those that are not configured.
     pub fn optional_parts(&self) -> Vec<Part> {
         let absent = [
             (Part::Gps, self.gps.is_absent()),
@@ -143,7 +143,7 @@ impl Config {
         self.daemon.optional.iter().copied().chain(absent).collect()
     }
 
-    /// Parses and checks a configuration. The error names line and key where it can.
+    /// Parses and checks a configuration. The error names line and key where possible.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let config: Self = toml::from_str(text).map_err(|e| ConfigError::syntax(&e, text))?;
         config.check().map_err(|e| e.at_line(text))?;

@@ -5,21 +5,21 @@ use serde::{Deserialize, Serialize};
 use super::ConfigError;
 use super::check::{refuse, within};
 
-/// What is kept of the video.
+/// Recorded video.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FramePolicy {
-    /// JPEG of every frame; what the camera compressed itself is stored untouched.
+    /// JPEG of every frame; frames that the camera compressed are stored unchanged.
     #[default]
     Jpeg,
     /// Lossless, as PNG.
     Png,
-    /// Lossless, as the driver gave it, zstd around it: faster than PNG and a third larger.
+    /// Lossless, the driver's bytes compressed with zstd: faster than PNG and a third larger.
     Zstd,
-    /// JPEG of the region around the vehicle, the rest of the image flat grey; whole while no
-    /// vehicle is seen.
+    /// JPEG of the region around the vehicle, the rest of the image flat grey; the whole image while no vehicle is
+    /// seen.
     Region,
-    /// Nothing.
+    /// No frames.
     None,
 }
 
@@ -27,39 +27,38 @@ pub enum FramePolicy {
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct StoreConfig {
-    /// Whether flights are recorded at all.
+    /// Whether flights are recorded.
     pub enabled: bool,
     /// Directory that holds `FLIGHTS/` and the index; the mount point of the data card.
     pub path: String,
-    /// Whether `path` must be a mount point. With it, a missing data card stops recording instead
-    /// of filling the system card below the empty mount point.
+    /// Whether `path` must be a mount point. Then a missing data card stops recording; otherwise recording would fill
+    /// the system disk below the empty mount point.
     pub require_mount: bool,
-    /// What is kept of the video: jpeg, png, zstd, region or none.
+    /// Recorded video: jpeg, png, zstd, region or none.
     pub frames: FramePolicy,
-    /// Every how many frames one is kept.
+    /// One frame of this many is recorded.
     pub frames_every: u32,
     /// Quality of JPEG, 1 to 100.
     pub jpeg_quality: u8,
-    /// With `frames = "region"`: pixels kept around everything seen of a vehicle.
+    /// With `frames = "region"`: margin around all detections of a vehicle, pixels.
     pub region_margin_px: u32,
     /// A segment ends after this many seconds …
     pub segment_s: f64,
     /// … or this many megabytes.
     pub segment_mb: u64,
-    /// Recording stops while less than this is free, so that the card, its file system and the index
-    /// never run dry.
+    /// Recording stops while less than this is free, so that the card, its file system and the index never become full.
     pub free_floor_mb: u64,
-    /// The oldest closed flights without `keep` are deleted to have this much free before recording
-    /// needs it, or a tenth of the card where that is less; 0 deletes nothing for room.
+    /// The oldest closed flights without `keep` are deleted so that this much is free, or a tenth of the card where
+    /// that is less; 0 deletes nothing for space.
     pub free_target_mb: u64,
     /// All flights together may take this many gigabytes; 0 is no limit.
     pub max_gb: f64,
     /// Flights older than this many days are deleted; 0 is no limit.
     pub max_age_days: f64,
-    /// Memory for what the card has not taken yet, megabytes. When it is full, the oldest frames go
-    /// first, and that is recorded.
+    /// Memory for data that the card has not taken yet, megabytes. When it is full, the oldest frames are dropped
+    /// first, which is recorded.
     pub queue_mb: u64,
-    /// Estimates kept for ground stations that were out of reach.
+    /// Estimates that are kept for ground stations out of reach.
     pub backfill_records: u64,
 }
 
@@ -103,7 +102,7 @@ impl StoreConfig {
         if self.free_target_mb != 0 && self.free_target_mb < self.free_floor_mb {
             refuse(
                 "store.free_target_mb",
-                "is below free_floor_mb; recording would stop before room is made",
+                "is below free_floor_mb; recording would stop before space is made",
             )?;
         }
         within("store.max_gb", self.max_gb, 0.0, 1e6)?;

@@ -1,4 +1,4 @@
-//! The link to the helicopter's autopilot as a task: a serial line or a UDP port, both ways.
+//! The connection to the helicopter's autopilot as a task: a serial line or a UDP port, in both directions.
 
 use std::collections::VecDeque;
 use std::convert::Infallible;
@@ -17,14 +17,14 @@ use super::serial::{Line, SerialSettings};
 use windhover_base::settings::Framing;
 use windhover_decode::{MavlinkFrame, MavlinkFrames};
 
-/// Frames that wait for a line that takes none; the oldest goes first.
+/// Frames that wait while the line accepts none; the oldest is dropped first.
 const WAITING: usize = 64;
 /// Bytes one read can return.
 const READ_BYTES: usize = 4096;
 
 /// How the autopilot is reached.
 #[derive(Clone, PartialEq, Eq, Debug)]
-pub enum Reached {
+pub enum AutopilotAddress {
     /// Over a serial line.
     Serial {
         /// Its device.
@@ -32,18 +32,18 @@ pub enum Reached {
         /// Its speed.
         baud: u32,
     },
-    /// At this UDP address of ours.
+    /// At this local UDP address.
     Udp(String),
 }
 
-/// What the task is set to.
+/// The settings of the task.
 #[derive(Clone, Debug)]
 pub struct AutopilotSettings {
     /// How it is reached.
-    pub reached: Reached,
-    /// Its system id; the first that is heard where `None`.
+    pub reached: AutopilotAddress,
+    /// Its system id; where `None`, the first system that is received.
     pub system_id: Option<u8>,
-    /// Whether it is asked for the messages that are used.
+    /// Whether the messages that are used are requested from it.
     pub configure: bool,
     /// Frames that are not signed with it are refused.
     pub key: Option<SigningKey>,
@@ -51,7 +51,7 @@ pub struct AutopilotSettings {
     pub signing_link_id: u8,
 }
 
-/// Frames on their way to the autopilot. Copies are the same; nothing here waits.
+/// Frames on their way to the autopilot. Copies share the same queue; no call waits.
 #[derive(Clone, Debug, Default)]
 pub struct ToAutopilot {
     frames: Arc<Mutex<VecDeque<Vec<u8>>>>,
@@ -59,7 +59,7 @@ pub struct ToAutopilot {
 }
 
 impl ToAutopilot {
-    /// Puts a frame in the row.
+    /// Queues a frame.
     pub fn send(&self, frame: &[u8]) {
         let mut frames = self.frames.lock().unwrap_or_else(PoisonError::into_inner);
         if frames.len() == WAITING {
@@ -75,7 +75,7 @@ impl ToAutopilot {
     }
 }
 
-/// Hears the autopilot for ever, and sends it what is to be sent; dropping the future closes the link.
+/// Receives from the autopilot without end, and sends it the queued frames; dropping the future closes the connection.
 pub async fn run(
     settings: &AutopilotSettings,
     outgoing: &ToAutopilot,
@@ -105,16 +105,16 @@ pub async fn run(
     }
 }
 
-/// An open way to the autopilot.
+/// An open connection to the autopilot.
 enum Port {
     Serial(Line, String),
     Udp { socket: UdpSocket, address: String, peer: Option<SocketAddr>, from: Option<SocketAddr> },
 }
 
 impl Port {
-    async fn open(reached: &Reached) -> Result<Self, Fault> {
+    async fn open(reached: &AutopilotAddress) -> Result<Self, Fault> {
         match reached {
-            Reached::Serial { device, baud } => {
+            AutopilotAddress::Serial { device, baud } => {
                 let settings = SerialSettings {
                     device: device.clone(),
                     baud: *baud,
@@ -125,7 +125,7 @@ impl Port {
                 let line = Line::open(&settings).await?;
                 Ok(Self::Serial(line, format!("{device} at {baud} baud")))
             }
-            Reached::Udp(address) => {
+            AutopilotAddress::Udp(address) => {
                 let socket = UdpSocket::bind(address).await.map_err(|e| Fault::from_io(address, &e))?;
                 Ok(Self::Udp { socket, address: address.clone(), peer: None, from: None })
             }
@@ -151,7 +151,7 @@ impl Port {
         }
     }
 
-    /// The autopilot is where the last bytes came from.
+    /// Sets the sender of the last datagram as the autopilot's address.
     fn answer_there(&mut self) {
         if let Self::Udp { peer, from, .. } = self {
             *peer = *from;
@@ -161,7 +161,7 @@ impl Port {
     async fn write(&mut self, frame: &[u8]) -> Result<(), Fault> {
         match self {
             Self::Serial(line, _) => line.write(frame).await,
-            // A datagram that does not go is lost, as any may be.
+            // A datagram that cannot be sent is lost, as any datagram may be.
             Self::Udp { socket, peer, .. } => {
                 if let Some(peer) = peer {
                     let _ = socket.send_to(frame, *peer).await;
@@ -212,7 +212,7 @@ impl AutopilotLink<'_> {
         }
     }
 
-    /// Bytes go on as they came; with a key, the frames alone that are signed with it.
+    /// Bytes are passed on unchanged; with a key, only frames that are signed with it.
     fn take(&mut self, bytes: &[u8], answers: &mut Vec<Vec<u8>>) {
         let t = self.clock.now();
         let mut heard = Vec::new();
@@ -258,12 +258,12 @@ mod tests {
         })
     }
 
-    /// What the task reports of these datagrams, and what it sends within a moment.
+    /// The task's reports for these datagrams, and what it sends within a moment.
     async fn served(key: Option<SigningKey>, datagrams: Vec<Vec<u8>>) -> (Vec<Report>, Vec<MavlinkFrame>) {
         let port = UdpSocket::bind("127.0.0.1:0").await.expect("a port").local_addr().expect("an address");
         let autopilot = UdpSocket::bind("127.0.0.1:0").await.expect("a socket");
         let settings = AutopilotSettings {
-            reached: Reached::Udp(port.to_string()),
+            reached: AutopilotAddress::Udp(port.to_string()),
             system_id: None,
             configure: false,
             key,

@@ -1,4 +1,4 @@
-//! Captures: serial bytes and frames in and out of MCAP.
+//! Captures: serial bytes and frames to and from MCAP.
 
 use std::collections::BinaryHeap;
 use std::path::{Path, PathBuf};
@@ -9,24 +9,23 @@ use super::records::{self, EventDecoder, FRAME_NUMBER_KEY, IN_SEQUENCE, KeptMess
 use windhover_base::msg::{Event, EventBody};
 use windhover_base::time::{MonoTime, Span};
 
-/// Messages are put in order of their log time over this span: writers of several threads do not
-/// keep it exactly.
+/// Messages are sorted by their log time over this span: writers with several threads do not keep the order exactly.
 const REORDER: Span = Span::from_ns(1_000_000_000);
 /// Unless they take more memory than this, in bytes: a second of raw colour frames fits twice.
 const REORDER_BYTES: usize = 1 << 28;
-/// Memory of a message beside its bytes, near enough for a limit.
+/// Memory of a message apart from its bytes, approximately, for the limit.
 const MESSAGE_COST: usize = 256;
 
-/// One message of a capture: as recorded, and as the event it stands for, if any.
+/// One message of a capture: as recorded, and as an event where it is one.
 #[derive(Clone, Debug)]
 pub struct CaptureItem {
     /// As recorded.
     pub raw: RawMessage,
-    /// What it stands for; `None` for topics that are not a source.
+    /// The event; `None` for topics that are not a source.
     pub event: Option<Event>,
 }
 
-/// Events of a capture in the order they were heard.
+/// Events of a capture in order of reception.
 pub struct CaptureReader {
     reader: McapReader,
     waiting: BinaryHeap<Reordered>,
@@ -82,14 +81,14 @@ impl CaptureReader {
         })
     }
 
-    /// What was damaged or could not be understood, so far; taken.
+    /// Damage and unreadable messages found since the last call.
     pub fn take_warnings(&mut self) -> Vec<String> {
         let mut all = self.reader.take_warnings();
         all.append(&mut self.warnings);
         all
     }
 
-    /// Bytes read and bytes in all.
+    /// Bytes read so far, and in total.
     pub fn progress(&self) -> (u64, u64) {
         self.reader.progress()
     }
@@ -131,7 +130,7 @@ impl Iterator for CaptureReader {
             let due = self.waiting_bytes > REORDER_BYTES
                 || self.waiting.peek().is_some_and(|first| self.newest - first.raw.log_time >= REORDER);
             if !due && let Some(raw) = self.reader.next() {
-                // Others may be dated by other clocks than what was heard.
+                // Other messages may be stamped by other clocks than the events.
                 if records::is_event(&raw.channel.topic) {
                     self.newest = self.newest.max(raw.log_time);
                 }
@@ -148,20 +147,20 @@ impl Iterator for CaptureReader {
     }
 }
 
-/// Writes a capture of events, which stands in its place when it is finished.
+/// Writes a capture of events. The file gets its name when it is finished.
 pub struct CaptureWriter {
     path: PathBuf,
     writer: McapFile,
 }
 
 impl CaptureWriter {
-    /// Begins a capture with its configuration attached.
+    /// Creates a capture with its configuration attached.
     pub fn create(path: &Path, config_toml: &str, began: MonoTime) -> Result<Self, WriteError> {
         let writer = McapFile::create(path, Maker::Capture, config_toml, began)?;
         Ok(Self { path: path.to_owned(), writer })
     }
 
-    /// Says what the messages of a topic were made of, before the first of them.
+    /// States the origin of the messages of a topic, before the first of them.
     pub fn made_of(&mut self, topic: &str, text: &str) {
         self.writer.made_of(topic, text);
     }

@@ -8,20 +8,20 @@ use windhover_base::time::{MonoTime, NS_PER_S, Span};
 
 /// Host time of this process. Copies share the same constant, so their times compare.
 ///
-/// The constant is what CLOCK_REALTIME was ahead of CLOCK_MONOTONIC when the clock was made: host
-/// time is close to UTC where the computer's clock was right at start, and never steps after that.
+/// The constant is the difference of CLOCK_REALTIME and CLOCK_MONOTONIC when the clock was made: host time is close to
+/// UTC where the computer's clock was right at start, and it never steps after that.
 #[derive(Clone, Copy, Debug)]
 pub struct HostClock {
     host_from_monotonic: Span,
 }
 
 impl HostClock {
-    /// Fixes the constant. A program does this once, first thing.
+    /// Fixes the constant. A program does this once, at its start.
     pub fn start() -> Self {
         Self { host_from_monotonic: realtime_from_monotonic() }
     }
 
-    /// Now.
+    /// The present host time.
     pub fn now(&self) -> MonoTime {
         MonoTime::from_ns(raw(ClockId::Monotonic)) + self.host_from_monotonic
     }
@@ -36,8 +36,8 @@ impl HostClock {
         MonoTime::from_unsigned_ns(stamp.as_nanos()) + self.host_from_monotonic
     }
 
-    /// Host time of a recent CLOCK_REALTIME stamp, as the kernel's pulse-per-second gives them. The
-    /// realtime clock may have been stepped since start, so its present distance is read anew.
+    /// Host time of a recent CLOCK_REALTIME stamp, as from the kernel's pulse-per-second. The realtime clock may have
+    /// been stepped since the start, so its present difference is measured again.
     pub fn from_realtime(&self, stamp: Duration) -> MonoTime {
         let realtime = MonoTime::from_unsigned_ns(stamp.as_nanos());
         realtime - realtime_from_monotonic() + self.host_from_monotonic
@@ -62,7 +62,7 @@ fn raw(clock: ClockId) -> i64 {
     ns(clock_gettime(clock))
 }
 
-/// How far CLOCK_REALTIME is ahead: read between two readings of CLOCK_MONOTONIC.
+/// CLOCK_REALTIME minus CLOCK_MONOTONIC: the former is read between two readings of the latter.
 fn realtime_from_monotonic() -> Span {
     let before = raw(ClockId::Monotonic);
     let realtime = raw(ClockId::Realtime);

@@ -1,4 +1,4 @@
-//! What every device task has in common: what it reports, how it fails, how it waits.
+//! Common parts of the device tasks: reports, faults, waiting.
 
 use std::cell::Cell;
 use std::fmt;
@@ -19,19 +19,19 @@ use windhover_base::time::MonoTime;
 /// Why a device does not deliver.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum FaultKind {
-    /// There is no such device (yet).
+    /// The device does not exist (yet).
     Missing,
     /// Another program holds it.
     Busy,
     /// This user may not open it.
     Denied,
-    /// It went away while in use.
+    /// It disappeared while in use.
     Unplugged,
-    /// It is there and delivers nothing any more.
+    /// It exists and no longer delivers.
     Frozen,
-    /// It cannot give what was asked for, nor anything else understood.
+    /// It cannot deliver the requested format or any other supported one.
     Unsuitable,
-    /// Anything else the system says.
+    /// Any other error of the system.
     Failed,
 }
 
@@ -50,14 +50,14 @@ impl FaultKind {
     }
 }
 
-/// A device that does not deliver: which, why, and what to do about it.
+/// A device that does not deliver: which, why, and what the operator can do.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Fault {
     /// Why.
     pub kind: FaultKind,
-    /// Path of the device.
+    /// Path of the device, or its address.
     pub device: String,
-    /// What the operator should know or do.
+    /// Information for the operator.
     pub detail: String,
 }
 
@@ -73,16 +73,16 @@ impl Fault {
         Self { kind, device: device.to_owned(), detail: detail.into() }
     }
 
-    /// What an error of opening or using `device` means. `EBUSY` and lock failures are
-    /// [`FaultKind::Busy`], vanished devices [`FaultKind::Missing`].
+    /// The fault for an error of opening or using `device`. `EBUSY` and lock failures are [`FaultKind::Busy`], vanished
+    /// devices [`FaultKind::Missing`].
     pub fn from_io(device: &str, error: &std::io::Error) -> Self {
         use rustix::io::Errno;
         let errno = error.raw_os_error().map(Errno::from_raw_os_error);
         let (kind, advice) = match errno {
             Some(Errno::NOENT | Errno::NXIO | Errno::NODEV) => {
-                (FaultKind::Missing, "not there; is it plugged in?")
+                (FaultKind::Missing, "does not exist; is it plugged in?")
             }
-            Some(Errno::BUSY) => (FaultKind::Busy, "another program holds it; stop that program"),
+            Some(Errno::BUSY) => (FaultKind::Busy, "another program uses it; stop that program"),
             Some(Errno::ACCESS | Errno::PERM) => {
                 (FaultKind::Denied, "permission denied; add this user to the device's group")
             }
@@ -95,50 +95,50 @@ impl Fault {
 /// A note about a device that still delivers.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum NoteKind {
-    /// What arrives is not what this line speed and format should give.
+    /// The bytes that arrive do not fit the line's speed and format.
     Garbled,
-    /// The driver's stamps cannot be used; arrival times stand in.
+    /// The driver's stamps cannot be used; arrival times replace them.
     StampsUnusable,
     /// The driver flagged a frame as damaged.
     FrameDamaged,
-    /// The device gives another format than asked for, one that is understood.
+    /// The device delivers another format than requested, which is supported.
     FormatDiffers,
-    /// Frames the driver counted and never delivered.
+    /// The driver counted frames that it did not deliver.
     FramesMissed,
-    /// A receiver was configured as asked.
+    /// A receiver accepted its configuration.
     Configured,
     /// A receiver refused or ignored its configuration.
     NotConfigured,
-    /// Something to know of the autopilot.
+    /// A note about the autopilot.
     Autopilot,
     /// A recorded source has played to its end.
     PlayedOut,
 }
 
-/// What a device task reports.
+/// A report of a device task.
 #[derive(Clone, Debug)]
 pub enum Report {
-    /// The device is open; the text says as what.
+    /// The device is open; the text describes it.
     Up(String),
     /// The bytes one read returned, and when it returned.
     Bytes(MonoTime, Vec<u8>),
     /// A frame, and when it was dequeued.
     Frame(MonoTime, FramePayload),
-    /// The device does not deliver; it will be tried again.
+    /// The device does not deliver; it will be opened again.
     Down(Fault),
-    /// Something to know about a device that delivers; `count` things of the kind.
+    /// A note about a device that delivers; `count` cases of this kind.
     Note(NoteKind, u32, String),
-    /// The task answers.
+    /// A heartbeat of the task.
     Beat,
 }
 
 /// Where a device task's reports go. The call returns at once.
 pub type Reports<'a> = &'a (dyn Fn(Report) + Sync);
 
-/// How often a task that waits reports that it answers.
+/// Heartbeat period of a waiting task.
 const BEAT: Duration = Duration::from_millis(250);
 
-/// Waits for `ready` and reports meanwhile that the task answers.
+/// Waits for `ready`, with heartbeats meanwhile.
 pub(super) async fn wait_for<T>(ready: impl Future<Output = T>, reports: Reports<'_>) -> T {
     let mut ready = std::pin::pin!(ready);
     loop {
@@ -149,13 +149,13 @@ pub(super) async fn wait_for<T>(ready: impl Future<Output = T>, reports: Reports
     }
 }
 
-/// Does work that can block on a thread for such work. A panic of the work is a panic of the caller.
+/// Runs blocking work on a thread for it. A panic of the work becomes a panic of the caller.
 pub async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
     match spawn_blocking(work).await {
         Ok(value) => value,
         Err(error) => match error.try_into_panic() {
             Ok(panic) => resume_unwind(panic),
-            // The runtime is being shut down: nothing of it runs on.
+            // The runtime is shutting down: none of its tasks continues.
             Err(_) => std::future::pending().await,
         },
     }
@@ -165,12 +165,12 @@ thread_local! {
     static PANICS_CAUGHT: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Whether a panic of this thread is caught: then it is no failure of the program.
+/// Whether a panic of this thread is caught, so that it is not a failure of the program.
 pub fn panics_are_caught() -> bool {
     PANICS_CAUGHT.get()
 }
 
-/// Does work in which a library may panic where a device vanishes; `None` where it did.
+/// Runs work in which a library may panic when a device disappears; `None` where it did.
 pub(super) fn catch_panics<T>(work: impl FnOnce() -> T) -> Option<T> {
     let before = PANICS_CAUGHT.replace(true);
     let result = catch_unwind(AssertUnwindSafe(work));
@@ -182,20 +182,20 @@ pub(super) fn catch_panics<T>(work: impl FnOnce() -> T) -> Option<T> {
 ///
 /// # Safety
 ///
-/// `as_raw_fd` gives the same open descriptor for as long as the value lives.
+/// `as_raw_fd` must return the same open descriptor for as long as the value lives.
 pub(super) unsafe trait OwnsDescriptor: AsRawFd {}
 
 // SAFETY: a file owns its descriptor and closes it when it is dropped.
 unsafe impl OwnsDescriptor for File {}
 
-/// Has the runtime wait on a device.
+/// Registers a device with the runtime for waiting.
 pub(super) fn register<D: OwnsDescriptor>(device: D, interest: Interest) -> io::Result<AsyncFd<D>> {
-    // SAFETY: what `OwnsDescriptor` promises is what is asked for, and the device lives as long as what is returned.
+    // SAFETY: `OwnsDescriptor` guarantees what is required, and the device lives as long as the returned value.
     Ok(unsafe { AsyncFd::register_with_interest(device, interest) }?)
 }
 
-/// An open device. Closing one can block (a line waits until its output is sent, a camera until its stream has
-/// ended) and a driver's library may panic, so it is closed on a thread for such work and a panic is caught there.
+/// An open device. Closing one can block (a line waits until its output is sent, a camera until its stream has ended)
+/// and a driver's library may panic, so it is closed on a thread for blocking work, where a panic is caught.
 #[derive(Debug)]
 pub(super) struct Opened<T: Send + 'static>(Option<T>);
 
@@ -235,7 +235,7 @@ impl<T: Send + 'static> DerefMut for Opened<T> {
 }
 
 impl<T: Send + 'static> Drop for Opened<T> {
-    /// Where the task is cancelled: closes the device without waiting for it.
+    /// For a cancelled task: closes the device without waiting for it.
     fn drop(&mut self) {
         if let Some(device) = self.0.take() {
             spawn_blocking(move || close(device));
@@ -243,7 +243,7 @@ impl<T: Send + 'static> Drop for Opened<T> {
     }
 }
 
-/// Waits between attempts: a quarter of a second, doubled each time, five seconds at most.
+/// Pauses between attempts: a quarter of a second, doubled each time, five seconds at most.
 #[derive(Debug)]
 pub(super) struct Backoff {
     next: Duration,
@@ -257,7 +257,7 @@ impl Backoff {
         Self { next: Self::FIRST }
     }
 
-    /// The device delivered: the next wait is short again.
+    /// The device delivered: the next pause is short again.
     pub(super) fn reset(&mut self) {
         self.next = Self::FIRST;
     }
@@ -267,7 +267,7 @@ impl Backoff {
         wait_for(tokio::time::sleep(self.lengthen()), reports).await;
     }
 
-    /// The wait that is due; the one after it is twice as long.
+    /// The next pause; the one after it is twice as long.
     fn lengthen(&mut self) -> Duration {
         let wait = self.next;
         self.next = (wait * 2).min(Self::LONGEST);
@@ -309,7 +309,7 @@ mod tests {
             fn drop(&mut self) {
                 let _ = self.0.send(std::thread::current().id());
                 assert!(panics_are_caught());
-                panic!("the driver gave up");
+                panic!("the driver failed");
             }
         }
         let (sender, closed) = std::sync::mpsc::channel();

@@ -1,21 +1,21 @@
-//! What an MCAP file defines, schemas and channels: each kept once, and all within a limit.
+//! Definitions of an MCAP file, schemas and channels: each kept once, and all within a limit.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
 use mcap::records::Record as McapRecord;
 
-/// Schemas and channels of a file are kept up to so many bytes: a thousand channels of this program
-/// take a tenth of it.
+/// Schemas and channels of a file are kept up to this many bytes: a thousand channels of this program take a tenth of
+/// it.
 const MAX_DEFINITIONS: usize = 1 << 26;
-/// Memory that a definition takes beside its bytes, near enough for a limit.
+/// Memory of a definition apart from its bytes, approximately, for the limit.
 const DEFINITION_COST: usize = 256;
 /// A schema of a recording.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct SchemaInfo {
     /// Its name; empty stands for no schema.
     pub name: String,
-    /// How it is written, e.g. `protobuf`.
+    /// Its encoding, e.g. `protobuf`.
     pub encoding: String,
     /// The schema.
     pub data: Vec<u8>,
@@ -30,7 +30,7 @@ pub struct ChannelInfo {
     pub message_encoding: String,
     /// Its schema, shared by all channels that have it.
     pub schema: Arc<SchemaInfo>,
-    /// What else its writer said of it.
+    /// Metadata of its writer.
     pub metadata: BTreeMap<String, String>,
 }
 
@@ -39,14 +39,14 @@ pub struct ChannelInfo {
 pub(super) struct Definitions {
     pub(super) schemas: HashMap<u16, Arc<SchemaInfo>>,
     pub(super) channels: HashMap<u16, Arc<ChannelInfo>>,
-    /// Bytes taken by everything ever defined; what is said again does not count.
+    /// Bytes of all definitions so far; repeated ones do not count.
     bytes: usize,
-    /// Whether something was left out because that was too much.
+    /// Whether a definition was left out because of the limit.
     pub(super) overfull: bool,
 }
 
 impl Definitions {
-    /// Takes a schema or channel whose record has so many bytes; false where there is no room for it.
+    /// Takes a schema or channel whose record has this many bytes; false where there is no room for it.
     pub(super) fn learn(&mut self, record: McapRecord<'_>, bytes: usize) -> bool {
         let room = self.bytes.saturating_add(bytes + DEFINITION_COST) <= MAX_DEFINITIONS;
         match record {

@@ -1,10 +1,9 @@
-//! Reading MCAP files as they come back from the field: cut off, holed, or whole.
+//! Reading MCAP files in any condition: cut off, with gaps, or complete.
 //!
-//! The reader walks the file's records itself, so that damage costs only the record it hit: a chunk
-//! that fails its checksum is skipped, a cut file ends at its last whole record, and each is told as
-//! a warning. No length is believed beyond what is left of the file and the limits of
-//! [`mcap_record`](super::mcap_record), and what a file defines is kept once and within a limit: a
-//! hostile file costs at most some hundreds of megabytes while it is read.
+//! The reader walks the file's records itself, so that damage affects only the damaged record: a chunk that fails its
+//! checksum is skipped, a cut file ends at its last whole record, and each case is a warning. A length is limited by
+//! the rest of the file and by the limits of [`mcap_record`](super::mcap_record), and each definition of a file is kept
+//! once and within a limit: a hostile file takes at most some hundreds of megabytes while it is read.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -20,28 +19,28 @@ use super::regular;
 use super::segment_files::segment_files;
 use windhover_base::time::MonoTime;
 
-/// Longest attachment that is read: a configuration, not a film.
+/// Longest attachment that is read: a configuration, not a video.
 const MAX_ATTACHMENT: u64 = 1 << 24;
 
 /// Why a recording could not be read at all.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadError {
-    /// The system refused.
+    /// The system's refusal.
     #[error("cannot read {}: {source}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Something else than an MCAP file.
+    /// The file is not an MCAP file.
     #[error("{} is not an MCAP recording (its first bytes are not those of one)", path.display())]
     NotMcap {
         /// The file.
         path: PathBuf,
     },
     /// A directory without segments.
-    #[error("{} holds no .mcap segment", path.display())]
+    #[error("{} has no .mcap segment", path.display())]
     Empty {
         /// The directory.
         path: PathBuf,
@@ -53,17 +52,17 @@ pub enum ReadError {
 pub struct RawMessage {
     /// Its channel.
     pub channel: Arc<ChannelInfo>,
-    /// When it was recorded, host time.
+    /// Time of recording, host time.
     pub log_time: MonoTime,
-    /// When it was true or sent, host time.
+    /// Time of validity or of sending, host time.
     pub publish_time: MonoTime,
-    /// Its sequence number, as its writer understood it.
+    /// Its sequence number, in its writer's meaning.
     pub sequence: u32,
     /// The bytes.
     pub data: Vec<u8>,
 }
 
-/// Files of a recording: itself, or the segments of a flight's directory in order.
+/// Files of a recording: the file itself, or the segments of a flight's directory in order.
 pub fn segments_of(path: &Path) -> Result<Vec<PathBuf>, ReadError> {
     let files = segment_files(path).map_err(|source| ReadError::Io { path: path.to_owned(), source })?;
     if files.is_empty() { Err(ReadError::Empty { path: path.to_owned() }) } else { Ok(files) }
@@ -84,7 +83,7 @@ struct OpenFile {
     position: u64,
     length: u64,
     definitions: Definitions,
-    /// The chunk being read: its records, and how far.
+    /// The chunk being read: its records, and the position in them.
     chunk: Option<(Vec<u8>, usize)>,
 }
 
@@ -94,10 +93,10 @@ struct Frame {
     length: u64,
 }
 
-/// Warnings kept until they are taken; a wreck has more than anybody reads.
+/// Most warnings that are kept: a badly damaged file has more than anyone reads.
 const MOST_WARNINGS: usize = 100;
 
-/// Adds a warning, or once that further ones are not told.
+/// Adds a warning, or once a note that further ones are not listed.
 pub(super) fn warn(warnings: &mut Vec<String>, text: String) {
     match warnings.len() {
         ..MOST_WARNINGS => warnings.push(text),
@@ -106,12 +105,12 @@ pub(super) fn warn(warnings: &mut Vec<String>, text: String) {
     }
 }
 
-/// A segment that is none.
+/// The warning for a segment that is not one.
 fn skipped(error: &ReadError) -> String {
     format!("{error}; it is skipped")
 }
 
-/// What reading a record gave.
+/// The result of reading a record.
 enum Step {
     Message(RawMessage),
     Other,
@@ -127,7 +126,7 @@ impl McapReader {
         let bytes_total = files.iter().filter_map(|f| f.metadata().ok()).map(|m| m.len()).sum();
         let mut reader =
             Self { files: files.into(), current: None, warnings: Vec::new(), bytes_total, bytes_done: 0 };
-        // One file must be one, so that a wrong path is an error and not an empty recording.
+        // A single file must be a recording, so that a wrong path is an error and not an empty recording.
         let mut first_error = None;
         while let Some(file) = reader.files.pop_front() {
             match OpenFile::open(file) {
@@ -144,12 +143,12 @@ impl McapReader {
         Err(first_error.unwrap_or_else(|| ReadError::Empty { path: path.to_owned() }))
     }
 
-    /// What was damaged, so far. Taken: the next call tells only what is new.
+    /// New damage since the last call.
     pub fn take_warnings(&mut self) -> Vec<String> {
         std::mem::take(&mut self.warnings)
     }
 
-    /// Bytes read and bytes in all, for progress.
+    /// Bytes read so far and in total, for progress.
     pub fn progress(&self) -> (u64, u64) {
         (self.bytes_done + self.current.as_ref().map_or(0, |f| f.position), self.bytes_total)
     }
@@ -205,7 +204,7 @@ impl OpenFile {
         Ok(Self { path, input, position: MAGIC_LENGTH, length, definitions, chunk: None })
     }
 
-    /// The next record's frame; `None` at the end, told as a warning where the file is cut.
+    /// The next record's frame; `None` at the end, with a warning where the file is cut.
     fn read_frame(&mut self, warnings: &mut Vec<String>) -> Option<Frame> {
         let left = self.length.saturating_sub(self.position);
         let mut head = [0; RECORD_HEAD];
@@ -245,7 +244,7 @@ impl OpenFile {
         Some(body)
     }
 
-    /// Reads one record, of the chunk that is open or of the file.
+    /// Reads one record, from the open chunk or from the file.
     fn step(&mut self, warnings: &mut Vec<String>) -> Step {
         if let Some((records, at)) = self.chunk.take() {
             return self.step_in_chunk(records, at, warnings);
@@ -258,7 +257,7 @@ impl OpenFile {
         let believed = frame.length <= longest(frame.op);
         if !wanted || !believed {
             if !believed {
-                warn(warnings, self.damaged("a record longer than is believed"));
+                warn(warnings, self.damaged("a record longer than the limit"));
             }
             return self.skip(frame.length).map_or(Step::End, |()| Step::Other);
         }
@@ -314,14 +313,14 @@ impl OpenFile {
             let path = self.path.display();
             warn(
                 warnings,
-                format!("{path} defines more schemas and channels than is believed: the rest is left out"),
+                format!("{path} defines more schemas and channels than the limit: the rest is left out"),
             );
         }
         Step::Other
     }
 }
 
-/// The records of a chunk record, its checksum verified before anything of it is used.
+/// The records of a chunk record; its checksum is verified before anything of it is used.
 fn chunk_records(body: &[u8]) -> Option<Vec<u8>> {
     match parse(op::CHUNK, body)? {
         McapRecord::Chunk { header, data } => unpack_chunk(&header, &data),
@@ -329,7 +328,7 @@ fn chunk_records(body: &[u8]) -> Option<Vec<u8>> {
     }
 }
 
-/// The first attachment of that name in a recording, wherever in the file it stands.
+/// The first attachment of that name in a recording, at any place in the file.
 pub fn attachment(path: &Path, name: &str) -> Result<Option<Vec<u8>>, ReadError> {
     for segment in segments_of(path)? {
         let mut file = match OpenFile::open(segment) {
@@ -364,8 +363,8 @@ impl OpenFile {
     }
 }
 
-/// The data of an attachment record if it has that name: log time, create time, name, media type,
-/// data, checksum; strings behind 4-byte lengths, data behind 8 bytes (MCAP specification).
+/// The data of an attachment record if it has that name: log time, create time, name, media type, data, checksum;
+/// strings after 4-byte lengths, data after 8 bytes (MCAP specification).
 fn attachment_named<'a>(body: &'a [u8], name: &str) -> Option<&'a [u8]> {
     let (found, rest) = sized_u32(body.get(16..)?)?;
     let (_media_type, rest) = sized_u32(rest)?;

@@ -1,9 +1,9 @@
-//! MCAP records out of bytes nobody vouches for: every length is held against what is there before
-//! anything of that length is made.
+//! MCAP records from untrusted bytes: every length is compared with the available bytes before memory of that length is
+//! allocated.
 //!
-//! `mcap::parse_record` reserves what a string says of its own length, up to 4 GB for one record of
-//! thirty bytes, and takes an attachment to be longer than its checksum. [`parse`] walks the fields
-//! first (mcap.dev/spec) and hands over only records that hold what they claim.
+//! `mcap::parse_record` allocates a string's stated length, up to 4 GB for one record of thirty bytes, and assumes that
+//! an attachment is longer than its checksum. [`parse`] first walks the fields (mcap.dev/spec) and passes on only
+//! records whose lengths are right.
 
 use std::io::Read;
 
@@ -12,16 +12,16 @@ use mcap::records::{ChunkHeader, Record, op};
 /// Bytes before a record's body: op code and length.
 pub const RECORD_HEAD: usize = 9;
 
-/// Largest chunk that is believed, packed or not: beyond it a size is damage, not data.
+/// Largest accepted chunk, compressed or not: a larger size is damage, not data.
 pub const MAX_CHUNK_BYTES: u64 = 1 << 28;
 
-/// Longest record but a chunk that is believed. One frame of 1280×1024 in colour has 4 MB.
+/// Longest accepted record other than a chunk. One frame of 1280×1024 in colour has 4 MB.
 pub const MAX_SMALL_RECORD: u64 = 1 << 26;
 
-/// Room made for a chunk before anything of it is unpacked; more comes as it is filled.
+/// Memory allocated for a chunk before any of it is decompressed; it grows as the chunk is filled.
 const FIRST_ROOM: u64 = 1 << 22;
 
-/// The longest body that is believed of a record of this kind.
+/// The longest accepted body of a record of this kind.
 pub const fn longest(opcode: u8) -> u64 {
     if opcode == op::CHUNK { MAX_CHUNK_BYTES } else { MAX_SMALL_RECORD }
 }
@@ -54,7 +54,7 @@ pub fn parse(opcode: u8, body: &[u8]) -> Option<Record<'_>> {
         op::ATTACHMENT => {
             fields.fixed(16)?;
             fields.strings(2)?;
-            // The length of the data, and behind the data their checksum.
+            // The length of the data, and after the data their checksum.
             fields.fixed(12)?;
         }
         op::ATTACHMENT_INDEX => {
@@ -74,7 +74,7 @@ pub fn parse(opcode: u8, body: &[u8]) -> Option<Record<'_>> {
     mcap::parse_record(opcode, body).ok()
 }
 
-/// What is left of a record's body.
+/// The rest of a record's body.
 struct Fields<'a>(&'a [u8]);
 
 impl Fields<'_> {
@@ -83,7 +83,7 @@ impl Fields<'_> {
         Some(())
     }
 
-    /// So many strings, each behind its length in 4 bytes.
+    /// Reads this many strings, each after its length in 4 bytes.
     fn strings(&mut self, count: usize) -> Option<()> {
         for _ in 0..count {
             (_, self.0) = sized_u32(self.0)?;
@@ -91,7 +91,7 @@ impl Fields<'_> {
         Some(())
     }
 
-    /// A map of strings behind its length in bytes.
+    /// A map of strings after its length in bytes.
     fn map(&mut self) -> Option<()> {
         let (inside, rest) = sized_u32(self.0)?;
         let mut inside = Fields(inside);
@@ -103,22 +103,22 @@ impl Fields<'_> {
     }
 }
 
-/// What stands behind a length in 4 bytes, and what follows it.
+/// The bytes after a length in 4 bytes, and the rest.
 pub fn sized_u32(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     let length = u32::from_le_bytes(bytes.get(..4)?.try_into().ok()?) as usize;
     let rest = bytes.get(4..)?;
     Some((rest.get(..length)?, rest.get(length..)?))
 }
 
-/// Op code, body and what follows the first record of `bytes`; `None` where none is whole.
+/// Op code, body and rest of the first record of `bytes`; `None` where it is not complete.
 pub fn split(bytes: &[u8]) -> Option<(u8, &[u8], &[u8])> {
     let length = u64::from_le_bytes(bytes.get(1..RECORD_HEAD)?.try_into().ok()?);
     let end = RECORD_HEAD.checked_add(usize::try_from(length).ok()?)?;
     Some((bytes[0], bytes.get(RECORD_HEAD..end)?, &bytes[end..]))
 }
 
-/// The records inside a chunk; `None` where it cannot be unpacked, is not as long as it says or its
-/// checksum is wrong.
+/// The records inside a chunk; `None` where it cannot be decompressed, does not have the stated length, or its checksum
+/// is wrong.
 pub fn unpack_chunk(header: &ChunkHeader, packed: &[u8]) -> Option<Vec<u8>> {
     let size = header.uncompressed_size;
     if size > MAX_CHUNK_BYTES {
@@ -135,7 +135,7 @@ pub fn unpack_chunk(header: &ChunkHeader, packed: &[u8]) -> Option<Vec<u8>> {
     whole.then_some(records)
 }
 
-/// What `input` gives, as long as it is no longer than `size`.
+/// The output of `input`, if it is no longer than `size`.
 fn unpacked(input: impl Read, size: u64) -> Option<Vec<u8>> {
     let mut out = Vec::with_capacity(size.min(FIRST_ROOM) as usize);
     input.take(size + 1).read_to_end(&mut out).ok()?;
@@ -150,7 +150,7 @@ mod tests {
         [&says.to_le_bytes(), text].concat()
     }
 
-    /// A whole record of each kind that holds strings, as bytes, and where its lengths stand.
+    /// A complete record of each kind with strings, as bytes, and the places of its lengths.
     fn records() -> Vec<(u8, Vec<u8>, Vec<usize>)> {
         let s = |text: &str| string(text.as_bytes(), text.len() as u32);
         let map = string(&[s("k"), s("v")].concat(), 10);

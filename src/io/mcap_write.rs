@@ -1,4 +1,4 @@
-//! Writing MCAP files: channels and schemas registered as they come, one chunk a second.
+//! Writing MCAP files: channels and schemas are registered at their first use, one chunk a second.
 
 use std::collections::{BTreeMap, HashMap};
 use std::io::{BufWriter, Seek, Write};
@@ -16,18 +16,18 @@ use windhover_base::time::{MonoTime, Span};
 /// Name of the configuration's attachment.
 pub const CONFIG_ATTACHMENT: &str = "config.toml";
 
-/// Channel metadata key that says what messages were made of, where they are not what a device sent.
+/// Channel metadata key for the origin of messages that are not what a device sent.
 pub const MADE_OF_KEY: &str = "windhover.made_of";
 
 /// Why a recording could not be written.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
-    /// The system refused.
+    /// The system's refusal.
     #[error("cannot write {}: {source}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The MCAP writer refused.
@@ -35,7 +35,7 @@ pub enum WriteError {
     Mcap(#[from] mcap::McapError),
 }
 
-/// Which of the program's commands makes a recording.
+/// The kinds of commands that make recordings.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Maker {
     /// One that makes captures: `simulate`, `import`.
@@ -55,7 +55,7 @@ impl Maker {
         }
     }
 
-    /// What is found near the begin of a file that it made, by whatever version.
+    /// The marks near the start of a file that it made, in any version.
     pub const fn marks(self) -> [&'static str; 2] {
         match self {
             Self::Capture => ["windhover ", " capture"],
@@ -74,18 +74,18 @@ pub struct McapWriter<W: Write + Seek> {
     made_of: HashMap<String, String>,
 }
 
-/// A recording in the making, which comes to its place when it is whole.
+/// A recording being written, which gets its name when it is complete.
 pub type McapFile = McapWriter<BufWriter<NewFile>>;
 
 impl McapFile {
-    /// Begins a file with its configuration attached.
+    /// Creates a file with its configuration attached.
     pub fn create(path: &Path, maker: Maker, config_toml: &str, began: MonoTime) -> Result<Self, WriteError> {
         let failed = |source| WriteError::Io { path: path.to_owned(), source };
         let file = NewFile::create(path).map_err(failed)?;
         Self::new(BufWriter::with_capacity(1 << 16, file), maker, config_toml, began)
     }
 
-    /// Ends the recording and puts it in its place, which is named in errors.
+    /// Ends the recording and gives it its name, which errors contain.
     pub fn close(self, path: &Path) -> Result<(), WriteError> {
         let failed = |source| WriteError::Io { path: path.to_owned(), source };
         let file = self.finish()?.into_inner().map_err(|error| failed(error.into_error()))?;
@@ -94,8 +94,8 @@ impl McapFile {
 }
 
 impl<W: Write + Seek> McapWriter<W> {
-    /// Begins a recording on any seekable output. `config_toml` becomes the attachment
-    /// [`CONFIG_ATTACHMENT`] unless it is empty; versions go into the metadata record `windhover`.
+    /// Starts a recording on any seekable output. `config_toml` becomes the attachment [`CONFIG_ATTACHMENT`] unless it
+    /// is empty; versions go into the metadata record `windhover`.
     pub fn new(output: W, maker: Maker, config_toml: &str, began: MonoTime) -> Result<Self, WriteError> {
         let options = WriteOptions::new()
             .compression(Some(Compression::Lz4))
@@ -120,8 +120,8 @@ impl<W: Write + Seek> McapWriter<W> {
         Ok(Self { writer, channels: HashMap::new(), sequence: 0, chunk_began: None, made_of: HashMap::new() })
     }
 
-    /// Says in a topic's channel what its messages were made of, where they are not what a device sent. To be said before the
-    /// first of them.
+    /// States in a topic's channel the origin of its messages, where they are not what a device sent. To be called
+    /// before the first of them.
     pub fn made_of(&mut self, topic: &str, text: &str) {
         self.made_of.insert(topic.to_owned(), text.to_owned());
     }
@@ -147,7 +147,7 @@ impl<W: Write + Seek> McapWriter<W> {
         self.write_message(&header, record.log_time, &record.data)
     }
 
-    /// Writes a message of another recording as it is, with its sequence number and its channel's metadata.
+    /// Writes a message of another recording unchanged, with its sequence number and its channel's metadata.
     pub fn copy(&mut self, message: &super::mcap_read::RawMessage) -> Result<(), WriteError> {
         let key = (message.channel.topic.as_str(), message.channel.schema.name.as_str());
         let channel = self.channel(key, || (*message.channel).clone())?;
@@ -185,12 +185,12 @@ impl<W: Write + Seek> McapWriter<W> {
         Ok(self.writer.write_to_known_channel(header, data)?)
     }
 
-    /// Ends the chunk and hands everything to the output.
+    /// Ends the chunk and passes everything to the output.
     pub fn flush(&mut self) -> Result<(), WriteError> {
         Ok(self.writer.flush()?)
     }
 
-    /// Ends the recording: index, statistics, closing magic; gives the output back.
+    /// Ends the recording: index, statistics, closing magic; returns the output.
     pub fn finish(mut self) -> Result<W, WriteError> {
         self.writer.finish()?;
         Ok(self.writer.into_inner())
@@ -201,7 +201,7 @@ fn header(channel_id: u16, sequence: u32, log_time: MonoTime, publish_time: Mono
     MessageHeader { channel_id, sequence, log_time: unsigned(log_time), publish_time: unsigned(publish_time) }
 }
 
-/// MCAP times are unsigned; before zero is zero.
+/// MCAP times are unsigned; negative times become zero.
 fn unsigned(t: MonoTime) -> u64 {
     u64::try_from(t.ns()).unwrap_or(0)
 }

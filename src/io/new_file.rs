@@ -1,5 +1,5 @@
-//! Files that commands write. What is written stands beside its place until it is whole, and nothing that is read, or that
-//! this program did not make, is written over.
+//! Output files of commands. A file has a temporary name until it is complete. No input is overwritten, and no file
+//! that this program did not make.
 
 use std::collections::BTreeSet;
 use std::fs::{File, OpenOptions};
@@ -10,23 +10,23 @@ use std::path::{Path, PathBuf};
 use super::regular;
 use super::segment_files::segment_files;
 
-/// A mark of ours stands within so many bytes of a file's begin.
+/// A mark of this program is within this many bytes of a file's start.
 const MARK_WITHIN: u64 = 1 << 12;
 
-/// A file in the making: beside its place, where it is put when it is whole. Dropped before, it leaves nothing.
+/// A file being written under a temporary name, renamed when it is complete. If dropped before, nothing remains.
 #[derive(Debug)]
 pub struct NewFile {
     file: File,
     place: PathBuf,
-    /// Where it stands; `None` for devices and pipes, which are written to as they are.
+    /// The temporary file; `None` for devices and pipes, which are written to directly.
     beside: Option<PathBuf>,
 }
 
 impl NewFile {
-    /// Begins a file that will stand at `place`, a link followed to where it leads.
+    /// Creates a file that will be at `place`; a symbolic link is followed.
     ///
     /// # Errors
-    /// What the system says; a directory is no file.
+    /// The system's error; a directory is not a file.
     pub fn create(place: &Path) -> io::Result<Self> {
         let place = place.canonicalize().unwrap_or_else(|_| place.to_owned());
         match place.metadata() {
@@ -51,10 +51,10 @@ impl NewFile {
         unreachable!("some number is free")
     }
 
-    /// Puts the whole file in its place.
+    /// Gives the complete file its name.
     ///
     /// # Errors
-    /// It cannot be brought to the disk or renamed; what stood there before stands there still.
+    /// It cannot be synced or renamed; an earlier file of that name remains.
     pub fn finish(mut self) -> io::Result<()> {
         let Some(beside) = &self.beside else { return self.file.flush() };
         self.file.sync_data()?;
@@ -63,7 +63,7 @@ impl NewFile {
         Ok(())
     }
 
-    /// Writes a whole file.
+    /// Writes a complete file.
     ///
     /// # Errors
     /// As [`Self::create`] and [`Self::finish`].
@@ -77,7 +77,7 @@ impl NewFile {
 impl Drop for NewFile {
     fn drop(&mut self) {
         if let Some(beside) = &self.beside {
-            // It never became anything; where it cannot be removed it is called .part.
+            // The temporary file was not completed; where it cannot be removed its name ends with .part.
             let _ = std::fs::remove_file(beside);
         }
     }
@@ -99,16 +99,16 @@ impl Seek for NewFile {
     }
 }
 
-/// Why an output cannot stand where it was asked for.
+/// Why an output cannot be at the requested place.
 #[derive(Debug, thiserror::Error)]
 pub enum PlaceError {
-    /// It is what is read.
-    #[error("{} is what is read; name another file for what is written", path.display())]
+    /// It is an input.
+    #[error("{} is an input; choose another file for the output", path.display())]
     OverInput {
         /// The output.
         path: PathBuf,
     },
-    /// It would be taken for a part of what is read.
+    /// It would become a part of the input.
     #[error("{} would become a segment of the flight that is read; write to another directory", path.display())]
     InFlight {
         /// The output.
@@ -122,7 +122,7 @@ pub enum PlaceError {
     },
 }
 
-/// What a command reads, by device and inode: every file, every segment of a flight.
+/// The inputs of a command, by device and inode: every file, every segment of a flight.
 #[derive(Clone, Debug, Default)]
 pub struct Inputs {
     files: BTreeSet<(u64, u64)>,
@@ -134,7 +134,7 @@ fn identity(path: &Path) -> Option<(u64, u64)> {
 }
 
 impl Inputs {
-    /// Of these files and flights. What is not there cannot be written over.
+    /// Inputs for these files and flights. A file that does not exist cannot be overwritten.
     pub fn of<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Self {
         let mut inputs = Self::default();
         for path in paths {
@@ -148,10 +148,10 @@ impl Inputs {
         inputs
     }
 
-    /// Whether an output may stand there.
+    /// Whether an output may be at this place.
     ///
     /// # Errors
-    /// It may not, and why.
+    /// The reason why it may not.
     pub fn allow(&self, output: &Path) -> Result<(), PlaceError> {
         let path = output.to_owned();
         if identity(output).is_some_and(|there| self.files.contains(&there)) {
@@ -178,8 +178,8 @@ fn every_file(path: &Path) -> Vec<PathBuf> {
     entries.map(|entry| entry.path()).filter(|file| file.is_file()).collect()
 }
 
-/// Whether what stands at a place may be written over without a question: nothing, nothing in it, no regular file, or
-/// what an earlier run of the same command wrote, which carries all of the `marks` near its begin.
+/// Whether the file at a place may be overwritten without a question: it does not exist, is empty, is no regular file,
+/// or was written by an earlier run of the same command, which is recognised by all of the `marks` near its start.
 pub fn is_free(place: &Path, marks: &[&str]) -> bool {
     let Ok(there) = place.metadata() else { return true };
     if !there.is_file() || there.len() == 0 {
@@ -207,9 +207,9 @@ mod tests {
         assert_eq!(std::fs::read(&place).expect("there"), b"before");
         NewFile::write(&link, b"whole").expect("written");
         assert_eq!(std::fs::read(&place).expect("there"), b"whole");
-        assert!(link.is_symlink(), "the link leads there still");
-        assert_eq!(dir.path().read_dir().expect("listed").count(), 2, "nothing is left beside");
-        NewFile::write(Path::new("/dev/null"), b"nothing").expect("a device takes it");
+        assert!(link.is_symlink(), "the link is still there");
+        assert_eq!(dir.path().read_dir().expect("listed").count(), 2, "no temporary file remains");
+        NewFile::write(Path::new("/dev/null"), b"nothing").expect("a device accepts it");
         assert!(NewFile::create(dir.path()).is_err());
     }
 

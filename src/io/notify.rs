@@ -1,4 +1,4 @@
-//! What the service manager is told: ready, alive, stopping, reloading, and a line of status.
+//! Notifications of the service manager: ready, alive, stopping, reloading, and a status line.
 
 use std::time::Duration;
 
@@ -9,13 +9,13 @@ use sd_notify::NotifyState;
 pub struct ServiceManager;
 
 impl ServiceManager {
-    /// How often the watchdog is to be stroked: half of what the service manager allows; `None` where
-    /// it does not watch this process.
+    /// Period of watchdog notifications: half of the service manager's limit; `None` where it does not watch this
+    /// process.
     pub fn watchdog_period() -> Option<Duration> {
         sd_notify::watchdog_enabled().map(|limit| limit / 2)
     }
 
-    /// Everything asked for is up.
+    /// Every required part is up.
     pub fn ready(self, status: &str) {
         self.send(&[NotifyState::Ready, NotifyState::Status(status)]);
     }
@@ -25,7 +25,7 @@ impl ServiceManager {
         self.send(&[NotifyState::Watchdog]);
     }
 
-    /// One line on what goes on.
+    /// One line about the present state.
     pub fn status(self, status: &str) {
         self.send(&[NotifyState::Status(status)]);
     }
@@ -39,13 +39,13 @@ impl ServiceManager {
         }
     }
 
-    /// The end has begun.
+    /// The daemon is stopping.
     pub fn stopping(self, status: &str) {
         self.send(&[NotifyState::Stopping, NotifyState::Status(status)]);
     }
 
     fn send(self, states: &[NotifyState<'_>]) {
-        // A service manager that does not listen cannot be told so.
+        // A failure to notify the service manager cannot be reported to it.
         let _ = sd_notify::notify(states);
     }
 }

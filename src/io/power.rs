@@ -1,10 +1,10 @@
-//! Temperature and supply voltage as the kernel offers them: hwmon and power_supply in sysfs.
+//! Temperature and supply voltage as the kernel provides them: hwmon and power_supply in sysfs.
 
 use std::path::{Path, PathBuf};
 
 use crate::text;
 
-/// What the kernel said of power and heat. `None` where it offers nothing.
+/// A reading of power and temperature. `None` where the kernel provides nothing.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct PowerReading {
     /// Hottest temperature sensor, degrees Celsius.
@@ -13,9 +13,9 @@ pub struct PowerReading {
     pub voltage_v: Option<f64>,
     /// Charge of the weakest battery, percent.
     pub charge_percent: Option<f64>,
-    /// Whether a mains or external supply is there and off line, or a UPS lives on its battery.
+    /// Whether a mains or external supply exists and is off line, or a UPS runs on its battery.
     pub mains_off: bool,
-    /// Whether the line or flag that tells of power going is set.
+    /// Whether the line or flag that signals a power failure is set.
     pub line_set: bool,
 }
 
@@ -28,14 +28,14 @@ pub struct PowerReader {
 }
 
 impl PowerReader {
-    /// A reader below `root`. `voltage_file`, where given, is read for the supply voltage instead of
-    /// everything found: a file that holds millivolts (hwmon `in*_input`) or microvolts
-    /// (power_supply `voltage_now`). `going_file`: a GPIO line's value or a UPS program's flag.
+    /// A reader below `root`. `voltage_file`, where given, is read for the supply voltage instead of all supplies: a
+    /// file with millivolts (hwmon `in*_input`) or microvolts (power_supply `voltage_now`). `going_file`: a GPIO line's
+    /// value or a UPS program's flag.
     pub fn new(root: &Path, voltage_file: Option<PathBuf>, going_file: Option<PathBuf>) -> Self {
         Self { root: root.to_owned(), voltage_file, going_file }
     }
 
-    /// One reading; costs a few file reads of sysfs.
+    /// One reading; takes a few file reads of sysfs.
     pub fn read(&self) -> PowerReading {
         let mut reading = PowerReading::default();
         self.read_hwmon(&mut reading);
@@ -52,7 +52,7 @@ impl PowerReader {
         for file in chips.iter().flat_map(|chip| children(chip)) {
             let name = file_name(&file);
             if name.starts_with("temp") && name.ends_with("_input") {
-                // A sensor that is not wired reads 0, or absurdly low or high.
+                // A sensor that is not connected reads 0, or an impossible value.
                 let celsius = number(&file).map(|milli| milli / 1000.0);
                 let sane = celsius.filter(|c| (-60.0..=200.0).contains(c) && *c != 0.0);
                 reading.temperature_c = highest(reading.temperature_c, sane);
@@ -112,8 +112,8 @@ fn number(file: &Path) -> Option<f64> {
     text::number(&words(file)?).ok()
 }
 
-/// Decides when power is going: a voltage under its threshold for a while, mains off where asked, or at
-/// once where a line says so.
+/// Decides when power is failing: a voltage below its threshold for a while, mains off where configured, or at once
+/// when a line signals it.
 #[derive(Clone, Debug)]
 pub struct PowerWatch {
     low_voltage_v: Option<f64>,
@@ -121,28 +121,27 @@ pub struct PowerWatch {
     low_for: u32,
 }
 
-/// Readings in a row that must be low: a motor's inrush pulls the supply down for a moment.
+/// Number of consecutive low readings that are required: a motor's inrush current lowers the supply for a moment.
 const LOW_READINGS: u32 = 3;
-/// Rise over the threshold that ends the alarm, volts over volts.
+/// Ratio to the threshold above which the alarm ends.
 const RECOVERED: f64 = 1.02;
 
-/// What a reading means.
+/// The judgement of a reading.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum PowerState {
-    /// Enough, or not known.
+    /// Sufficient, or not known.
     Good,
-    /// Going: save what is to be saved.
+    /// Failing: the flight must be closed.
     Going,
 }
 
 impl PowerWatch {
-    /// A watch with a threshold in volts (none: voltage is not watched), and whether mains going off
-    /// line counts.
+    /// A watch with a threshold in volts (`None`: voltage is not watched), and whether mains going off line counts.
     pub const fn new(low_voltage_v: Option<f64>, on_mains_off: bool) -> Self {
         Self { low_voltage_v, on_mains_off, low_for: 0 }
     }
 
-    /// Takes a reading in, one a second.
+    /// Judges a reading, one each second.
     pub fn judge(&mut self, reading: &PowerReading) -> PowerState {
         let low = match (self.low_voltage_v, reading.voltage_v) {
             (Some(limit), Some(volts)) if volts < limit => true,
@@ -202,7 +201,11 @@ mod tests {
         let flag = root.path().join("gpio17/value");
         let reader = PowerReader::new(root.path(), None, Some(flag));
         let mut watch = PowerWatch::new(None, true);
-        assert_eq!(watch.judge(&reader.read()), PowerState::Good, "no such file: no power going");
+        assert_eq!(
+            watch.judge(&reader.read()),
+            PowerState::Good,
+            "without the file there is no power failure"
+        );
         write(root.path(), "gpio17/value", "0\n");
         assert_eq!(watch.judge(&reader.read()), PowerState::Good);
         write(root.path(), "gpio17/value", "1\n");

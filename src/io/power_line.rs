@@ -1,4 +1,4 @@
-//! A GPIO line that tells of power going, watched through its chip's character device (Linux `/dev/gpiochipN`).
+//! A GPIO line that signals a power failure, watched through its chip's character device (Linux `/dev/gpiochipN`).
 
 use std::convert::Infallible;
 use std::time::Duration;
@@ -12,21 +12,21 @@ use super::device::{
 };
 use crate::config::GoingLine;
 
-/// How often a line is read whose controller raises no interrupts.
+/// Reading period for a line whose controller raises no interrupts.
 const READING: Duration = Duration::from_secs(1);
 
-/// The line as it was given to this program.
+/// The requested line.
 enum Requested {
     /// Its controller reports edges.
     Edges(Request),
-    /// Its controller raises no interrupts for it: the line is read now and then.
+    /// Its controller raises no interrupts for it: the line is read periodically.
     Level(Request),
 }
 
 // SAFETY: a request owns the descriptor that the kernel gave for it until it is dropped.
 unsafe impl OwnsDescriptor for Request {}
 
-/// Watches the line for ever; `active` gets its level whenever it may have changed, and `false` where it is lost.
+/// Watches the line without end; `active` gets its level whenever it may have changed, and `false` where it is lost.
 pub async fn run(line: &GoingLine, reports: Reports<'_>, active: &(dyn Fn(bool) + Sync)) -> Infallible {
     let mut backoff = Backoff::new();
     loop {
@@ -63,7 +63,7 @@ async fn watch(
             reports(Report::Up("waits for its edges".into()));
             loop {
                 level(request.get_ref())?;
-                // Cleared first: an edge that comes from here on wakes again.
+                // Cleared first: an edge from here on wakes again.
                 wait_for(request.readable(), reports).await?.clear_ready();
                 while request.get_ref().has_edge_event()? {
                     request.get_ref().read_edge_event()?;
@@ -81,7 +81,7 @@ async fn watch(
 }
 
 fn request(line: &GoingLine) -> Result<Requested, Fault> {
-    // The library folds its errors into one; the plain system call tells a missing chip from a forbidden one.
+    // The library has one error for all causes; the system call distinguishes a missing chip from a forbidden one.
     std::fs::File::open(&line.chip).map_err(|error| Fault::from_io(&line.chip, &error))?;
     let mut builder = Request::builder();
     builder.on_chip(&line.chip).with_consumer("windhover").with_line(line.line).as_input();

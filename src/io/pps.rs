@@ -22,7 +22,7 @@ struct PpsTime {
     flags: u32,
 }
 
-/// `struct pps_fdata` of linux/pps.h: its `pps_kinfo`, then how long to wait.
+/// `struct pps_fdata` of linux/pps.h: its `pps_kinfo`, then the time-out.
 #[repr(C)]
 #[derive(Clone, Copy, Default)]
 struct PpsFetch {
@@ -34,7 +34,7 @@ struct PpsFetch {
     timeout: PpsTime,
 }
 
-/// `PPS_FETCH`, `_IOWR('p', 0xa4, struct pps_fdata *)`: the header puts a pointer's size in.
+/// `PPS_FETCH`, `_IOWR('p', 0xa4, struct pps_fdata *)`: the header uses the size of a pointer.
 const PPS_FETCH: Opcode = opcode::read_write::<*mut PpsFetch>(b'p', 0xa4);
 
 // SAFETY: the opcode belongs to this structure (linux/pps.h), which is repr(C), lives in the value for
@@ -52,12 +52,12 @@ unsafe impl Ioctl for PpsFetch {
     }
 
     unsafe fn output_from_ptr(_: IoctlOutput, pointer: *mut std::ffi::c_void) -> rustix::io::Result<Self> {
-        // SAFETY: `pointer` is what `as_ptr` gave, still valid.
+        // SAFETY: `pointer` is the result of `as_ptr`, and still valid.
         Ok(unsafe { *pointer.cast::<Self>() })
     }
 }
 
-/// Watches a pulse line for ever; `pulse` gets the host time of each rising edge.
+/// Watches a pulse line without end; `pulse` gets the host time of each rising edge.
 pub async fn run(
     device: &str,
     clock: HostClock,
@@ -83,19 +83,19 @@ pub async fn run(
     }
 }
 
-/// Until the line is lost. The kernel wakes whoever waits at every edge; before Linux 6.14 it also says at any time that
-/// the device can be read, so only a wake-up counts (epoll's edge trigger, which the runtime asks for).
+/// Until the line is lost. The kernel wakes waiters at every edge; before Linux 6.14 it also reports at any time that
+/// the device can be read, so only a wake-up counts (epoll's edge trigger, which the runtime requests).
 async fn watch(
     file: File,
     clock: HostClock,
     reports: Reports<'_>,
     pulse: &(dyn Fn(MonoTime) + Sync),
 ) -> io::Result<Infallible> {
-    // What is no pulse line says so here.
+    // This call fails for a device that is not a pulse line.
     let mut last = fetch(&file)?.assert_sequence;
     let line = register(file, Interest::READABLE)?;
     loop {
-        // Cleared first: an edge that comes from here on wakes again.
+        // Cleared first: an edge from here on wakes again.
         wait_for(line.readable(), reports).await?.clear_ready();
         let edge = fetch(line.get_ref())?;
         let new = std::mem::replace(&mut last, edge.assert_sequence) != edge.assert_sequence;

@@ -1,6 +1,6 @@
-//! What this process costs the computer, and which boot of it this is.
+//! Resources of this process, and the identity of the present boot.
 
-/// Resident memory in megabytes; `None` where /proc does not tell.
+/// Resident memory in megabytes; `None` where /proc does not provide it.
 pub fn resident_mb() -> Option<f64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;
@@ -14,7 +14,7 @@ pub fn be_nice(steps: i32) {
     let _ = rustix::process::nice(steps);
 }
 
-/// The kernel's name for this boot; `None` where /proc does not tell.
+/// The kernel's identity of this boot; `None` where /proc does not provide it.
 pub fn boot_id() -> Option<String> {
     let id = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok()?;
     Some(id.trim().to_owned()).filter(|id| !id.is_empty())
@@ -24,13 +24,13 @@ pub fn boot_id() -> Option<String> {
 mod tests {
     #[test]
     fn a_process_has_memory() {
-        let mb = super::resident_mb().expect("told by /proc");
+        let mb = super::resident_mb().expect("from /proc");
         assert!((0.5..100_000.0).contains(&mb), "{mb}");
     }
 
     #[test]
     fn a_boot_keeps_its_name() {
-        let id = super::boot_id().expect("told by /proc");
+        let id = super::boot_id().expect("from /proc");
         assert_eq!(super::boot_id().as_deref(), Some(id.as_str()));
     }
 }

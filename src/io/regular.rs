@@ -1,5 +1,5 @@
-//! Opening files that somebody else names: a recording's segments and its terrain, a folder's images. Only regular files
-//! are opened, and never waited for; what is read has a limit.
+//! Opening files whose names come from other people: a recording's segments and its terrain, a folder's images. Only
+//! regular files are opened, without waiting; the size that is read has a limit.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read as _};
@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 /// Opens a regular file. A pipe, a device or a socket is refused without waiting for its other end.
 ///
 /// # Errors
-/// It is none, or what the system says.
+/// It is not a regular file, or the system's error.
 pub fn open(path: &Path) -> io::Result<File> {
     let wait_for_nobody = rustix::fs::OFlags::NONBLOCK.bits();
     let file = OpenOptions::new().read(true).custom_flags(wait_for_nobody.cast_signed()).open(path)?;
@@ -18,12 +18,12 @@ pub fn open(path: &Path) -> io::Result<File> {
         return Err(io::ErrorKind::IsADirectory.into());
     }
     if !there.is_file() {
-        return Err(io::Error::other("it is no regular file"));
+        return Err(io::Error::other("it is not a regular file"));
     }
     Ok(file)
 }
 
-/// Reads a regular file of at most so many bytes.
+/// Reads a regular file of at most this many bytes.
 ///
 /// # Errors
 /// As [`open`]; it is longer.
@@ -39,21 +39,21 @@ pub fn read(path: &Path, most: u64) -> io::Result<Vec<u8>> {
 /// The same as text.
 ///
 /// # Errors
-/// As [`read`]; it is no UTF-8.
+/// As [`read`]; it is not UTF-8.
 pub fn read_text(path: &Path, most: u64) -> io::Result<String> {
-    String::from_utf8(read(path, most)?).map_err(|_| io::Error::other("it is no text (UTF-8)"))
+    String::from_utf8(read(path, most)?).map_err(|_| io::Error::other("it is not text (UTF-8)"))
 }
 
-/// The file of that name in a folder, wherever links lead: it must not leave the folder.
+/// The file of that name in a folder, with links resolved: it must be inside the folder.
 ///
 /// # Errors
-/// It is elsewhere, or what the system says.
+/// It is outside, or the system's error.
 pub fn inside(folder: &Path, name: &str) -> io::Result<PathBuf> {
     let (folder, file) = (folder.canonicalize()?, folder.join(name).canonicalize()?);
     if file.starts_with(&folder) {
         return Ok(file);
     }
-    Err(io::Error::other(format!("{name:?} leads out of {}", folder.display())))
+    Err(io::Error::other(format!("{name:?} is outside of {}", folder.display())))
 }
 
 #[cfg(test)]
@@ -70,15 +70,15 @@ mod tests {
         std::os::unix::fs::symlink("../private", folder.join("link")).expect("linked");
         let fifo = folder.join("fifo");
         rustix::fs::mkfifoat(rustix::fs::CWD, &fifo, rustix::fs::Mode::RWXU).expect("a pipe");
-        // A pipe that nobody writes to would be waited for.
-        assert!(open(&fifo).expect_err("a pipe").to_string().contains("no regular file"));
+        // Opening a pipe that has no writer would wait.
+        assert!(open(&fifo).expect_err("a pipe").to_string().contains("not a regular file"));
         assert!(open(Path::new("/dev/zero")).is_err() && open(&folder).is_err());
         assert_eq!(read(&folder.join("a"), 100).expect("it fits").len(), 100);
         assert!(read(&folder.join("a"), 99).is_err());
         assert!(inside(&folder, "a").is_ok() && inside(&folder, "./../in/a").is_ok());
         for outside in ["../private", "link", "/dev/zero"] {
             assert!(
-                inside(&folder, outside).expect_err("outside").to_string().contains("leads out"),
+                inside(&folder, outside).expect_err("outside").to_string().contains("is outside"),
                 "{outside}"
             );
         }

@@ -1,4 +1,4 @@
-//! Files of a recording: itself, or the segments of a flight's directory, each of them once.
+//! Files of a recording: the file itself, or the segments of a flight's directory, each of them once.
 
 use std::collections::BTreeMap;
 use std::io::{self, Read};
@@ -9,13 +9,13 @@ use super::regular;
 /// Bytes that are compared at a time.
 const BLOCK: u64 = 1 << 16;
 
-/// Files of a recording: itself, or the segments of a flight's directory in order of their names. Files whose names
-/// begin with a dot are no segments (other systems leave such beside each file), and a segment that is there under
+/// Files of a recording: the file itself, or the segments of a flight's directory in order of their names. Files whose
+/// names begin with a dot are not segments (some systems write such a file beside each file), and a segment with
 /// several names (a link, a copy) is read once, by the first of them.
 ///
 /// # Errors
 ///
-/// What the system says where the path cannot be looked at.
+/// The system's error where the path cannot be read.
 pub fn segment_files(path: &Path) -> io::Result<Vec<PathBuf>> {
     if !path.metadata()?.is_dir() {
         return Ok(vec![path.to_owned()]);
@@ -33,7 +33,7 @@ pub fn segment_files(path: &Path) -> io::Result<Vec<PathBuf>> {
     files.retain(|file| {
         let length = file.metadata().map_or(0, |file| file.len());
         let others = by_length.entry(length).or_default();
-        // What cannot be compared is read, and says why it cannot be.
+        // A file that cannot be compared is read, which reports the error.
         let again = others.iter().any(|other| is_same(other, file).unwrap_or(false));
         others.push(file.clone());
         !again
@@ -41,8 +41,8 @@ pub fn segment_files(path: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// Whether two files hold the same bytes. Segments differ in their first blocks, where their numbers stand, so this
-/// reads more of copies only. Two files that hold nothing are two.
+/// Whether two files have the same bytes. Segments differ in their first blocks, which contain their numbers, so only
+/// copies are read further. Two empty files are different.
 fn is_same(one: &Path, other: &Path) -> io::Result<bool> {
     let (mut one, mut other) = (regular::open(one)?, regular::open(other)?);
     if one.metadata()?.len() == 0 {

@@ -11,15 +11,15 @@ use windhover_base::geo::{TerrainError, Tile};
 
 /// GDAL's tag for the value of missing heights, as text (GDAL, GeoTIFF driver).
 const GDAL_NODATA: Tag = Tag::Unknown(42_113);
-/// Heights farther than this from the sea are marks for missing ones, metres.
+/// Heights beyond this mark missing values, metres.
 const HIGHEST_M: f64 = 12_000.0;
 
 /// Bytes of the largest `.hgt` file, 3601 heights square.
 const LARGEST_HGT: u64 = 3601 * 3601 * 2;
-/// Bytes of the largest GeoTIFF that is looked at: 1″ floats over two degrees square, not compressed.
+/// Bytes of the largest accepted GeoTIFF: 1″ floats over two degrees square, uncompressed.
 const LARGEST_TIFF: u64 = 1 << 28;
 
-/// Why a file gave no tile.
+/// Why a file could not be used as a tile.
 #[derive(Debug, thiserror::Error)]
 pub enum TileError {
     /// The file could not be read.
@@ -27,10 +27,10 @@ pub enum TileError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Not a TIFF file, or one of a kind this program does not read.
+    /// Not a TIFF file, or of a kind that is not supported.
     #[error("terrain {}: {source}", path.display())]
     Tiff {
         /// The file.
@@ -38,7 +38,7 @@ pub enum TileError {
         /// What is wrong.
         source: tiff::TiffError,
     },
-    /// The heights are not a tile in latitude and longitude.
+    /// The heights are not a grid in latitude and longitude.
     #[error("terrain {}: {source}", path.display())]
     Tile {
         /// The file.
@@ -46,7 +46,7 @@ pub enum TileError {
         /// What is wrong.
         source: TerrainError,
     },
-    /// A GeoTIFF without its place, or of a kind that is not heights.
+    /// A GeoTIFF without its position, or with other values than heights.
     #[error("terrain {}: {reason}", path.display())]
     Unfit {
         /// The file.
@@ -73,7 +73,7 @@ fn geotiff(path: &Path) -> Result<Tile, TileError> {
     let file = regular::open(path).map_err(io)?;
     if file.metadata().map_err(io)?.len() > LARGEST_TIFF {
         return Err(io(std::io::Error::other(
-            "it is longer than 256 MB; cut out the place with gdalwarp -te",
+            "it is longer than 256 MB; cut out the area with gdalwarp -te",
         )));
     }
     let wrong = |source| TileError::Tiff { path: path.to_owned(), source };
@@ -84,13 +84,13 @@ fn geotiff(path: &Path) -> Result<Tile, TileError> {
     let (scale, tie) = (numbers(Tag::ModelPixelScaleTag), numbers(Tag::ModelTiepointTag));
     let keys = numbers(Tag::GeoKeyDirectoryTag).unwrap_or_default();
     let (Some(scale), Some(tie)) = (scale, tie) else {
-        return Err(unfit("it does not tell where it lies (ModelPixelScale and ModelTiepoint)"));
+        return Err(unfit("its position is missing (ModelPixelScale and ModelTiepoint)"));
     };
     let ([dx, dy, ..], [i, j, _, x, y, ..]) = (&scale[..], &tie[..]) else {
-        return Err(unfit("it does not tell where it lies (ModelPixelScale and ModelTiepoint)"));
+        return Err(unfit("its position is missing (ModelPixelScale and ModelTiepoint)"));
     };
     let key = |id: f64| keys.chunks_exact(4).skip(1).find(|k| k[0] == id).map(|k| k[3]);
-    // GTModelType 2 is geographic; GTRasterType 2 puts the tie point on a height, 1 on a pixel's corner.
+    // GTModelType 2 is geographic; with GTRasterType 2 the tie point is on a height, with 1 on a pixel's corner.
     if key(1024.0).is_some_and(|model| model != 2.0) {
         return Err(unfit("it is not in latitude and longitude: convert it with gdalwarp -t_srs EPSG:4326"));
     }
@@ -140,10 +140,10 @@ mod tests {
         tags.write_tag(GDAL_NODATA, "-9999").expect("a tag");
         image.write_data(&heights).expect("heights");
         let tile = load(&path).expect("a tile");
-        // The corner is at (31, −86): the first height half a pixel inside.
+        // The corner is at (31, −86): the first height is half a pixel inside.
         assert_eq!(tile.height_msl_m(30.95, -85.95), 0.0);
         assert!((tile.height_msl_m(30.65, -85.55) - 19.0).abs() < 1e-4);
-        // The missing one is filled from around it.
+        // The missing height is filled from its neighbours.
         assert!((tile.height_msl_m(30.85, -85.75) - 7.0).abs() < 1e-4);
     }
 

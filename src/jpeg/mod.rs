@@ -1,27 +1,27 @@
-//! Pictures made into JPEG, colour formats of cameras as they stand: chroma is neither invented nor lost.
+//! Pictures to JPEG, in the colour formats of cameras without conversion: chroma is neither interpolated nor reduced.
 
 use turbojpeg::{Compressor, Image, PixelFormat, Subsamp, YuvImage};
 use windhover_base::msg::GrayImage;
 
-/// What the bytes of a picture are, row after row without gaps.
+/// Format of a picture's bytes, row after row without gaps.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Layout {
-    /// One byte a pixel.
+    /// One byte for each pixel.
     Grey,
     /// Red, green, blue.
     Rgb,
     /// Blue, green, red.
     Bgr,
-    /// Planes Y, U, V; colour once for two pixels of a row.
+    /// Planes Y, U, V; one colour for two pixels of a row.
     Yuv422,
-    /// Planes Y, U, V; colour once for a block of 2×2 pixels.
+    /// Planes Y, U, V; one colour for a block of 2×2 pixels.
     Yuv420,
 }
 
 /// One plane of a picture.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Plane {
-    /// Bytes a sample takes.
+    /// Bytes of a sample.
     pub channels: usize,
     /// Samples of a row.
     pub width: usize,
@@ -39,8 +39,8 @@ impl Plane {
 }
 
 impl Layout {
-    /// The planes of a picture of `width` by `height` pixels, in the order of its bytes. Where colour is
-    /// coarser, the first plane is filled up to whole blocks.
+    /// The planes of a picture of `width` by `height` pixels, in the order of its bytes. Where colour is subsampled,
+    /// the first plane is padded to whole blocks.
     pub fn planes(self, width: usize, height: usize) -> Vec<Plane> {
         let plane = |channels, step| Plane { channels, width, height, step };
         let subsampled = |(across, down): (usize, usize)| {
@@ -63,10 +63,10 @@ impl Layout {
     }
 }
 
-/// Why a picture is not made into JPEG.
+/// Why a picture cannot be made into JPEG.
 #[derive(Debug, thiserror::Error)]
 pub enum JpegError {
-    /// Not the bytes of such a picture.
+    /// The number of bytes is wrong for such a picture.
     #[error("{got} bytes are not {width}x{height} {layout:?}")]
     Size {
         /// Bytes there are.
@@ -75,7 +75,7 @@ pub enum JpegError {
         width: usize,
         /// Rows.
         height: usize,
-        /// Layout.
+        /// The error of the compressor.
         layout: Layout,
     },
     /// The compressor's own words.
@@ -127,7 +127,7 @@ pub fn encode_grey(image: &GrayImage, quality: u8) -> Result<Vec<u8>, JpegError>
 mod tests {
     use super::*;
 
-    /// A ramp of grey and a colour that changes slowly, at odd sizes too.
+    /// A ramp of grey and a slowly changing colour, at odd sizes too.
     fn picture(layout: Layout, (width, height): (usize, usize)) -> Vec<u8> {
         let mut out = Vec::new();
         for (k, plane) in layout.planes(width, height).iter().enumerate() {
@@ -165,7 +165,7 @@ mod tests {
         }
     }
 
-    /// Red, green, blue of [`picture`]; full-range BT.601 as JFIF has it.
+    /// Red, green, blue of [`picture`]; full-range BT.601 as in JFIF.
     fn expected(layout: Layout, x: usize, y: usize) -> [f64; 3] {
         let (x, y) = (x as f64, y as f64);
         let luma = 40.0 + x + y;

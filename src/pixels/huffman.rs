@@ -1,8 +1,8 @@
-//! Huffman codes of JPEG: walking over coded blocks without making pixels of them.
+//! Huffman codes of JPEG: walking over coded blocks without decoding their pixels.
 //!
 //! Source: ITU-T T.81, annexes C (codes), F.2.2 (decoding), K.3 (standard tables).
 
-/// Bits of a code looked up at once.
+/// Bits of a code that are looked up at once.
 const QUICK: u32 = 10;
 /// Longest code.
 const LONGEST: usize = 16;
@@ -11,15 +11,15 @@ const LONGEST: usize = 16;
 pub(super) struct Code {
     /// By the next [`QUICK`] bits: length of the code and its symbol; length 0 where it is longer.
     quick: Vec<(u8, u8)>,
-    /// By length less one: the first code beyond those of this length, left-aligned to 16 bits.
+    /// By length minus one: the first code beyond those of this length, left-aligned to 16 bits.
     beyond: [u32; LONGEST],
-    /// By length less one: index of a code's symbol, less the code.
+    /// By length minus one: index of a code's symbol, minus the code.
     offset: [i32; LONGEST],
     symbols: Vec<u8>,
 }
 
 impl Code {
-    /// Of the number of codes of each length, and their symbols; `None` where these are no code.
+    /// A table from the number of codes of each length, and their symbols; `None` where these are not a valid code.
     pub(super) fn new(counts: &[u8], symbols: &[u8]) -> Option<Self> {
         let mut this = Self {
             quick: vec![(0, 0); 1 << QUICK],
@@ -63,7 +63,7 @@ impl Code {
         None
     }
 
-    /// The next symbol and its length, of the next 16 bits.
+    /// The next symbol and its length, from the next 16 bits.
     fn next(&self, bits: u32) -> Option<(u32, u8)> {
         let (length, symbol) = self.quick[(bits >> (LONGEST as u32 - QUICK)) as usize];
         if length > 0 {
@@ -90,7 +90,7 @@ impl<'a> Bits<'a> {
         Self { bytes, at: 0, hold: 0, held: 0, used: 0 }
     }
 
-    /// At least 32 bits, zeros after the end.
+    /// Ensures at least 32 bits, zeros after the end.
     fn fill(&mut self) {
         if self.held >= 32 {
             return;
@@ -111,7 +111,7 @@ impl<'a> Bits<'a> {
         self.used += bits as usize;
     }
 
-    /// The next symbol, with the bits of its value passed over.
+    /// The next symbol; the bits of its value are skipped.
     fn symbol(&mut self, code: &Code) -> Option<u8> {
         self.fill();
         let (length, symbol) = code.next((self.hold >> 48) as u32)?;
@@ -132,7 +132,7 @@ impl<'a> Bits<'a> {
         Some(if value < 1 << (size - 1) { value + 1 - (1 << size) } else { value })
     }
 
-    /// Walks over a block and adds its difference to the level; whether it is a block.
+    /// Walks over a block and adds its difference to the level; returns whether it is a valid block.
     pub(super) fn block(&mut self, dc: &Code, ac: &Code, level: &mut i32) -> bool {
         let Some(difference) = self.difference(dc) else { return false };
         *level += difference;
@@ -151,7 +151,7 @@ impl<'a> Bits<'a> {
         self.used <= 8 * self.bytes.len()
     }
 
-    /// Whether nothing is left but the filling of the last byte, and so many bytes of zeros at most.
+    /// Whether only the padding of the last byte remains, and at most `zeros` bytes of zeros.
     pub(super) fn is_at_end(&self, zeros: usize) -> bool {
         let whole = self.used.div_ceil(8);
         let filling = self.bytes.get(self.used / 8).filter(|_| !self.used.is_multiple_of(8));
@@ -162,7 +162,7 @@ impl<'a> Bits<'a> {
     }
 }
 
-/// Writes codes as a scan has them.
+/// Writes codes in the form of a scan.
 pub(super) struct Writer<'a> {
     out: &'a mut Vec<u8>,
     hold: u32,
@@ -188,7 +188,7 @@ impl<'a> Writer<'a> {
         }
     }
 
-    /// Fills the last byte with ones.
+    /// Pads the last byte with ones.
     pub(super) fn finish(mut self) {
         let spare = (8 - self.held % 8) % 8;
         self.write(((1 << spare) - 1, spare));
@@ -213,7 +213,7 @@ pub(super) fn standard() -> [Code; 4] {
 
 const fn standard_segment() -> [u8; 420] {
     let mut segment = [0; 420];
-    // Marker, and the length of what follows it: 2 + 4 tables of 1 + 16 + symbols.
+    // Marker, and the length of the rest: 2 + 4 tables of 1 + 16 + symbols.
     (segment[0], segment[1], segment[2], segment[3]) = (0xFF, 0xC4, 1, 0xA2);
     let mut at = 4;
     let tables: [(u8, &[u8; 16], &[u8]); 4] = [

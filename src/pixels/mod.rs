@@ -1,4 +1,4 @@
-//! Pixels out of the bytes of a frame, as cameras and captures give it.
+//! Pixels from the bytes of a frame, as cameras and captures deliver them.
 
 mod huffman;
 mod mosaic;
@@ -20,16 +20,16 @@ use windhover_base::msg::{FrameEncoding, FramePayload, GrayImage, RgbImage};
 /// A frame in memory.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct DecodedFrame {
-    /// Grey levels: luma of colour formats.
+    /// Grey levels: the luma of colour formats.
     pub gray: GrayImage,
-    /// Colours, where they were asked for and the format has them.
+    /// Colours, where requested and where the format has them.
     pub rgb: Option<RgbImage>,
-    /// Parts that were lost on the way: grey stands there. The rest is as the camera took it.
+    /// Lost parts, which are grey in the picture. The rest is as the camera took it.
     pub missing: Vec<MissingPart>,
 }
 
 impl DecodedFrame {
-    /// Whether what lies between these columns and rows, `margin_px` wider, is the camera's.
+    /// Whether the area between these columns and rows, `margin_px` wider, has no lost part.
     pub fn is_whole(&self, from: (f64, f64), to: (f64, f64), margin_px: f64) -> bool {
         !self.missing.iter().any(|part| {
             let (part_from, part_to) = (part.from, part.to);
@@ -44,18 +44,18 @@ impl DecodedFrame {
 /// Why a frame cannot be used.
 #[derive(Clone, PartialEq, Eq, Debug, thiserror::Error)]
 pub enum FrameFault {
-    /// An encoding this program does not read.
-    #[error("its encoding is not known here")]
+    /// An encoding that is not supported.
+    #[error("its encoding is not supported")]
     UnknownEncoding,
-    /// The bytes are not what the encoding promises.
+    /// The bytes are not valid in the encoding.
     #[error("its {encoding:?} bytes are damaged: {reason}")]
     Damaged {
-        /// What they should be.
+        /// The stated encoding.
         encoding: FrameEncoding,
         /// What is wrong.
         reason: String,
     },
-    /// Fewer bytes than width, height and stride ask for, or a stride shorter than a row.
+    /// Fewer bytes than width, height and stride require, or a stride shorter than a row.
     #[error("{got} bytes are not {width}x{height} {encoding:?} with rows {stride} bytes apart")]
     Size {
         /// Bytes there are.
@@ -69,8 +69,8 @@ pub enum FrameFault {
         /// Encoding.
         encoding: FrameEncoding,
     },
-    /// Not the size the configuration's intrinsics are for.
-    #[error("it is {got_width}x{got_height}, the configuration says {want_width}x{want_height}")]
+    /// Not the size for which the configuration has intrinsics.
+    #[error("it is {got_width}x{got_height}, the configuration has {want_width}x{want_height}")]
     Unexpected {
         /// Columns there are.
         got_width: usize,
@@ -83,10 +83,10 @@ pub enum FrameFault {
     },
 }
 
-/// Largest side of a frame, pixels: beyond it a header is damage.
+/// Largest side of a frame, pixels: a larger one in a header is damage.
 const LARGEST_SIDE: usize = 16_384;
 
-/// Decodes a frame; `want_rgb` asks for colours too.
+/// Decodes a frame; with `want_rgb` also its colours.
 pub fn decode(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault> {
     match frame.encoding {
         FrameEncoding::Jpeg => jpeg(frame, want_rgb),
@@ -110,7 +110,7 @@ fn damaged(encoding: FrameEncoding, reason: impl std::fmt::Display) -> FrameFaul
     FrameFault::Damaged { encoding, reason: reason.to_string() }
 }
 
-/// Grey levels of a picture in a file, whatever its name says it is, and the parts of it that are lost.
+/// Grey levels of a picture in a file, whatever the extension of its name, and its lost parts.
 pub fn picture(bytes: &[u8]) -> Result<(GrayImage, Vec<MissingPart>), String> {
     let format = image::guess_format(bytes).map_err(|e| e.to_string())?;
     let checked = match format {
@@ -124,7 +124,7 @@ pub fn picture(bytes: &[u8]) -> Result<(GrayImage, Vec<MissingPart>), String> {
     Ok((gray, checked.missing))
 }
 
-/// Decodes once: to luma alone, or where colours are wanted and there are any to luma and chroma.
+/// Decodes once: to luma alone, or where colours are wanted and exist to luma and chroma.
 fn jpeg(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault> {
     let fault = |e: zune_jpeg::errors::DecodeErrors| damaged(FrameEncoding::Jpeg, format!("{e:?}"));
     let options = DecoderOptions::default().set_max_width(LARGEST_SIDE).set_max_height(LARGEST_SIDE);
@@ -138,7 +138,7 @@ fn jpeg(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault
     let mut pixels = decoder.decode().map_err(fault)?;
     let (width, height) =
         decoder.dimensions().ok_or_else(|| damaged(FrameEncoding::Jpeg, "it has no size"))?;
-    let short = || damaged(FrameEncoding::Jpeg, "it has fewer pixels than its header says");
+    let short = || damaged(FrameEncoding::Jpeg, "it has fewer pixels than its header states");
     if !with_chroma {
         let gray = GrayImage::from_vec(width, height, pixels).ok_or_else(short)?;
         return Ok(DecodedFrame { gray, rgb: None, missing });
@@ -167,11 +167,11 @@ fn png(frame: &FramePayload, want_rgb: bool) -> Result<DecodedFrame, FrameFault>
     let luma = decoded.into_luma8();
     let (width, height) = (luma.width() as usize, luma.height() as usize);
     let gray = GrayImage::from_vec(width, height, luma.into_raw())
-        .ok_or_else(|| damaged(FrameEncoding::Png, "it has fewer pixels than its header says"))?;
+        .ok_or_else(|| damaged(FrameEncoding::Png, "it has fewer pixels than its header states"))?;
     Ok(DecodedFrame { gray, rgb, missing: Vec::new() })
 }
 
-/// Bytes a row of pixels takes, and rows of bytes for `height` rows of pixels.
+/// Bytes of a row of pixels, and rows of bytes for `height` rows of pixels.
 fn raw_layout(encoding: FrameEncoding, width: usize, height: usize) -> (usize, usize) {
     match encoding {
         FrameEncoding::Yuyv | FrameEncoding::Uyvy => (2 * width, height),
@@ -242,7 +242,7 @@ fn luma_row(encoding: FrameEncoding, row: &[u8], out: &mut [u8]) {
     }
 }
 
-/// The upper eight of a pixel's bits in two bytes; bits above them saturate.
+/// The upper eight of a pixel's bits, which are in two bytes; bits above them saturate.
 fn upper_eight(row: &[u8], out: &mut [u8], below: u32) {
     for (o, pair) in out.iter_mut().zip(row.chunks_exact(2)) {
         *o = (u16::from_le_bytes([pair[0], pair[1]]) >> below).min(255) as u8;
@@ -278,7 +278,7 @@ fn rgb_at(encoding: FrameEncoding, row: &[u8], chroma: &[u8], u: usize) -> [u8; 
     }
 }
 
-/// Full-range BT.601, as JPEG and most webcams have it.
+/// Full-range BT.601, as in JPEG and most webcams.
 fn yuv(y: u8, cb: u8, cr: u8) -> [u8; 3] {
     let (y, cb, cr) = (f32::from(y), f32::from(cb) - 128.0, f32::from(cr) - 128.0);
     let clamp = |x: f32| x.round().clamp(0.0, 255.0) as u8;

@@ -1,4 +1,4 @@
-//! Mosaics of colour filters (Bayer): grey levels with the mosaic evened out, and colours.
+//! Mosaics of colour filters (Bayer): grey levels with the mosaic filtered out, and colours.
 
 use windhover_base::msg::{Bayer, GrayImage, RgbImage};
 
@@ -6,7 +6,7 @@ use windhover_base::msg::{Bayer, GrayImage, RgbImage};
 pub(super) struct Rows<'a> {
     /// The bytes.
     pub(super) data: &'a [u8],
-    /// From one row to the next.
+    /// Bytes from one row to the next.
     pub(super) stride: usize,
     /// Columns.
     pub(super) width: usize,
@@ -14,7 +14,7 @@ pub(super) struct Rows<'a> {
     pub(super) height: usize,
 }
 
-/// The index mirrored into `0..length` about its ends, so that it keeps its place in the mosaic.
+/// The index mirrored into `0..length` at its ends, so that its place in the mosaic's period is kept.
 fn mirrored(index: isize, length: usize) -> usize {
     let last = length as isize - 1;
     let index = if index < 0 { -index } else { index };
@@ -28,8 +28,9 @@ impl Rows<'_> {
         &self.data[start..start + self.width]
     }
 
-    /// Grey: each pixel with its eight neighbours, weighted 1 2 1 | 2 4 2 | 1 2 1. Whatever the pixel's own filter, red and
-    /// blue have a quarter of the weight each and green a half, so that an even surface is even and an edge stays in place.
+    /// Grey: each pixel with its eight neighbours, weighted 1 2 1 | 2 4 2 | 1 2 1. For every filter of the pixel
+    /// itself, red and blue have a quarter of the weight each and green a half, so that a uniform surface is uniform
+    /// and an edge keeps its place.
     pub(super) fn grey(&self) -> GrayImage {
         let mut gray = GrayImage::new(self.width, self.height);
         let mut sums = vec![0_u32; self.width];
@@ -49,7 +50,8 @@ impl Rows<'_> {
         gray
     }
 
-    /// Colours: of each pixel those of its cell of four. Discs are told apart by it, nothing is measured in it.
+    /// Colours: each pixel gets those of its cell of four. They serve to distinguish discs; nothing is measured in
+    /// them.
     pub(super) fn colours(&self, order: Bayer) -> RgbImage {
         // Where red and blue are in the cell; green is in the two others.
         let (red, blue) = match order {

@@ -1,12 +1,12 @@
-//! Whether every block of a JPEG's picture is there, before anything is made of its pixels.
+//! Checks that every block of a JPEG picture is present, before its pixels are decoded.
 //!
-//! A decoder goes on where bytes of a scan are lost, and what follows lies in the wrong place. So the scan is
-//! walked first, code by code: every block must be there, and nothing else. Where the picture has restart
-//! markers, their numbers tell which intervals are lost or damaged; these are replaced by flat grey and told,
-//! the others stand where they belong. Without them a damaged picture is of no use below the damage, and where
-//! that begins is not known.
+//! A decoder continues where bytes of a scan are lost, and puts the following blocks in the wrong places. So the scan
+//! is walked first, code by code: it must consist of all blocks and nothing else. Where the picture has restart
+//! markers, their numbers show which intervals are lost or damaged; these are replaced by flat grey and reported, the
+//! others stay in their places. Without restart markers a damaged picture cannot be used below the damage, and the
+//! start of the damage is not known.
 //!
-//! Motion JPEG may leave the Huffman tables out (USB Video Class, AVI): the standard ones are put in.
+//! Motion JPEG may omit the Huffman tables (USB Video Class, AVI): the standard ones are inserted.
 //!
 //! Source: ITU-T T.81 (markers B.1, Huffman decoding F.2.2, restarts E.2.4, standard tables K.3).
 
@@ -14,12 +14,12 @@ use std::borrow::Cow;
 
 use super::huffman::{Bits, Code, STANDARD_TABLES, Writer, standard};
 
-/// The most of a picture that may be missing.
+/// Largest share of a picture that may be missing.
 const MOST_MISSING: f64 = 0.5;
-/// Bytes of zeros after the last block that some cameras fill up with.
+/// Bytes of zeros after the last block with which some cameras pad.
 const FILLED_MAX: usize = 64;
 
-/// A part of a picture that was not there, in pixels: from the first corner up to before the second.
+/// A lost part of a picture, in pixels: from the first corner to before the second.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct MissingPart {
     /// First column and row.
@@ -28,7 +28,7 @@ pub struct MissingPart {
     pub to: (usize, usize),
 }
 
-/// A picture that a decoder can be given.
+/// A picture that can be decoded.
 pub(super) struct Checked<'a> {
     pub(super) bytes: Cow<'a, [u8]>,
     pub(super) missing: Vec<MissingPart>,
@@ -45,10 +45,10 @@ struct Component {
     ac: usize,
 }
 
-/// Furthest that a block's level is from the middle, before it is quantized (eight bits, A.3.3).
+/// Largest distance of a block's level from the middle, before quantization (eight bits, A.3.3).
 const LEVEL_MAX: i32 = 1024;
 
-/// What stands before the scan.
+/// Data before the scan.
 #[derive(Default)]
 struct Header {
     width: usize,
@@ -58,19 +58,19 @@ struct Header {
     restart: usize,
     dc: [Option<Code>; 4],
     ac: [Option<Code>; 4],
-    /// What levels are divided by, of each quantization table.
+    /// Quantization steps of the levels, for each quantization table.
     steps: [u16; 4],
     has_tables: bool,
     /// Where the coded picture begins.
     scan: usize,
 }
 
-/// Checks the scan of a sequential picture. Other kinds are passed on where their end is there.
+/// Checks the scan of a sequential picture. Other kinds are passed on where their end is present.
 pub(super) fn checked(bytes: &[u8]) -> Result<Checked<'_>, String> {
     let as_it_is = |bytes| Checked { bytes: Cow::Borrowed(bytes), missing: Vec::new() };
     let Some(mut header) = Header::read(bytes)? else {
         let has_end = bytes.windows(2).any(|pair| pair == [0xFF, 0xD9]);
-        return if has_end { Ok(as_it_is(bytes)) } else { Err("it is cut short".to_owned()) };
+        return if has_end { Ok(as_it_is(bytes)) } else { Err("it is incomplete".to_owned()) };
     };
     if !header.has_tables {
         let [dc, chroma_dc, ac, chroma_ac] = standard();
@@ -97,7 +97,7 @@ pub(super) fn checked(bytes: &[u8]) -> Result<Checked<'_>, String> {
 }
 
 fn u16_at(bytes: &[u8], at: usize) -> Result<usize, String> {
-    let pair = bytes.get(at..at + 2).ok_or("its header is cut short")?;
+    let pair = bytes.get(at..at + 2).ok_or("its header is incomplete")?;
     Ok(usize::from(pair[0]) << 8 | usize::from(pair[1]))
 }
 
@@ -109,7 +109,7 @@ impl Header {
         }
         let (mut header, mut at) = (Self::default(), 2);
         loop {
-            let marker = match bytes.get(at..at + 2).ok_or("its header is cut short")? {
+            let marker = match bytes.get(at..at + 2).ok_or("its header is incomplete")? {
                 [0xFF, 0xFF] => {
                     at += 1;
                     continue;
@@ -118,7 +118,7 @@ impl Header {
                 _ => return Err("its header is damaged".to_owned()),
             };
             let length = u16_at(bytes, at + 2)?;
-            let body = bytes.get(at + 4..at + 2 + length).ok_or("its header is cut short")?;
+            let body = bytes.get(at + 4..at + 2 + length).ok_or("its header is incomplete")?;
             at += 2 + length;
             match marker {
                 0xC4 => header.tables(body)?,
@@ -138,12 +138,13 @@ impl Header {
 
     fn tables(&mut self, mut body: &[u8]) -> Result<(), String> {
         while let Some((&class, rest)) = body.split_first() {
-            let counts = rest.get(..16).ok_or("a Huffman table is cut short")?;
+            let counts = rest.get(..16).ok_or("a Huffman table is incomplete")?;
             let total: usize = counts.iter().map(|count| usize::from(*count)).sum();
-            let symbols = rest.get(16..16 + total).ok_or("a Huffman table is cut short")?;
+            let symbols = rest.get(16..16 + total).ok_or("a Huffman table is incomplete")?;
             let code = Code::new(counts, symbols).ok_or("a Huffman table is damaged")?;
             let tables = if class >> 4 == 0 { &mut self.dc } else { &mut self.ac };
-            *tables.get_mut(usize::from(class & 15)).ok_or("a Huffman table has no place")? = Some(code);
+            *tables.get_mut(usize::from(class & 15)).ok_or("a Huffman table has an invalid number")? =
+                Some(code);
             self.has_tables = true;
             body = &rest[16 + total..];
         }
@@ -153,9 +154,13 @@ impl Header {
     fn quantization(&mut self, mut body: &[u8]) -> Result<(), String> {
         while let Some((&class, rest)) = body.split_first() {
             let wide = class >> 4 != 0;
-            let table = rest.get(..if wide { 128 } else { 64 }).ok_or("a quantization table is cut short")?;
+            let table =
+                rest.get(..if wide { 128 } else { 64 }).ok_or("a quantization table is incomplete")?;
             let step = if wide { u16_at(table, 0)? as u16 } else { u16::from(table[0]) };
-            *self.steps.get_mut(usize::from(class & 15)).ok_or("a quantization table has no place")? = step;
+            *self
+                .steps
+                .get_mut(usize::from(class & 15))
+                .ok_or("a quantization table has an invalid number")? = step;
             body = &rest[table.len()..];
         }
         Ok(())
@@ -181,16 +186,16 @@ impl Header {
         }
     }
 
-    /// Takes the scan's tables; whether it holds all components.
+    /// Takes the scan's tables; returns whether it has all components.
     fn scan_of(&mut self, body: &[u8]) -> Result<bool, String> {
-        let count = usize::from(*body.first().ok_or("its scan header is cut short")?);
-        for entry in body.get(1..1 + 2 * count).ok_or("its scan header is cut short")?.chunks_exact(2) {
+        let count = usize::from(*body.first().ok_or("its scan header is incomplete")?);
+        for entry in body.get(1..1 + 2 * count).ok_or("its scan header is incomplete")?.chunks_exact(2) {
             let component = self.components.iter_mut().find(|component| component.id == entry[0]);
-            let component = component.ok_or("its scan is of no component it has")?;
+            let component = component.ok_or("its scan is of an undefined component")?;
             (component.dc, component.ac) = (usize::from(entry[1] >> 4 & 3), usize::from(entry[1] & 3));
         }
         if let [one] = self.components.as_mut_slice() {
-            // A component alone has one block after the other, whatever its sampling.
+            // A single component has one block after the other, whatever its sampling.
             (one.across, one.down) = (1, 1);
         }
         Ok(count == self.components.len())
@@ -230,7 +235,7 @@ impl Header {
         parts
     }
 
-    /// Which part is each interval of the picture, where it is there and whole.
+    /// Assigns a part to each interval of the picture, where it is present and complete.
     fn place(&self, bytes: &[u8], parts: &[Part]) -> Result<Vec<Option<Part>>, String> {
         let (_, all) = self.groups();
         let count = if self.restart == 0 { 1 } else { all.div_ceil(self.restart) };
@@ -243,7 +248,7 @@ impl Header {
             if let Some(number) = part.restart {
                 let skipped = (usize::from(number) + 8 - index % 8) % 8;
                 if skipped > 0 {
-                    // Even where it is whole: intervals before it may be lost, or after it.
+                    // Even where it is complete: intervals before or after it may be lost.
                     *unknown = true;
                     (holes, hole_at) = (holes + 1, places.len());
                 }
@@ -262,7 +267,7 @@ impl Header {
         };
         if lacking > 0 {
             let cut = parts.last().is_some_and(|part| !whole(part, last));
-            // A hole of more than eight intervals is told by the number of all; two cannot be told apart.
+            // A gap of more than eight intervals follows from the total number; two such gaps cannot be distinguished.
             match (holes, cut) {
                 (0, true) => {}
                 (1, false) if lacking.is_multiple_of(8) => {
@@ -278,7 +283,7 @@ impl Header {
         Ok(placed)
     }
 
-    /// Whether these bytes are so many groups of blocks and nothing else.
+    /// Whether these bytes are exactly this many groups of blocks.
     fn is_whole(&self, bytes: &[u8], groups: usize, last: bool) -> bool {
         let mut bits = Bits::new(bytes);
         let mut levels = vec![0; self.components.len()];
@@ -299,7 +304,7 @@ impl Header {
         bits.is_at_end(if last { FILLED_MAX } else { 0 })
     }
 
-    /// The picture with its tables, and grey where intervals are missing.
+    /// The picture with its tables, and grey in the missing intervals.
     fn put_together(&self, bytes: &[u8], placed: &[Option<Part>]) -> Result<Vec<u8>, String> {
         let mut out = Vec::with_capacity(bytes.len() + STANDARD_TABLES.len());
         out.extend_from_slice(&bytes[..2]);
@@ -325,7 +330,8 @@ impl Header {
         for _ in 0..groups {
             for component in &self.components {
                 let codes = code(&self.dc[component.dc]).zip(code(&self.ac[component.ac]));
-                let (same, end) = codes.ok_or("parts of it are damaged, and its tables have no grey")?;
+                let (same, end) =
+                    codes.ok_or("parts of it are damaged, and its tables have no code for grey")?;
                 for _ in 0..component.across * component.down {
                     writer.write(same);
                     writer.write(end);
@@ -337,7 +343,7 @@ impl Header {
     }
 }
 
-/// What stands between two markers of the scan.
+/// The bytes between two markers of the scan.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 struct Part {
     from: usize,
@@ -369,7 +375,7 @@ impl Part {
         parts
     }
 
-    /// Its bytes without the zeros after each 255.
+    /// Its bytes without the stuffed zeros after each 255.
     fn unstuffed<'a>(&self, bytes: &[u8], scratch: &'a mut Vec<u8>) -> &'a [u8] {
         scratch.clear();
         let mut rest = &bytes[self.from..self.to];

@@ -1,4 +1,4 @@
-//! Damaged pictures: what is shown is what the camera took, or it is not shown.
+//! Damaged pictures: every pixel that is shown is as the camera took it.
 
 use std::collections::HashSet;
 
@@ -13,7 +13,7 @@ use windhover_base::time::MonoTime;
 /// Blocks across and down of the pictures here.
 const BLOCKS: (usize, usize) = (20, 12);
 
-/// A grey picture of random blocks; where its scan begins, and where each of its parts does.
+/// A grey picture of random blocks; the start of its scan and of each of its parts.
 struct Picture {
     bytes: Vec<u8>,
     scan: usize,
@@ -21,7 +21,7 @@ struct Picture {
 }
 
 impl Picture {
-    /// With a restart after so many blocks (0: none), with Huffman tables or without.
+    /// With a restart after this many blocks (0: none), with Huffman tables or without.
     fn new(seed: u64, restart: usize, with_tables: bool) -> Self {
         let (width, height) = ((BLOCKS.0 * 8) as u8, (BLOCKS.1 * 8) as u8);
         let mut bytes = vec![0xFF, 0xD8, 0xFF, 0xDB, 0, 67, 0];
@@ -68,7 +68,7 @@ fn random_blocks(count: usize, rng: &mut ChaCha8Rng, out: &mut Vec<u8>) {
     writer.finish();
 }
 
-/// A code of the value's size with what else it tells, and the value's bits.
+/// A code for the value's size together with `told`, and the value's bits.
 fn write_value(writer: &mut Writer<'_>, told: u8, value: i32, code: impl Fn(u8) -> Option<(u32, u32)>) {
     let size = 32 - value.unsigned_abs().leading_zeros();
     writer.write(code(told | size as u8).expect("in the standard's table"));
@@ -91,7 +91,7 @@ fn shown(bytes: &[u8]) -> Result<(GrayImage, Vec<MissingPart>), String> {
     decode(&frame, false).map(|frame| (frame.gray, frame.missing)).map_err(|fault| fault.to_string())
 }
 
-/// Blocks that are missing, by their number; the others must be those of the picture as it was.
+/// Numbers of the missing blocks; the others must be those of the original picture.
 fn missing_blocks(
     shown: &(GrayImage, Vec<MissingPart>),
     whole: &GrayImage,
@@ -118,7 +118,7 @@ fn a_whole_picture_is_whole() {
         let picture = Picture::new(1, restart, true);
         let (image, missing) = shown(&picture.bytes).expect("whole");
         assert_eq!((image.width, image.height, missing), (BLOCKS.0 * 8, BLOCKS.1 * 8, Vec::new()));
-        // Zeros after the last block are some cameras' filling.
+        // Zeros after the last block are the padding of some cameras.
         let mut filled = picture.bytes.clone();
         let end = filled.len() - 2;
         filled.splice(end..end, [0; 5]);
@@ -158,7 +158,7 @@ fn with_restarts_what_is_whole_stands_where_it_belongs() {
         let restart = [4, 6, 10, 20][case % 4];
         let picture = Picture::new(case as u64, restart, true);
         let (whole, _) = shown(&picture.bytes).expect("whole");
-        // Lost: bytes within a part, a part with its marker, or several.
+        // Lost: bytes within a part, a part with its marker, or several parts.
         let length = [17, 60, 188, 900][rng.random_range(0..4)].min(picture.bytes.len() - picture.scan - 2);
         let at = rng.random_range(picture.scan..picture.bytes.len() - 1 - length);
         let hit = picture.parts.iter().filter(|part| **part < at + length).count()
@@ -169,7 +169,7 @@ fn with_restarts_what_is_whole_stands_where_it_belongs() {
             Ok(seen) => {
                 let missing =
                     missing_blocks(&seen, &whole).unwrap_or_else(|why| panic!("case {case}: {why}"));
-                // Mostly the parts hit, and one more where a cut ends a part that another began.
+                // Usually the affected parts, and one more where a cut ends a part that another began.
                 close += usize::from(missing.len() <= (hit + 2) * restart);
                 used += 1;
             }
@@ -189,11 +189,12 @@ fn a_lost_interval_is_known_by_the_numbers() {
             cut.drain(picture.parts[lost]..picture.parts[lost + count]);
             let seen = shown(&cut);
             if count == 8 {
-                assert!(seen.is_err(), "eight leave no trace but their number");
+                assert!(seen.is_err(), "eight are only visible in the total number");
                 continue;
             }
-            let missing = missing_blocks(&seen.expect("most is there"), &whole).expect("in its place");
-            // And the one that stands alone between their numbers: it may be the first or the last.
+            let missing =
+                missing_blocks(&seen.expect("most of it is present"), &whole).expect("in its place");
+            // And the single interval between their numbers: it may be the first or the last.
             assert_eq!(missing.len(), 10 * (count + 1), "{count} from {lost}");
         }
     }

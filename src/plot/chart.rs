@@ -64,13 +64,13 @@ impl Chart {
         self
     }
 
-    /// Makes the vertical range that of these values, whatever else is drawn.
+    /// Sets the vertical range to that of these values, whatever else is drawn.
     pub fn y_range_of(self, values: impl Iterator<Item = f64>) -> Self {
         let (low, high) = range(values, 0.15);
         self.y_range(low, high)
     }
 
-    /// The same scale on both axes, as maps have.
+    /// The same scale on both axes, as in maps.
     pub fn equal(mut self) -> Self {
         self.equal = true;
         self
@@ -235,7 +235,7 @@ mod tests {
     fn marks_land_where_the_axes_say() {
         let mut chart = Chart::new("", 170.0, 148.0).x_range(0.0, 10.0).y_range(0.0, 1.0);
         chart.mark(Mark::Line(vec![[0.0, 0.0], [f64::NAN, 0.0], [10.0, 1.0]]), Ink::Blue);
-        // Plot area: x from 56 to 156, y from 108 (bottom) to 8 (top); the gap lifts the pen.
+        // Plot area: x from 56 to 156, y from 108 (bottom) to 8 (top); a gap interrupts the line.
         assert!(chart.render().contains("d=\"M56.0 108.0M156.0 8.0\""), "{}", chart.render());
     }
 

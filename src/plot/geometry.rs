@@ -1,9 +1,9 @@
-//! Points of curves: covariance ellipses, and lines thinned to what a picture can show.
+//! Points of curves: covariance ellipses, and lines thinned to a chart's resolution.
 
 use nalgebra::Matrix2;
 
-/// The outline of the ellipse `{x : (x − c)ᵀ C⁻¹ (x − c) = scale²}`, closed, 73 points; empty where
-/// the covariance is not one.
+/// The outline of the ellipse `{x : (x − c)ᵀ C⁻¹ (x − c) = scale²}`, closed, 73 points; empty where the covariance is
+/// not valid.
 pub fn ellipse(center: [f64; 2], covariance: &Matrix2<f64>, scale: f64) -> Vec<[f64; 2]> {
     if !covariance.iter().all(|x| x.is_finite()) {
         return Vec::new();
@@ -23,8 +23,8 @@ pub fn ellipse(center: [f64; 2], covariance: &Matrix2<f64>, scale: f64) -> Vec<[
         .collect()
 }
 
-/// At most about `limit` points of a curve: of each run of neighbours the first, the lowest and the
-/// highest are kept, so that spikes survive. A not-a-number point breaks the curve and is kept.
+/// At most about `limit` points of a curve: of each group of neighbours the first, the lowest and the highest are kept,
+/// so that spikes survive. A NaN point breaks the curve and is kept.
 pub fn thin(points: &[[f64; 2]], limit: usize) -> Vec<[f64; 2]> {
     if points.len() <= limit.max(4) {
         return points.to_vec();

@@ -1,6 +1,6 @@
-//! Inks of a chart, by class.
+//! Colours of a chart, by class.
 
-/// What a mark is drawn with.
+/// The colour of a mark.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Ink {
     /// First series.
@@ -11,9 +11,9 @@ pub enum Ink {
     Green,
     /// Fourth series.
     Violet,
-    /// What went wrong.
+    /// Failures.
     Red,
-    /// What is beside the point.
+    /// Secondary data.
     Grey,
     /// Truth.
     Black,

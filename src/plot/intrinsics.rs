@@ -1,4 +1,4 @@
-//! Pictures of a calibration: residuals, error per image, and where images are missing.
+//! Charts of a calibration: residuals, error of each image, and areas without corners.
 
 use nalgebra::Vector2;
 
@@ -9,7 +9,7 @@ use super::{Chart, Ink, Mark};
 
 /// Cells of the coverage map, across and down.
 const CELLS: (usize, usize) = (8, 6);
-/// Tilts of the board below this tell little about the focal length, radians.
+/// Tilts of the board below this hardly determine the focal length, radians.
 const LITTLE_TILT: f64 = 0.26;
 
 fn size_of(size: (usize, usize)) -> (f64, f64) {
@@ -27,7 +27,7 @@ fn image_chart(title: String, size: (usize, usize)) -> Chart {
         .y_down()
 }
 
-/// Residuals as arrows over the image, drawn longer by a round factor that the title tells.
+/// Residuals as arrows over the image, enlarged by a round factor that is in the title.
 pub fn residuals_svg(result: &Intrinsics, views: &[PlaneView], size: (usize, usize)) -> String {
     let factor = (0.03 * size_of(size).0 / result.rms_px.max(1e-6)).log2().floor().exp2().max(1.0);
     let title = format!("Residuals, {factor:.0} times as long, rms {:.3} px", result.rms_px);
@@ -44,8 +44,8 @@ pub fn residuals_svg(result: &Intrinsics, views: &[PlaneView], size: (usize, usi
 /// Error of each image as a bar.
 pub fn per_view_svg(result: &Intrinsics, names: &[&str]) -> String {
     let n = result.views.len();
-    let mut chart = Chart::new("Error per image", 760.0, 320.0)
-        .labels("image, in the order given", "rms (px)")
+    let mut chart = Chart::new("Error of each image", 760.0, 320.0)
+        .labels("image, in the given order", "rms (px)")
         .x_range(0.3, n as f64 + 0.7);
     let bars = result.views.iter().enumerate().map(|(k, v)| [k as f64 + 1.0, v.rms_px]).collect();
     chart.mark(Mark::Bars(bars, 0.7), Ink::Blue);
@@ -65,7 +65,7 @@ pub fn per_view_svg(result: &Intrinsics, names: &[&str]) -> String {
     chart.render()
 }
 
-/// Every corner seen, and how many fell into each cell of the image.
+/// Every detected corner, and the number of corners in each cell of the image.
 pub fn coverage_svg(views: &[PlaneView], size: (usize, usize)) -> String {
     let counts = coverage(views, size);
     let missing = counts.iter().filter(|c| **c == 0).count();
@@ -98,7 +98,7 @@ fn coverage(views: &[PlaneView], size: (usize, usize)) -> Vec<usize> {
     counts
 }
 
-/// What further photographs would help, in words; nothing where the set is good.
+/// Advice on further photographs, as text; empty where the set is good.
 pub fn coverage_advice(result: &Intrinsics, views: &[PlaneView], size: (usize, usize)) -> Vec<String> {
     let mut advice = Vec::new();
     let counts = coverage(views, size);
@@ -120,7 +120,7 @@ pub fn coverage_advice(result: &Intrinsics, views: &[PlaneView], size: (usize, u
     }
     if !missing.is_empty() {
         advice.push(format!(
-            "Hardly a corner lies along the {}: distortion there is extrapolated. Take photographs with the board there.",
+            "There are few corners along the {}: distortion there is extrapolated. Take photographs with the board there.",
             missing.join(", ")
         ));
     }
@@ -129,7 +129,7 @@ pub fn coverage_advice(result: &Intrinsics, views: &[PlaneView], size: (usize, u
     let tilted = tilted.count();
     if tilted < 5.min(result.views.len()) {
         advice.push(format!(
-            "The board is tilted by more than 15 degrees in {tilted} images only: tilt it more, to fix the focal length."
+            "The board is tilted by more than 15 degrees in {tilted} images only: tilt it more, to determine the focal length."
         ));
     }
     let median = {
@@ -146,7 +146,7 @@ pub fn coverage_advice(result: &Intrinsics, views: &[PlaneView], size: (usize, u
         .collect();
     if !bad.is_empty() {
         advice.push(format!(
-            "Fitting three times worse than most, image number {}: corners placed wrongly (try a smaller --window), blurred, or the board was bent. Leave it out or take it again.",
+            "Errors three times as large as in most images, image number {}: corners in wrong places (try a smaller --window), blur, or a bent board. Leave it out or take it again.",
             bad.join(", ")
         ));
     }

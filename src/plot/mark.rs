@@ -1,4 +1,4 @@
-//! What is drawn in a chart.
+//! The marks of a chart.
 
 use std::fmt::Write as _;
 
@@ -6,7 +6,7 @@ use super::Scale;
 use super::ink::Ink;
 use crate::text::xml;
 
-/// Something drawn in data coordinates. A not-a-number point breaks a line or band.
+/// A mark in data coordinates. A NaN point breaks a line or band.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Mark {
     /// A line through points (x, y).
@@ -21,7 +21,7 @@ pub enum Mark {
     Bars(Vec<[f64; 2]>, f64),
     /// Arrows from (x, y) by (dx, dy).
     Arrows(Vec<[f64; 4]>),
-    /// Words at (x, y).
+    /// Text at (x, y).
     Text([f64; 2], String),
 }
 
@@ -66,7 +66,7 @@ pub(super) fn draw_mark(out: &mut String, mark: &Mark, ink: Ink, x: &Scale, y: &
             }
         }
         Mark::Dots(points, radius) => {
-            // One path of round zero-length strokes is far smaller than as many circles.
+            // One path of round zero-length strokes is much smaller than as many circles.
             let mut d = String::new();
             for p in points.iter().filter(|p| p[0].is_finite() && p[1].is_finite()) {
                 let _ = write!(d, "M{:.1} {:.1}h0", x.at(p[0]), y.at(p[1]));
@@ -122,7 +122,7 @@ fn draw_arrows(out: &mut String, arrows: &[[f64; 4]], class: &str, x: &Scale, y:
     let _ = write!(out, "<path class=\"{class} line thin\" d=\"{d}\"/>");
 }
 
-/// Path data of a polyline; a not-a-number point lifts the pen.
+/// Path data of a polyline; a NaN point interrupts it.
 fn path(points: &[[f64; 2]], x: &Scale, y: &Scale) -> String {
     let mut d = String::with_capacity(points.len() * 12);
     let mut pen_down = false;

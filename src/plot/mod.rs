@@ -1,7 +1,7 @@
 //! Drawings as SVG text: charts of data, equal-scale maps, images of error. Values in, strings out.
 //!
-//! A chart names its inks by class, never by colour: [`standalone`] adds a style sheet that follows
-//! the reader's light or dark setting, and a page that embeds charts brings the same sheet once.
+//! A chart names its colours by class: [`standalone`] adds a style sheet that follows the reader's light or dark
+//! setting, and a page that embeds charts contains the same sheet once.
 
 mod chart;
 mod geometry;

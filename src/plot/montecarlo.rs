@@ -1,4 +1,4 @@
-//! The picture of a Monte Carlo analysis: scatter, circles, covariance ellipse, a flight beside it.
+//! The chart of a Monte Carlo analysis: scatter, circles, covariance ellipse, and the errors of a flight.
 
 use nalgebra::Matrix2;
 
@@ -6,12 +6,12 @@ use windhover_calibrate::montecarlo::{Analysis, radii};
 
 use super::{Chart, Ink, Mark, ellipse};
 
-/// Most dots drawn of one cloud; more would only blacken the picture.
+/// Most dots of one cloud; more would only blacken the chart.
 const MOST_DOTS: usize = 3_000;
 /// Mahalanobis distance that holds 95 % of a Gaussian in the plane: √(−2 ln 0.05).
 const SCALE_95: f64 = 2.447_746_8;
 
-/// Errors of a flight over a surveyed marker, to be laid over the simulation.
+/// Errors of a flight over a surveyed marker, drawn over the simulation.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Overlay {
     /// Name in the legend.
@@ -20,9 +20,8 @@ pub struct Overlay {
     pub errors_m: Vec<[f64; 2]>,
 }
 
-/// The scatter of errors as an SVG element, east to the right and north up: samples, the circles
-/// that hold 50 % and 95 % of them, the 95 % ellipse of the closed form, and a flight's errors with
-/// their own 95 % circle.
+/// The scatter of errors as an SVG element, east to the right and north up: samples, the circles that contain 50 % and
+/// 95 % of them, the 95 % ellipse of the closed form, and a flight's errors with their own 95 % circle.
 pub fn scatter_svg(analysis: &Analysis, title: &str, overlay: Option<&Overlay>) -> String {
     let mut chart = Chart::new(title, 720.0, 700.0).labels("error east (m)", "error north (m)").equal();
     let reach = 1.05 * analysis.r95_m.max(overlay.map_or(0.0, |o| radii(&o.errors_m).1)) * 1.25;

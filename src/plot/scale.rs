@@ -1,4 +1,4 @@
-//! From data to picture along one axis, and round numbers to mark on it.
+//! The scale of one axis from data to picture, and its round tick values.
 
 /// A linear scale: data `low..high` to picture coordinates `from..to`.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -13,7 +13,7 @@ pub struct Scale {
     pub to: f64,
 }
 
-/// Fewer values than this on an axis are hard to read between.
+/// With fewer ticks on an axis, values between them are hard to read.
 const LEAST_TICKS: f64 = 3.0;
 
 impl Scale {
@@ -22,8 +22,8 @@ impl Scale {
         self.from + (value - self.low) / (self.high - self.low) * (self.to - self.from)
     }
 
-    /// Round values (1, 2 or 5 times a power of ten apart) inside the scale, about `wanted` of them and
-    /// never so few that they tell no scale.
+    /// Round values (1, 2 or 5 times a power of ten apart) inside the scale, about `wanted` of them and at least enough
+    /// to show the scale.
     pub fn ticks(&self, wanted: usize) -> Vec<f64> {
         let raw = (self.high - self.low) / wanted.max(1) as f64;
         let inside = |step: f64| (self.high / step).floor() - (self.low / step).ceil() + 1.0;
@@ -37,7 +37,7 @@ impl Scale {
         (first..=last).take(100).map(|k| k as f64 * step).collect()
     }
 
-    /// A tick's figure, with just the decimals its neighbours need.
+    /// A tick's number, with just the decimals that distinguish it from its neighbours.
     pub fn label(value: f64, step: f64) -> String {
         let decimals = (-(step.abs().max(1e-12)).log10().floor()).clamp(0.0, 9.0) as usize;
         // Adding zero turns minus zero into zero.

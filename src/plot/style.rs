@@ -1,6 +1,6 @@
-//! The style sheet of charts, light and dark, and what makes a chart a file of its own.
+//! The style sheet of charts, light and dark, and the frame that makes a chart a file.
 
-/// Colours by name, for light, dark and paper. Each ink keeps a contrast of at least 3:1 on its ground.
+/// Colours by name, for light, dark and paper. Each has a contrast of at least 3:1 on its background.
 pub const PALETTE_CSS: &str = "\
 :root{--ground:#ffffff;--panel:#f6f7f9;--text:#1b1f24;--soft:#5b6570;--rule:#d5dae0;--grid:#e8ebef;\
 --blue:#1f6feb;--orange:#c4570a;--green:#1a7f4b;--violet:#8745c7;--red:#cf222e;--grey:#7a838d}\
@@ -25,10 +25,10 @@ pub const CHART_CSS: &str = "\
 .chart .violet{color:var(--violet)}.chart .red{color:var(--red)}.chart .grey{color:var(--grey)}\
 .chart .black{color:var(--text)}";
 
-/// What every file of ours with a drawing, a map or a page in it says near its begin.
+/// The mark near the start of every file of ours with a drawing, a map or a page.
 pub const MADE_BY: &str = "made by windhover";
 
-/// A chart as an SVG file: with its style sheet and the ground painted.
+/// A chart as an SVG file: with its style sheet and a painted background.
 pub fn standalone(chart: &str) -> String {
     let style = format!(
         "<style>{PALETTE_CSS}{CHART_CSS}</style><rect width=\"100%\" height=\"100%\" fill=\"var(--ground)\"/>"

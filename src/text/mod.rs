@@ -1,5 +1,5 @@
-//! Text and figures of others at the borders of the program: each border has one helper, and everything that came from a
-//! file, a peer or a device goes through it.
+//! Foreign text and numbers at the borders of the program: each border has one helper, which everything from a file, a
+//! peer or a device passes.
 //!
 //! | border | helper |
 //! |---|---|
@@ -7,21 +7,21 @@
 //! | several lines on a terminal | [`printable`] |
 //! | KML, HTML, SVG | [`xml`] |
 //! | CSV | [`csv_field`], [`csv_figure`] |
-//! | JSON, GeoJSON | `serde_json` for text, [`finite`] for figures |
-//! | figures that people or files give | [`number`] |
+//! | JSON, GeoJSON | `serde_json` for text, [`finite`] for numbers |
+//! | numbers from people or files | [`number`] |
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
 
-/// Characters that a terminal takes for something else than text: control characters, and those that change the
-/// direction of what follows or break a line unseen (Unicode, annex 9 and 14).
+/// Characters that a terminal does not show as text: control characters, and those that change the direction of the
+/// following text or break a line invisibly (Unicode, annex 9 and 14).
 fn is_steering(c: char) -> bool {
     c.is_control()
         || matches!(c, '\u{61c}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2060}'..='\u{206f}'
             | '\u{feff}' | '\u{fff9}'..='\u{fffb}')
 }
 
-/// Writes a character that steers as what it is: `\n`, `\u{1b}`.
+/// Writes such a character in its escaped form: `\n`, `\u{1b}`.
 pub fn put_shown(out: &mut String, c: char) {
     match c {
         c if is_steering(c) => out.extend(c.escape_default()),
@@ -40,22 +40,22 @@ fn shown(text: &str, stays: impl Fn(char) -> bool) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// Whether the text can stand in a line as it is.
+/// Whether the text can be in a line unchanged.
 pub fn is_one_line(text: &str) -> bool {
     !text.chars().any(is_steering)
 }
 
-/// One line for a terminal or a log: whatever would move the cursor, colour, turn or break the line is written out.
+/// One line for a terminal or a log: characters that move the cursor, or change colour, direction or line, are escaped.
 pub fn one_line(text: &str) -> Cow<'_, str> {
     shown(text, |_| false)
 }
 
-/// Lines for a terminal: as [`one_line`], with line ends and tabs.
+/// Lines for a terminal: as [`one_line`], but line ends and tabs are kept.
 pub fn printable(text: &str) -> Cow<'_, str> {
     shown(text, |c| matches!(c, '\n' | '\t'))
 }
 
-/// The words of the system without its number: `No such file or directory`, not `… (os error 2)`.
+/// The system's message without its number: `No such file or directory`, not `… (os error 2)`.
 pub fn without_numbers(words: &str) -> Cow<'_, str> {
     const BEGIN: &str = " (os error ";
     let mut words = Cow::Borrowed(words);
@@ -70,7 +70,7 @@ pub fn without_numbers(words: &str) -> Cow<'_, str> {
     words
 }
 
-/// Text inside XML and HTML, in elements and in quoted attributes alike. Characters that XML cannot hold are left out.
+/// Text inside XML and HTML, in elements and in quoted attributes. Characters that are not allowed in XML are left out.
 pub fn xml(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
@@ -88,8 +88,8 @@ pub fn xml(text: &str) -> String {
     out
 }
 
-/// A field of text in a table (RFC 4180): quoted where it holds a comma, a quote or a line end. What a spreadsheet would
-/// take for a formula gets an apostrophe before it, which spreadsheets show as text.
+/// A text field of a table (RFC 4180): quoted where it has a comma, a quote or a line end. A text that a spreadsheet
+/// would take for a formula gets an apostrophe before it, which spreadsheets show as text.
 pub fn csv_field(text: &str) -> Cow<'_, str> {
     let formula =
         text.starts_with(['=', '+', '-', '@', '\t', '\r', '\u{ff1d}', '\u{ff0b}', '\u{ff0d}', '\u{ff20}']);
@@ -111,7 +111,7 @@ pub fn csv_field(text: &str) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// Appends a comma and a figure to a row of a table; where it is none (not a number, infinite), the field stays empty.
+/// Appends a comma and a number to a row of a table; the field stays empty where the number is not finite.
 pub fn csv_figure(row: &mut String, figure: f64, decimals: usize) {
     row.push(',');
     if figure.is_finite() {
@@ -120,21 +120,21 @@ pub fn csv_figure(row: &mut String, figure: f64, decimals: usize) {
     }
 }
 
-/// The figure, if it is one: neither infinite nor "not a number".
+/// The number, if it is finite.
 pub fn finite(figure: f64) -> Option<f64> {
     figure.is_finite().then_some(figure)
 }
 
-/// A figure that a person or a file gives; `nan`, `inf` and words are none.
+/// A number from a person or a file; `nan`, `inf` and words are refused.
 ///
 /// # Errors
-/// What is wrong, in words.
+/// What is wrong, as text.
 pub fn number(text: &str) -> Result<f64, String> {
     let figure = text.trim().parse().ok().and_then(finite);
     figure.ok_or_else(|| format!("{:?} is not a number", text.trim()))
 }
 
-/// `1 thing`, `2 things`: a count of what has a regular plural.
+/// `1 thing`, `2 things`: a count with a noun whose plural is regular.
 pub fn counted(count: usize, what: &str) -> String {
     if count == 1 { format!("1 {what}") } else { format!("{count} {what}s") }
 }
@@ -150,7 +150,7 @@ mod tests {
         assert_eq!(one_line("line\nlevel=info\r\u{9b}31m"), r"line\nlevel=info\r\u{9b}31m");
         assert_eq!(one_line("a\u{202e}b\u{2028}c"), r"a\u{202e}b\u{2028}c");
         assert_eq!(printable("a\tb\nc\u{1b}"), "a\tb\nc\\u{1b}");
-        assert!(is_one_line("as it is") && !is_one_line("two\nlines"));
+        assert!(is_one_line("unchanged") && !is_one_line("two\nlines"));
     }
 
     #[test]

@@ -148,7 +148,7 @@ class Imports(unittest.TestCase):
         path.write_bytes(whole[: len(whole) * 2 // 3])
         self.assertTrue(len(self.capture("--log", path)[0]) > 30)
         path.write_bytes(whole[:500])
-        self.assertIn("tells nothing that can be used", self.refused("--log", path))
+        self.assertIn("has nothing usable", self.refused("--log", path))
 
     def test_dataflash(self):
         path = self.at / "flight.bin"
@@ -210,7 +210,7 @@ class Imports(unittest.TestCase):
         packets, _, made_of = self.capture("--log", path)
         self.assertEqual(b"".join(bytes(packet.get_msgbuf()) for _, packet in packets), kept)
         self.assertEqual(packets[0][0], UTC * 10**9)
-        self.assertEqual(made_of, "", "the very bytes")
+        self.assertEqual(made_of, "", "the original bytes")
 
     def bag_messages(self, store):
         """Topic, type, time, message: forward, left, up in east, north, up."""
@@ -367,10 +367,10 @@ class Imports(unittest.TestCase):
             self.assertAlmostEqual((t - UTC * 10**9) / 1e9, at, delta=1e-3)
             np.testing.assert_allclose([fix.lat * 1e-7, fix.lon * 1e-7, fix.alt * 1e-3], [lat, lon, alt], atol=1e-6)
         path.write_text("nothing of the kind\n")
-        self.assertIn("is none of the logs that are read", self.refused("--log", path))
-        self.assertIn("is no bag", self.refused("--bag", path))
+        self.assertIn("is none of the supported logs", self.refused("--log", path))
+        self.assertIn("is not a bag", self.refused("--bag", path))
         (self.at / "empty").mkdir()
-        self.assertIn("holds no .mcap and no .db3", self.refused("--bag", self.at / "empty"))
+        self.assertIn("has no .mcap and no .db3", self.refused("--bag", self.at / "empty"))
 
 
 if __name__ == "__main__":

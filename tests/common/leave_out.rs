@@ -1,11 +1,11 @@
-//! A test that cannot be done on this machine says so, and the checks say it again at their end.
+//! A test that cannot run on this machine reports that, and the checks list it at their end.
 
 use std::io::Write;
 
-/// What `.ci/run` shows at its end.
+/// The list that `.ci/run` shows at its end.
 const LEFT_OUT: &str = concat!(env!("CARGO_TARGET_TMPDIR"), "/skipped");
 
-/// Says that a test is left out, and why.
+/// Reports that a test is left out, and why.
 pub fn leave_out(test: &str, why: &str) {
     println!("SKIPPED {test}: {why}");
     let file = std::fs::OpenOptions::new().create(true).append(true).open(LEFT_OUT);

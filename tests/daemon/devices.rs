@@ -1,4 +1,4 @@
-//! Devices that answer, are held by others, or have nothing to say: the real binary over pseudo-terminals.
+//! Devices that answer, are in use, or send nothing: the real binary over pseudo-terminals.
 
 use std::time::Duration;
 
@@ -6,7 +6,7 @@ use super::harness::{Bench, Feeder, Garmin};
 
 #[test]
 fn a_receiver_is_configured_and_its_answers_are_checked() {
-    // Given a receiver that echoes what it is told, as a GPS 18x does.
+    // Given a receiver that echoes its settings, as a GPS 18x does.
     let bench = Bench::new();
     bench.configure(|text| {
         text.replace("baud = 38400\n\n[compass]", "baud = 38400\nconfigure_garmin = true\n\n[compass]")
@@ -21,7 +21,7 @@ fn a_receiver_is_configured_and_its_answers_are_checked() {
     assert!(line.contains("7 settings accepted"), "{line}");
     let (_, seen) = daemon.wait_from(seen, &["event=health", "fix=3d"]);
 
-    // When another receiver is plugged in that keeps averaging positions, then that is told.
+    // When another receiver is plugged in that keeps averaging positions, then that is reported.
     let (mut gps, compass) = feeder.stop();
     drop(receiver);
     gps.unplug();
@@ -32,8 +32,8 @@ fn a_receiver_is_configured_and_its_answers_are_checked() {
     let (line, seen) = daemon.wait_from(seen, &["event=receiver_not_configured", "about=gps"]);
     assert!(line.contains("PGRMC1") && line.contains("other values"), "{line}");
 
-    // When one is plugged in that does not answer, then that is told too, moments after the last time, and what it
-    // sends is used.
+    // When one is plugged in that does not answer, then that is reported too, moments after the last time, and its data
+    // are used.
     drop(receiver);
     gps.unplug();
     let (_, seen) = daemon.wait_from(seen, &["event=device_down", "about=gps", "fault=unplugged"]);
@@ -53,7 +53,7 @@ fn a_port_that_another_program_holds_is_taken_when_it_is_free() {
     let held = serialport::TTYPort::open(&serialport::new(path, 38_400)).expect("opened");
     let daemon = bench.start();
     let (line, _) = daemon.wait(&["event=device_down", "about=gps", "fault=busy"]);
-    assert!(line.contains("another program holds"), "{line}");
+    assert!(line.contains("another program uses it"), "{line}");
     daemon.wait(&["event=not_ready", "gps"]);
     drop(held);
     let feeder = Feeder::start(gps, compass);
@@ -64,7 +64,7 @@ fn a_port_that_another_program_holds_is_taken_when_it_is_free() {
 
 #[test]
 fn a_receiver_without_a_fix_is_heard_and_not_used() {
-    // Given a receiver under a roof, then its sentences are counted and no fix is told.
+    // Given a receiver under a roof, then its sentences are counted and no fix is reported.
     let bench = Bench::new();
     let (gps, compass) = bench.lines();
     let daemon = bench.start();
@@ -76,7 +76,7 @@ fn a_receiver_without_a_fix_is_heard_and_not_used() {
     let (line, seen) = daemon.wait_from(seen, &["event=health", "fix=none"]);
     assert!(!line.contains("gps_hz=0.0"), "{line}");
 
-    // When it sees the sky and then loses it, then both are told.
+    // When it sees satellites and then loses them, then both are reported.
     feeder.sky(true);
     let (_, seen) = daemon.wait_from(seen, &["event=health", "fix=3d"]);
     feeder.sky(false);
@@ -93,7 +93,7 @@ fn a_compass_that_falls_silent_is_told_and_heard_again() {
     let feeder = Feeder::start(gps, compass);
     let (_, seen) = daemon.wait(&["event=ready"]);
 
-    // When nothing more comes on its line, which stays open, then that is told.
+    // When nothing more arrives on its line, which stays open, then that is reported.
     let (gps, compass) = feeder.stop();
     let (_, seen) = daemon.wait_from(seen, &["event=source_silent", "about=compass"]);
     let (line, seen) = daemon.wait_from(seen, &["event=health", "compass_hz=0.0"]);

@@ -19,11 +19,10 @@ use windhover::io::clock::HostClock;
 use windhover_base::msg::{Event, EventBody};
 use windhover_base::time::Span;
 
-/// Longest a test waits for anything: what a machine with all its processors taken needs many times over.
-/// Nothing is asserted of how long things take.
+/// Longest wait of a test: many times what a machine with all processors busy needs. No test asserts durations.
 const PATIENCE: Span = Span::from_ns(120_000_000_000);
 
-/// A serial line by a stable name: its near end is a link that can be taken away and put back.
+/// A serial line by a stable name: its near end is a link that can be removed and replaced.
 pub struct Line {
     link: PathBuf,
     far: Option<File>,
@@ -48,12 +47,12 @@ impl Line {
         self.far = Some(File::from(far));
     }
 
-    /// The far end once more, for a device that listens too.
+    /// Another handle on the far end, for a device that also receives.
     pub fn far_end(&self) -> File {
         self.far.as_ref().expect("plugged").try_clone().expect("a second handle")
     }
 
-    /// Takes the line away.
+    /// Removes the line.
     pub fn unplug(&mut self) {
         let _ = std::fs::remove_file(&self.link);
         self.far = None;
@@ -110,7 +109,7 @@ impl Feeder {
         self.sky.store(open, Ordering::Release);
     }
 
-    /// Ends feeding and gives the lines back.
+    /// Ends feeding and returns the lines.
     pub fn stop(mut self) -> (Line, Line) {
         self.stop.store(true, Ordering::Release);
         self.thread.take().expect("running").join().expect("fed")
@@ -131,8 +130,7 @@ fn epoch(n: u32, alt_msl_m: Option<f64>) -> String {
     sentence(&rmc) + &sentence(&gga)
 }
 
-/// A Garmin receiver that listens on its line and answers each `$PGRM…` sentence. Lets go of the line when
-/// dropped.
+/// A Garmin receiver that answers each `$PGRM…` sentence on its line. Releases the line when dropped.
 pub struct Garmin {
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -151,7 +149,7 @@ impl Garmin {
                 if !poll(&mut ready, Some(&wait)).is_ok_and(|count| count > 0) {
                     continue;
                 }
-                // Nobody has the near end open: as quiet as no bytes.
+                // The near end is not open: the same as no bytes.
                 let Ok(count) = line.read(&mut buffer) else {
                     std::thread::sleep(Duration::from_millis(50));
                     continue;
@@ -159,7 +157,7 @@ impl Garmin {
                 heard.push_str(&String::from_utf8_lossy(&buffer[..count]));
                 while let Some((one, rest)) = heard.split_once("\r\n") {
                     let body = one.strip_prefix('$').and_then(|one| one.split_once('*'));
-                    // A sentence with a wrong checksum is not heard.
+                    // A sentence with a wrong checksum is ignored.
                     let body =
                         body.filter(|(body, _)| sentence(body).trim_end() == one).map(|(body, _)| body);
                     if let Some(answer) = body.and_then(&answer) {
@@ -190,7 +188,7 @@ pub fn frames(recording: &Path) -> Vec<u32> {
     events.filter_map(number).collect()
 }
 
-/// A flight computer's worth of files: configuration, lines, card, recorded camera.
+/// The files of a flight computer: configuration, lines, card, recorded camera.
 pub struct Bench {
     pub folder: TempDir,
 }
@@ -228,7 +226,7 @@ impl Bench {
         std::fs::write(folder.join("times.csv"), list).expect("written");
     }
 
-    /// Makes every frame this picture, a grey level for each column and row.
+    /// Sets the picture of every frame, a grey level for each column and row.
     pub fn draw(&self, level: impl Fn(usize, usize) -> u8) {
         let pixels: Vec<u8> = (0..320 * 256).map(|i| level(i % 320, i / 320)).collect();
         let picture = [b"P5\n320 256\n255\n".as_slice(), &pixels].concat();
@@ -253,7 +251,7 @@ impl Bench {
         flights.get(number).map_or_else(Vec::new, |flight| frames(flight))
     }
 
-    /// Runs another command of the program to its end; what it wrote to standard output.
+    /// Runs another command of the program to its end; returns its standard output.
     pub fn command(&self, args: &[&str]) -> String {
         let output = Command::new(env!("CARGO_BIN_EXE_windhover"))
             .args(args)
@@ -288,7 +286,7 @@ impl Daemon {
         Self::start_with(config, Stdio::from(file), log, manager)
     }
 
-    /// With another standard error than the log that is waited for.
+    /// With a standard error other than the log that the test reads.
     pub fn start_with(config: &Path, stderr: Stdio, log: &Path, manager: Option<&Path>) -> Self {
         let child = Command::new(env!("CARGO_BIN_EXE_windhover"))
             .args(["run", "--config"])
@@ -311,8 +309,7 @@ impl Daemon {
         std::fs::read_to_string(&self.log).unwrap_or_default()
     }
 
-    /// The first line after `skip` lines that holds all of `words`, and how many lines came before
-    /// the one after it.
+    /// The first line after `skip` lines that contains all of `words`, and the number of lines up to and including it.
     pub fn wait_from(&self, skip: usize, words: &[&str]) -> (String, usize) {
         let limit = self.clock.now() + PATIENCE;
         loop {
@@ -330,7 +327,7 @@ impl Daemon {
         self.wait_from(0, words)
     }
 
-    /// Waits until `done` says so.
+    /// Waits until `done` returns true.
     pub fn wait_until(&self, what: &str, mut done: impl FnMut() -> bool) {
         let limit = self.clock.now() + PATIENCE;
         while !done() {
@@ -358,7 +355,7 @@ impl Daemon {
         self.child.wait().expect("a child");
     }
 
-    /// Waits for the end; how it ended.
+    /// Waits for the end; returns its status.
     pub fn ended(mut self) -> ExitStatus {
         let limit = self.clock.now() + PATIENCE;
         loop {

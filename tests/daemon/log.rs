@@ -1,4 +1,4 @@
-//! A sink that takes nothing: a real pipe that is full and that nobody reads.
+//! A sink that accepts nothing: a real pipe that is full and has no reader.
 
 use std::io::{PipeReader, PipeWriter, Write, pipe};
 use std::process::{Command, Stdio};
@@ -22,14 +22,15 @@ fn full_pipe() -> (PipeReader, PipeWriter) {
 
 #[test]
 fn a_stuck_pipe_holds_up_neither_the_file_nor_the_end() {
-    // Given a daemon that logs into a pipe that nobody reads, and into a file.
+    // Given a daemon that logs into a pipe without a reader, and into a file.
     let bench = Bench::new();
     let file = bench.path("windhover.log");
     bench.configure(|text| format!("{text}\n[log]\nfile = {:?}\n", file.display().to_string()));
     let (reader, writer) = full_pipe();
     let daemon = Daemon::start_with(&bench.config(), Stdio::from(writer), &file, None);
 
-    // When it flies for a while and is asked to end, then it goes on, and ends, with everything in the file.
+    // When it has run for a while and is asked to stop, then it continues until then, and ends with all lines in the
+    // file.
     let (_, seen) = daemon.wait(&["event=health"]);
     daemon.wait_from(seen, &["event=health"]);
     daemon.signal(Signal::TERM);
@@ -40,7 +41,7 @@ fn a_stuck_pipe_holds_up_neither_the_file_nor_the_end() {
     assert!(lines.first().is_some_and(|line| line.contains("event=started")), "{text}");
     assert!(lines.last().is_some_and(|line| line.contains("event=stopped")), "{text}");
 
-    // Then it says what is missing in the pipe: all the lines that were for it.
+    // Then it reports what is missing in the pipe: all its lines.
     let lost = lines.iter().position(|line| line.contains("event=log_lines_lost about=stderr"));
     let lost = lost.or_else(|| lines.iter().position(|line| line.contains("event=log_lines_lost")));
     let at = lost.unwrap_or_else(|| panic!("nothing is said of the pipe:\n{text}"));
@@ -60,7 +61,7 @@ fn a_daemon_that_fails_ends_though_nobody_reads_its_last_words() {
 
 #[test]
 fn a_station_ends_though_its_terminal_is_stuck() {
-    // Given a station whose output nobody reads, with a payload that cannot be resolved to speak of.
+    // Given a station whose output has no reader, with a payload whose name does not resolve.
     let folder = tempfile::tempdir().expect("a folder");
     let windhover = || {
         let mut command = Command::new(env!("CARGO_BIN_EXE_windhover"));
@@ -81,7 +82,7 @@ fn a_station_ends_though_its_terminal_is_stuck() {
         .expect("started");
     let station = Daemon::of(station, &folder.path().join("none"));
 
-    // When it has come up and is asked to end, then it does.
+    // When it is up and is asked to stop, then it stops.
     station.wait_until("the folder of flights", || folder.path().join("ground").is_dir());
     std::thread::sleep(Duration::from_secs(3));
     station.signal(Signal::TERM);

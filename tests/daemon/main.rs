@@ -1,5 +1,5 @@
-//! The real binary over pseudo-terminals at the real pace, with a recorded camera: everything but the
-//! V4L2 call is what flies.
+//! The real binary over pseudo-terminals at the real pace, with a recorded camera: everything except the V4L2 call is
+//! as in flight.
 
 mod devices;
 mod harness;
@@ -21,7 +21,7 @@ fn from_start_to_ready_to_the_end() {
     let daemon = bench.start();
     let feeder = Feeder::start(gps, compass);
 
-    // When they deliver, then the daemon is ready, and tells how it does every second.
+    // When they deliver, then the daemon is ready, and sends its health every second.
     daemon.wait(&["event=ready"]);
     let (_, seen) = daemon.wait(&["event=health"]);
     let (line, _) = daemon.wait_from(seen, &["event=health", "fix=3d"]);
@@ -30,7 +30,7 @@ fn from_start_to_ready_to_the_end() {
         assert!(line.contains(field), "{field} in {line}");
     }
 
-    // When it is asked to end, then it does, and says so last.
+    // When it is asked to stop, then it stops, and its last event says so.
     daemon.signal(Signal::TERM);
     let log = bench.path("log");
     let status = daemon.ended();
@@ -50,17 +50,17 @@ fn devices_come_and_go() {
         daemon.wait(&["event=device_down", device, "fault=missing"]);
     }
 
-    // When they come, then it is ready.
+    // When they appear, then it is ready.
     let (gps, compass) = bench.lines();
     let feeder = Feeder::start(gps, compass);
     let (_, seen) = daemon.wait(&["event=ready"]);
 
-    // When the compass goes away, then that is told, and the daemon flies on.
+    // When the compass disappears, then that is reported, and the daemon continues.
     let (gps, mut compass) = feeder.stop();
     compass.unplug();
     let (_, seen) = daemon.wait_from(seen, &["event=device_down", "about=compass", "fault=unplugged"]);
 
-    // When it comes back under another number, with the GPS speaking rubbish, then both are used.
+    // When it returns under another number, and the GPS sends noise first, then both are used.
     let mut gps = gps;
     gps.send(&[0xff; 900]);
     compass.plug();
@@ -80,7 +80,7 @@ fn the_configuration_is_read_again() {
     daemon.wait(&["event=started"]);
     daemon.wait(&["event=device_up", "about=camera"]);
 
-    // When a level changes and a line speed too, then one takes effect and the other is told.
+    // When a level changes and a line speed too, then the former takes effect and the latter is reported.
     bench.configure(|text| format!("{}\n[log]\nlevel = \"error\"\n", text.replace("38400", "19200")));
     daemon.signal(Signal::HUP);
     daemon.wait(&["event=reloaded", "log.level"]);
@@ -89,12 +89,12 @@ fn the_configuration_is_read_again() {
     std::thread::sleep(Duration::from_millis(1_500));
     let lines = daemon.log().lines().count();
     std::thread::sleep(Duration::from_millis(1_500));
-    assert_eq!(daemon.log().lines().count(), lines, "nothing but errors is shown now");
+    assert_eq!(daemon.log().lines().count(), lines, "only errors are shown now");
 
     // When the file is broken, then the old configuration stays.
     bench.configure(|text| text.replace("baud = 38400", "baud = \"fast\""));
     daemon.signal(Signal::HUP);
-    daemon.wait(&["event=reload_refused", "the old one stays"]);
+    daemon.wait(&["event=reload_refused", "the previous configuration stays"]);
 }
 
 #[test]
@@ -150,9 +150,8 @@ fn what_was_recorded_survives_a_crash_and_replays_to_the_same() {
     assert_eq!(flights.len(), 2, "{flights:?}");
     assert!(frames(&flights[0]).len() >= 15, "{:?} before the crash", frames(&flights[0]));
 
-    // When the second flight is replayed, then the helicopter's own states are those that flew, frame by
-    // frame. A machine too busy to record a frame says so by a gap in the numbers: up to the first gap
-    // the tables are the same.
+    // When the second flight is replayed, then the helicopter's own states are those that flew, frame by frame. A frame
+    // that a busy machine did not record leaves a gap in the numbers: up to the first gap the tables are the same.
     let kept = frames(&flights[1]);
     let whole = kept.iter().zip(0..).take_while(|(frame, number)| *frame == number).count();
     let flight = flights[1].to_string_lossy().into_owned();

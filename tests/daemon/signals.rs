@@ -10,7 +10,7 @@ use rustix::process::Signal;
 
 use super::harness::{Bench, Daemon};
 
-/// A file that is as slow as whoever writes it: a reader waits until somebody does.
+/// A file that is as slow as its writer: a reader waits for a writer.
 fn slow_file(path: &Path) {
     let _ = std::fs::remove_file(path);
     mknodat(CWD, path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).expect("a fifo");
@@ -26,7 +26,7 @@ impl Manager {
         Self(socket)
     }
 
-    /// Waits for a message that holds this line.
+    /// Waits for a message that contains this line.
     fn wait(&self, line: &str) {
         let mut buffer = [0; 4096];
         loop {
@@ -44,13 +44,13 @@ impl Manager {
 
 #[test]
 fn signals_are_answered_before_the_configuration_is_read() {
-    // Given a configuration that takes for ever to read.
+    // Given a configuration whose reading never ends.
     let bench = Bench::new();
     slow_file(&bench.config());
     let daemon = bench.start();
     daemon.wait_until("signals are taken over", || daemon.catches(&[Signal::TERM, Signal::INT, Signal::HUP]));
 
-    // When it is asked to read it again and to end, then it goes on and ends.
+    // When it is asked to reload and to stop, then it continues and stops.
     daemon.signal(Signal::HUP);
     daemon.signal(Signal::TERM);
     assert_eq!(daemon.ended().code(), Some(0));
@@ -65,7 +65,7 @@ fn a_hang_up_before_the_configuration_is_read_ends_nothing() {
     // Opened as soon as the daemon reads it.
     let mut slow = std::fs::File::options().write(true).open(bench.config()).expect("opened");
     daemon.signal(Signal::HUP);
-    // What is read once more is there at once.
+    // The next read of the file returns at once.
     std::fs::remove_file(bench.config()).expect("removed");
     std::fs::write(bench.config(), &text).expect("written");
     slow.write_all(text.as_bytes()).expect("read");
@@ -84,7 +84,7 @@ fn the_watchdog_is_stroked_and_the_end_heard_while_slow_files_are_read() {
     let daemon = Daemon::start_under(&bench.config(), &bench.path("log"), Some(&bench.path("manager")));
     daemon.wait(&["event=device_up", "about=camera"]);
 
-    // When a configuration is read again that nobody writes, then every task answers all the same.
+    // When a reload reads a configuration without a writer, then every task still answers.
     slow_file(&bench.config());
     daemon.signal(Signal::HUP);
     manager.wait("RELOADING=1");
@@ -95,7 +95,7 @@ fn the_watchdog_is_stroked_and_the_end_heard_while_slow_files_are_read() {
     std::fs::write(bench.config(), format!("{text}\n[log]\nlevel = \"warn\"\n")).expect("read");
     daemon.wait(&["event=reloaded", "log.level"]);
 
-    // When it names a terrain tile that takes for ever to read, then the same, and the end is heard.
+    // When it names a terrain tile whose reading never ends, then the same, and the stop request is handled.
     let tile = bench.path("N38W010.hgt");
     slow_file(&tile);
     std::fs::remove_file(bench.config()).expect("removed");

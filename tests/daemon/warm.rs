@@ -1,4 +1,4 @@
-//! A daemon killed in flight and started again goes on with what it knew.
+//! A daemon that is killed in flight and restarted continues from its saved state.
 
 use std::path::Path;
 
@@ -42,7 +42,7 @@ fn of<M: prost::Message + Default>(messages: &[RawMessage], topic: &str) -> Vec<
 fn a_restart_in_flight_tracks_within_two_seconds_and_replays() {
     // Given a daemon that tracks the vehicle below and is killed in flight.
     let bench = Bench::new();
-    // Frames as they were seen, not as JPEG, so that the replay sees the same.
+    // Frames without loss, so that the replay has the same pixels.
     bench.configure(|text| text.replace("[store]", "[store]\nframes = \"png\""));
     vehicle_below(&bench);
     let (gps, compass) = bench.lines();
@@ -81,9 +81,9 @@ fn a_restart_in_flight_tracks_within_two_seconds_and_replays() {
     };
     assert_eq!((datums(&first).len(), datums(&first)), (1, datums(&second)));
     let states: Vec<wh::WarmState> = of(&second, topic::WARM_START);
-    assert_eq!(states.len(), 1, "what it continued from is in the flight");
+    assert_eq!(states.len(), 1, "the state from which it continued is in the flight");
 
-    // And how card and computer did is in the flight, and in its report.
+    // And the state of card and computer is in the flight, and in its report.
     let flight = flights[1].to_string_lossy().into_owned();
     let healths: Vec<wh::Health> = of(&second, topic::HEALTH);
     let told = healths.last().expect("once a second");
@@ -111,7 +111,7 @@ fn a_card_that_does_not_tell_what_was_known_is_told_and_not_waited_for() {
     let held = Index::open(&bench.path("card").join(INDEX)).expect("a new index");
     let (gps, compass) = bench.lines();
     let feeder = Feeder::start(gps, compass);
-    // Then the daemon says so, and flies.
+    // Then the daemon reports that, and continues.
     let daemon = bench.start();
     let (line, seen) = daemon.wait(&["event=warm_start"]);
     assert!(line.contains("begins anew"), "{line}");

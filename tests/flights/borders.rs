@@ -1,5 +1,5 @@
-//! The borders of the commands: outputs are never written over inputs, what others wrote is text and figures or nothing,
-//! and who reads the output may go.
+//! The borders of the commands: outputs never overwrite inputs, foreign content is shown as text and numbers or not at
+//! all, and a reader of the output may leave.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -58,7 +58,7 @@ fn no_command_writes_over_what_it_reads_or_did_not_make() {
     assert!(std::fs::read(&segment).unwrap() == before, "the flight is as it was");
     assert_eq!(std::fs::read(at("gps.log")).unwrap(), b"100.0 $GPRMC,a*00\n");
     assert_eq!(std::fs::read(at("letter.txt")).unwrap(), b"to whom it may concern");
-    // What the same command made is made again, and leaves nothing beside.
+    // Output of the same command is overwritten, without further files.
     for _ in 0..2 {
         for args in [
             &["simulate", "s.mcap", "--duration", "0.2", "--scale", "0.1"][..],
@@ -77,7 +77,7 @@ fn no_command_writes_over_what_it_reads_or_did_not_make() {
     assert_eq!(beside.count(), 0);
 }
 
-/// A flight in which a stranger named targets and gave their figures.
+/// A flight with hostile names of targets and hostile values.
 fn hostile(path: &Path) {
     flight_of(path, &[("=1+1,<b>&\"", 30.0), ("nowhere", f64::NAN), ("nowhere", f64::INFINITY)]);
 }
@@ -176,7 +176,7 @@ fn a_reader_who_goes_ends_a_command_quietly_and_a_full_disk_is_an_error() {
         assert_eq!(run.status.code(), Some(1), "{args:?}: {}", said(&run));
         assert!(said(&run).contains("standard output"), "{args:?}: {}", said(&run));
     }
-    // Nor does a closed standard error hurt.
+    // A closed standard error does no harm either.
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);
     let mut command = Command::new(env!("CARGO_BIN_EXE_windhover"));

@@ -21,7 +21,7 @@ fn every_command_of_the_page_works() {
     let commands = commands_of(DOC);
     assert!(commands.len() >= 12, "{commands:?}");
     for command in commands {
-        // The page is ours and the shell is what its readers use: it expands photos/*.png.
+        // The page is ours and its readers use a shell: it expands photos/*.png.
         let bin = env!("CARGO_BIN_EXE_windhover");
         let line = command.replacen("windhover", &format!("'{bin}'"), 1);
         let run = Command::new("sh").arg("-c").arg(&line).current_dir(dir.path()).output().expect("a shell");

@@ -1,5 +1,4 @@
-//! Closed-loop flights: the helicopter follows what is told of the vehicle over MAVLink, and what it is told depends on
-//! how it flies.
+//! Closed-loop flights: the helicopter follows the vehicle's MAVLink messages, which depend on how it flies.
 
 use nalgebra::Vector3;
 
@@ -141,8 +140,8 @@ fn proof_a_covered_tag_never_makes_the_helicopter_run() {
         assert!(farthest < 3.0, "{farthest} m from the vehicle's path");
         let told = moments.iter().filter(|m| m.t_s > until_s && m.told.is_some()).map(|m| m.t_s - until_s);
         let after = told.fold(f64::INFINITY, f64::min);
-        println!("told again after {after} s, {farthest} m from the path");
-        assert!(covered_s > 10.0 || after < 1.0, "told again after {after} s");
+        println!("back after {after} s, {farthest} m from the path");
+        assert!(covered_s > 10.0 || after < 1.0, "back after {after} s");
     }
 }
 

@@ -1,5 +1,5 @@
-//! Each way in which a compass may mean pitch and roll (`[compass] angles`), flown in strong wind with tilts
-//! beyond 20°, recorded and replayed.
+//! Each definition of a compass's pitch and roll (`[compass] angles`), flown in strong wind with tilts beyond 20°,
+//! recorded and replayed.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -26,12 +26,11 @@ fn encode(image: &GrayImage) -> Result<Vec<u8>, String> {
     jpeg::encode_grey(image, 80).map_err(|e| e.to_string())
 }
 
-/// Records a flight whose compass speaks this way. Gives which way is down in the body frame at each
-/// frame, by the truth.
+/// Records a flight whose compass has this convention. Returns the true down direction in the body frame at each frame.
 fn record(angles: TiltConvention, path: &Path) -> Vec<Vector3<f64>> {
     let mut scenario = Scenario::named("elevation-compass").unwrap().with_resolution(0.3);
     scenario.rig.compass.angles = angles;
-    // Twelve seconds are too short to find out in flight what the sensor feels.
+    // Twelve seconds are too short to find out in flight what the sensor measures.
     scenario.rig.compass.tilt = TiltKind::Inertial;
     scenario.duration_s = 12.0;
     scenario.rig.camera.fps = 4.0;
@@ -52,7 +51,7 @@ fn record(angles: TiltConvention, path: &Path) -> Vec<Vector3<f64>> {
     down
 }
 
-/// Root mean square of the angle between truth and estimate of where down is, degrees, from 4 s on.
+/// Root mean square of the angle between the true and the estimated down direction, degrees, from 4 s on.
 fn tilt_error_deg(capture: &Path, angles: TiltConvention, truth: &[Vector3<f64>]) -> f64 {
     let dir = tempfile::tempdir().unwrap();
     let flight = dir.path().join("flight.mcap");
@@ -88,8 +87,8 @@ fn each_convention_is_replayed_as_the_compass_meant_it() {
         assert!(steepest > 20.0, "{steepest} degrees at most");
         let error = tilt_error_deg(&capture, kind, &truth);
         println!("{kind:?}: {error:.3} degrees of up to {steepest:.0}");
-        // A wrong axis or sign shows here. What tells the conventions apart, 1 to 2 degrees, is within the 1.5 degrees
-        // an axis to which an AHRS is trusted; the tests of `geo` hold it.
+        // A wrong axis or sign shows here. The differences between the conventions, 1 to 2 degrees, are within the 1.5
+        // degrees for each axis that are assumed for an AHRS; the tests of `geo` check them.
         assert!(error < 3.0, "{kind:?}: {error} degrees");
     }
 }

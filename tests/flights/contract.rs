@@ -1,4 +1,4 @@
-//! The command line as its contract has it: exit codes, messages, help, tables and JSON of the binary.
+//! The command line against its contract: exit codes, messages, help, tables and JSON of the binary.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -60,7 +60,7 @@ fn help_answers_on_every_level() {
         let text = String::from_utf8_lossy(&run.stdout).into_owned();
         assert_eq!(run.status.code(), Some(0), "{command:?}");
         assert!(text.contains("Usage: windhover"), "{command:?}: {text}");
-        // Leaves of the tree that people start from show how they are called.
+        // Commands that people start with show an example.
         if command.len() == 1 && !["store", "keys", "calibrate"].contains(&command[0]) {
             assert!(text.contains("Example"), "{command:?} shows no example");
         }
@@ -102,14 +102,14 @@ fn failures_say_what_and_exit_as_agreed() {
             assert!(text.trim_end().lines().count() <= 2, "{args:?}: {text}");
         }
     }
-    assert!(!in_dir("tables").exists(), "a bare capture leaves no empty tables behind");
+    assert!(!in_dir("tables").exists(), "a capture leaves no empty tables behind");
 }
 
 #[test]
 fn a_flight_that_cannot_be_written_ends_the_replay() {
     // Given a place that cannot be written and a capture longer than what is read ahead.
     let dir = scratch();
-    // When it is replayed, then it ends and names the file, rather than waiting for ever.
+    // When it is replayed, then it ends and names the file, rather than waiting without end.
     let run = windhover(&["replay", &capture(), "--out", "no/such/place.mcap"], dir.path());
     assert_eq!(run.status.code(), Some(1));
     assert!(said(&run).contains("no/such/place.mcap"), "{}", said(&run));
@@ -136,7 +136,7 @@ fn values_that_cannot_be_are_refused_with_line_and_key() {
         assert_eq!(run.status.code(), Some(78), "{to}");
         let words = said(&run);
         assert!(words.contains(key) && words.lines().count() <= 2, "{to}: {words}");
-        // Where a key stands in several tables of one name, its line is not told.
+        // Where a key is in several tables of one name, its line is not given.
         if text.matches("[[target.marker]]").count() == 1 || !to.starts_with("size_m") {
             assert!(words.contains(&format!("line {line},")), "{to}, line {line}: {words}");
         }
@@ -284,8 +284,8 @@ fn a_log_in_which_nothing_is_understood_is_an_error() {
             let run = windhover(&["decode", device, log, "--json"], dir.path());
             assert_eq!(run.status.code(), Some(1), "{device} {log}");
             let said = said(&run);
-            assert!(said.contains(log) && said.contains("nothing in it is understood"), "{said}");
-            assert!(said.contains("0 used"), "the counts are told all the same: {said}");
+            assert!(said.contains(log) && said.contains("it has nothing decodable"), "{said}");
+            assert!(said.contains("0 used"), "the counts are still printed: {said}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Import: recordings people already have become one capture in order of time.
+//! Import: existing recordings become one capture in order of time.
 
 use std::path::Path;
 
@@ -52,7 +52,7 @@ fn logs_and_a_folder_of_images_merge_in_order() {
 
     assert_eq!((imported.gps_lines, imported.compass_lines, imported.frames), (2, 1, 2));
     assert_eq!(imported.video, Some(VideoSource::Folder));
-    assert!(imported.warnings[0].contains("1 line without a time left out, line 2 first"));
+    assert!(imported.warnings[0].contains("1 line without a time left out, the first at line 2"));
     let times: Vec<i64> = got.iter().map(|(ms, _)| *ms).collect();
     assert_eq!(times, [0, 100, 150, 200, 250]);
     assert_eq!(got[0].1, "gps $GPRMC,a*00");

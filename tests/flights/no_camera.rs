@@ -1,4 +1,5 @@
-//! A flight without a camera: the helicopter's own state goes on, in every output, and the program says what is missing.
+//! A flight without a camera: the helicopter's own state continues, in every output, and the program reports what is
+//! missing.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -48,7 +49,7 @@ fn own_states_come_at_their_own_rate_in_every_output() {
     blind_capture(dir);
     // When a flight without frames is replayed.
     let said = windhover(dir, &["replay", "blind.mcap", "--out", "flight.mcap"]);
-    assert!(said.contains("0 frames") && said.contains("no frame came"), "{said}");
+    assert!(said.contains("0 frames") && said.contains("no frame was received"), "{said}");
     windhover(dir, &["export", "flight.mcap", "--format", "csv", "--out", "tables"]);
     // Then its table has a row each tenth of a second, without a frame's number.
     let rows = own_rows(dir, "tables");
@@ -59,7 +60,7 @@ fn own_states_come_at_their_own_rate_in_every_output() {
     windhover(dir, &["replay", "flight.mcap", "--out", "again.mcap"]);
     windhover(dir, &["export", "again.mcap", "--format", "csv", "--out", "again"]);
     assert_eq!(rows, own_rows(dir, "again"));
-    // And map, track and page show the helicopter, and the page says that no frame came.
+    // And map, track and page show the helicopter, and the page states that no frame was received.
     for (format, file, words) in
         [("kml", "flight.kml", "<name>helicopter</name>"), ("geojson", "flight.geojson", "\"helicopter\"")]
     {
@@ -69,7 +70,7 @@ fn own_states_come_at_their_own_rate_in_every_output() {
     }
     windhover(dir, &["report", "flight.mcap", "--out", "report.html"]);
     let page = std::fs::read_to_string(dir.join("report.html")).unwrap();
-    assert!(page.contains("No frame came from the camera") && !page.contains("bare capture"));
+    assert!(page.contains("No frame was received from the camera") && !page.contains("it is a capture"));
     assert!(page.contains("Height over the datum"), "the helicopter's own charts are there");
 }
 

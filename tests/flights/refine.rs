@@ -20,9 +20,9 @@ fn a_refined_flight_stands_beside_the_real_one() {
     run(&["replay", &capture(), "--out", "flight.mcap"], dir.path());
     // When it is refined.
     let text = run(&["refine", "flight.mcap"], dir.path());
-    // Then what it tells of its configuration is said, and what it does not.
-    assert!(text.contains("what the flight tells of its configuration"), "{text}");
-    assert!(text.contains("not told by this flight"), "{text}");
+    // Then constants that it determines are printed, and those that it does not.
+    assert!(text.contains("constants of the configuration"), "{text}");
+    assert!(text.contains("not determined by this flight"), "{text}");
     // And a file beside it has the flight without its pictures, and a refined estimate a frame.
     let (flight, refined) = (
         Flight::read(&dir.path().join("flight.mcap")).expect("a flight"),
@@ -70,7 +70,7 @@ fn a_refined_flight_stands_beside_the_real_one() {
     let again = Flight::read(&dir.path().join("again.mcap")).expect("a refined flight");
     let twice = again.targets.values().next().expect("the target");
     assert_eq!(twice.refined.len(), track.refined.len());
-    // And nothing half is left.
+    // And no partial file is left.
     let left = std::fs::read_dir(dir.path()).expect("readable").filter_map(Result::ok);
     assert!(left.into_iter().all(|entry| !entry.file_name().to_string_lossy().ends_with(".part")));
 }

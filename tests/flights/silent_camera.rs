@@ -1,4 +1,4 @@
-//! A camera that gives no more frames: targets coast and are lost by the time that passes, live and in replay alike.
+//! A camera that stops: targets coast and are lost after their time, live and in replay alike.
 
 use std::path::Path;
 
@@ -43,8 +43,8 @@ fn targets_coast_and_are_lost_without_a_frame() {
     let (config, events, cut) = flight_without_frames_after(3.0);
     let out = fly(&config, &events);
     let coasted = coasted(&out);
-    // Then it is predicted ten times a second from half a second on, no surer than before, and lost in its time, once.
-    // (What GPS and compass say of the helicopter meanwhile may make up for a hundredth of the sigma.)
+    // Then it is predicted ten times a second from half a second on, with no smaller sigma than before, and lost after
+    // its time, once. (GPS and compass may meanwhile reduce the sigma by a hundredth.)
     let (lost, predicted) = coasted.split_last().expect("it is predicted");
     assert_eq!((lost.status, lost.state), (TrackStatus::Lost, None));
     let since = |estimate: &TargetEstimate| (estimate.t_valid - cut).s();
@@ -63,7 +63,7 @@ fn targets_coast_and_are_lost_without_a_frame() {
     }
     let (first, last) = (sigma(&predicted[0]), sigma(&predicted[predicted.len() - 1]));
     assert!(last > first, "{last} m after {first} m");
-    // Then health and the operator's notices say the same.
+    // Then health and the operator's notices agree.
     let notices = out.iter().filter_map(|timed| match &timed.output {
         Output::Notice(n) if n.t > cut && n.target.is_some() => Some(n.kind),
         _ => None,
@@ -87,7 +87,7 @@ fn targets_coast_and_are_lost_without_a_frame() {
         );
         assert!(
             last.state.is_none() || health.t - last.t_valid < Span::from_s(0.2),
-            "the figures are of now"
+            "the figures are current"
         );
     }
 }

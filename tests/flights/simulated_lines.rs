@@ -68,8 +68,8 @@ fn nearest(readings: &[(MonoTime, AttitudeSample)], t: MonoTime) -> &(MonoTime, 
     around.iter().min_by_key(|(t_true, _)| (*t_true - t).abs()).expect("there are readings")
 }
 
-/// The jitter of arrivals is removed: what is left is this flight's constant error of the latency,
-/// which arrival times cannot show, and little else. The first ten seconds are the fit's own.
+/// The jitter of arrivals is removed: what is left is this flight's constant error of the latency, which arrival times
+/// cannot show, and little else. The fit settles in the first ten seconds.
 #[test]
 fn arrival_jitter_is_removed() {
     println!("flight  latency off by (gps, compass)  left after it: gps ms  compass ms  frame ms");
@@ -147,13 +147,13 @@ fn every_compass_format_is_read_as_it_was_sent() {
             }
         }
         let has = |what: fn(&AttitudeSample) -> bool| attitudes.iter().any(|a| what(&a.value));
-        // The line between two antennas has no tilt of its own, and what begins anywhere is no heading.
+        // The line between two antennas has no tilt of its own, and a heading with an arbitrary zero is not used.
         assert_eq!(has(|a| a.tilt.is_some()), format != CompassFormat::Ubx, "{format:?}: tilt");
         assert_eq!(has(|a| a.heading.is_some()), format != CompassFormat::Bno08xRvc, "{format:?}: heading");
     }
 }
 
-/// One line for both: a receiver with two antennas, whose packets of the heading stand between its sentences.
+/// One line for both: a receiver with two antennas, with heading packets between its sentences.
 #[test]
 fn a_receivers_line_may_tell_the_heading_too() {
     let mut scenario = Scenario::named("follow").expect("known");
@@ -184,7 +184,7 @@ fn a_receivers_line_may_tell_the_heading_too() {
     assert_eq!(count(&complaint), 0);
 }
 
-/// Sentences say what the receiver worked out, to the digits they carry.
+/// Sentences carry the receiver's result, to their number of digits.
 #[test]
 fn fixes_are_read_as_they_were_sent() {
     let world = Arc::new(World::new(Scenario::named("gps-outage").expect("known"), 8));
@@ -211,7 +211,7 @@ fn fixes_are_read_as_they_were_sent() {
     assert!(compared > 260, "{compared} fixes compared of {}", sent.len());
 }
 
-/// The datum is settled all the same, and each is an event of its own.
+/// The datum is still settled, and each is an event of its own.
 #[test]
 fn a_terrain_tile_that_is_missing_is_an_event_of_its_own() {
     // Given a configuration that names a terrain tile, and a pipeline that could not be given it.
@@ -228,7 +228,7 @@ fn a_terrain_tile_that_is_missing_is_an_event_of_its_own() {
     for event in Flight::new(world, FrameStorage::None, 1) {
         pipeline.handle(&event.expect("serial lines need no encoder"), &mut outputs);
     }
-    // Then it is said once, as what it is, and the datum is settled.
+    // Then it is reported once, under its own name, and the datum is settled.
     let count = |kind: NoticeKind| {
         outputs.iter().filter(|o| matches!(&o.output, Output::Notice(notice) if notice.kind == kind)).count()
     };

@@ -1,4 +1,4 @@
-//! A pipeline that continues from what an earlier one had learnt.
+//! A pipeline that continues from the state of an earlier one.
 
 use std::path::{Path, PathBuf};
 
@@ -27,7 +27,7 @@ fn outputs(pipeline: &mut Pipeline, events: &[Event]) -> Vec<Output> {
     out.into_iter().map(|timed| timed.output).collect()
 }
 
-/// When the estimates with `tracking` were true, and their heading sigma in rad.
+/// Times of the estimates with `tracking`, and their heading sigma in rad.
 fn tracked(out: &[Output]) -> impl Iterator<Item = (MonoTime, f64)> {
     out.iter().filter_map(|o| match o {
         Output::Estimator(EstimatorOutput::Estimate(e)) if e.status == TrackStatus::Tracking => {

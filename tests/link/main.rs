@@ -1,4 +1,4 @@
-//! The wireless link over an impaired relay: nothing missing, nothing twice, nobody else gets in.
+//! The wireless link over an impaired relay: nothing missing, nothing twice, no foreign peer.
 
 mod refused;
 mod relay;
@@ -178,7 +178,7 @@ async fn both_sides_restarted_in_mid_backfill_end_up_the_same() {
     let station = Station::first(&calls);
     let some = within(PATIENCE, || station.counts(1).0 > 100).await;
     assert!(some, "back-fill begins: {:?}", payload.handle.status());
-    // When: both end without a word and come back, the payload first.
+    // When: both end without a goodbye and come back, the payload first.
     let address = payload.address;
     let got = station.vanish().await;
     payload.vanish().await;

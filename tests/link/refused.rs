@@ -1,4 +1,4 @@
-//! Who is not let in, and what both sides say about it.
+//! Refused peers, and the reports of both sides.
 
 use std::time::Duration;
 
@@ -145,7 +145,7 @@ async fn a_station_revoked_in_flight_is_thrown_out() {
     assert!(within(PATIENCE, || payload.handle.status().stations.len() == 1).await);
     keys.authority.revoke(Role::Station, "base", MADE).expect("revoked");
     let thrown_out = within(PATIENCE, || payload.handle.status().stations.is_empty()).await;
-    // It calls again at once, and is told why not.
+    // It connects again at once, and gets the reason.
     let told = within(PATIENCE, || refused(&payload.events, "revoked")).await;
     assert!(thrown_out && told, "{:?}", payload.events);
     assert!(keys.path().exists());

@@ -1,4 +1,4 @@
-//! A payload and stations on loopback, and what the stations got.
+//! A payload and stations on loopback, and the records that the stations got.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -132,7 +132,7 @@ impl Payload {
         self.handle.send(&record(self.clock.now())).expect("a record for the ground")
     }
 
-    /// Ends without a word, as when power fails.
+    /// Ends without a goodbye, as in a power failure.
     pub async fn vanish(self) {
         self.task.abort();
         let _ = self.task.await;

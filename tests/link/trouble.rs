@@ -1,4 +1,4 @@
-//! A payload in trouble: its connection ends without a clear goodbye, its card cannot be read.
+//! A payload in trouble: its connection ends without a goodbye, its card cannot be read.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -10,7 +10,7 @@ use windhover::io::link::{Backlog, Extent, Found, MemoryBacklog, Unread};
 
 use crate::team::{Keys, Payload, Station, card, loopback, payload_settings, station_settings, within};
 
-/// Less than a station waits after another program of the same name took over.
+/// Shorter than a station's wait after another program of the same name took over.
 const PATIENCE: Duration = Duration::from_secs(20);
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -27,7 +27,7 @@ async fn a_payload_whose_streams_end_before_its_connection_is_called_again() {
     let mut kept = Vec::new();
     for time in 0..3 {
         let calls = async { endpoint.accept().await.expect("an open port").await.expect("a handshake") };
-        // Then: the station does not take that for another program's taking over, and calls again.
+        // Then: the station does not mistake that for another program's takeover, and connects again.
         let called = tokio::time::timeout(PATIENCE, calls).await;
         let call = called.unwrap_or_else(|_| panic!("no call after {time}"));
         // When: the control stream ends.

@@ -1,4 +1,4 @@
-//! Captures: what goes in comes out, whatever happened to the file in between.
+//! Captures: the content is read back, whatever happened to the file in between.
 
 use std::path::Path;
 

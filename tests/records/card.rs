@@ -1,6 +1,6 @@
-//! The store on cards of its own: full, read-only, failing, taken out, put back, not permitted. A card is
-//! a tmpfs, or an ext4 on a loop device where it has to fail as devices do; both take the right to mount,
-//! and without it these tests say so and pass.
+//! The store on separate cards: full, read-only, failing, removed, put back, not permitted. A card is a tmpfs, or an
+//! ext4 on a loop device where it has to fail as devices do; both need the right to mount, and without it these tests
+//! report that and pass.
 
 use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt;
@@ -22,19 +22,19 @@ use windhover_base::time::MonoTime;
 
 use crate::leave_out::leave_out;
 
-/// A mount point and what is in it.
-struct Slot(TempDir);
+/// A mount point and the card in it.
+struct CardMount(TempDir);
 
-impl Slot {
-    /// An empty slot; `None` where this user may not mount.
+impl CardMount {
+    /// An empty mount; `None` where this user may not mount.
     fn new() -> Option<Self> {
-        let slot = Self(tempfile::tempdir().unwrap());
-        std::fs::create_dir(slot.path()).unwrap();
-        if !slot.put_in("size=64m") {
+        let mount = Self(tempfile::tempdir().unwrap());
+        std::fs::create_dir(mount.path()).unwrap();
+        if !mount.put_in("size=64m") {
             leave_out("card", "mounting takes privileges this user has not");
             return None;
         }
-        Some(slot)
+        Some(mount)
     }
 
     fn path(&self) -> PathBuf {
@@ -50,13 +50,13 @@ impl Slot {
         assert!(mount(&["-o", &format!("remount,{options}")], &self.path()), "remount {options}");
     }
 
-    /// Takes the card out under whoever uses it.
+    /// Removes the card while it is in use.
     fn take_out(&self) {
         assert!(quietly(Command::new("umount").arg("-l").arg(self.path())), "unmounted");
     }
 }
 
-impl Drop for Slot {
+impl Drop for CardMount {
     fn drop(&mut self) {
         while quietly(Command::new("umount").arg("-l").arg(self.path())) {}
     }
@@ -103,7 +103,7 @@ fn say(handle: &StoreHandle, t_recv: MonoTime, words: &str) {
     });
 }
 
-/// What was heard, flight by flight.
+/// The recorded events, flight by flight.
 fn heard(card: &Path) -> Vec<String> {
     let mut names = flight::flight_names(card).unwrap();
     names.sort();
@@ -119,17 +119,17 @@ fn heard(card: &Path) -> Vec<String> {
 /// An ext4 on a loop device, on a file whose own file system can be filled: then writes that the card's
 /// file system had promised fail at the device, as those of worn flash do.
 struct FailingCard {
-    slot: Slot,
-    below: Slot,
+    mount: CardMount,
+    below: CardMount,
 }
 
 impl FailingCard {
     fn new() -> Option<Self> {
-        let (slot, below) = (Slot::new()?, Slot::new()?);
-        let card = Self { slot, below };
+        let (mount, below) = (CardMount::new()?, CardMount::new()?);
+        let card = Self { mount, below };
         std::fs::File::create(card.image()).unwrap().set_len(96 << 20).unwrap();
         let made = quietly(Command::new("mkfs.ext4").args(["-q", "-F", "-m", "1"]).arg(card.image()));
-        card.slot.take_out();
+        card.mount.take_out();
         if !made || !card.put_in() {
             leave_out("a failing card", "no mkfs.ext4 or no loop device here");
             return None;
@@ -146,7 +146,7 @@ impl FailingCard {
         quietly(Command::new("e2fsck").arg("-p").arg(self.image()));
         let options = ["-o", "loop,noatime,nodev,nosuid,noexec,errors=remount-ro"];
         let image = self.image();
-        quietly(Command::new("mount").args(options).arg(image).arg(self.slot.path()))
+        quietly(Command::new("mount").args(options).arg(image).arg(self.mount.path()))
     }
 
     /// Lets everything fail that needs a block not written before.
@@ -159,7 +159,7 @@ impl FailingCard {
         std::fs::remove_file(self.below.path().join("ballast")).unwrap();
     }
 
-    /// Waits until nothing uses the device any more: until then it is not out.
+    /// Waits until nothing uses the device: until then it is not removed.
     fn let_go(&self) {
         for _ in 0..300 {
             let used = Command::new("losetup").arg("-j").arg(self.image()).output().unwrap();
@@ -174,15 +174,15 @@ impl FailingCard {
 
 impl Drop for FailingCard {
     fn drop(&mut self) {
-        // The loop device goes before what it lies on.
-        while quietly(Command::new("umount").arg("-l").arg(self.slot.path())) {}
+        // The loop device is removed before its file.
+        while quietly(Command::new("umount").arg("-l").arg(self.mount.path())) {}
     }
 }
 
 #[test]
 fn a_device_that_refuses_writes_stops_recording_and_the_same_card_comes_back() {
     let Some(device) = FailingCard::new() else { return };
-    let (card, clock) = (device.slot.path(), HostClock::start());
+    let (card, clock) = (device.mount.path(), HostClock::start());
     let (store, notices) = start(&card, clock);
     let handle = store.handle();
     expect(&notices, "recording_started");
@@ -193,7 +193,7 @@ fn a_device_that_refuses_writes_stops_recording_and_the_same_card_comes_back() {
         std::thread::sleep(Duration::from_millis(20));
     }
     device.fail();
-    // Bytes that do not pack, until one write has come to a block that is not there.
+    // Incompressible bytes, until one write reaches a block that does not exist.
     let mut noise = 1u64;
     let stopped = loop {
         let words = std::iter::repeat_with(|| {
@@ -218,8 +218,8 @@ fn a_device_that_refuses_writes_stops_recording_and_the_same_card_comes_back() {
     let (free, _) = Volume::new(&card).space().unwrap();
     assert!(free > 20 << 20, "the card's own file system has room: {free} bytes");
     say(&handle, clock.now(), "meanwhile");
-    // The pilot takes it out, cleans its contacts, and puts it back.
-    device.slot.take_out();
+    // The pilot removes it, cleans its contacts, and puts it back.
+    device.mount.take_out();
     device.let_go();
     device.mend();
     assert!(device.put_in());
@@ -234,10 +234,10 @@ fn a_device_that_refuses_writes_stops_recording_and_the_same_card_comes_back() {
     assert!(errors.is_empty() && !flights.is_empty(), "{errors:?}");
 }
 
-/// The store as somebody else runs it: root may write everywhere.
+/// The store under another user: root may write everywhere.
 #[test]
 fn a_card_of_somebody_else_is_told_and_used_once_it_is_handed_over() {
-    let Some(slot) = Slot::new() else { return };
+    let Some(mount) = CardMount::new() else { return };
     let tests = std::env::current_exe().unwrap();
     let built = tests.parent().and_then(Path::parent).unwrap().join("examples/store_load");
     if !built.exists() {
@@ -245,13 +245,13 @@ fn a_card_of_somebody_else_is_told_and_used_once_it_is_handed_over() {
         return;
     }
     // Where nobody may look and execute.
-    std::fs::set_permissions(slot.0.path(), Permissions::from_mode(0o755)).unwrap();
-    let program = slot.0.path().join("store_load");
+    std::fs::set_permissions(mount.0.path(), Permissions::from_mode(0o755)).unwrap();
+    let program = mount.0.path().join("store_load");
     std::fs::copy(built, &program).unwrap();
-    std::fs::set_permissions(slot.path(), Permissions::from_mode(0o700)).unwrap();
+    std::fs::set_permissions(mount.path(), Permissions::from_mode(0o700)).unwrap();
     const NOBODY: u32 = 65_534;
     let child = Command::new(&program)
-        .arg(slot.path())
+        .arg(mount.path())
         .args(["--seconds", "8", "--fps", "0", "--floor-mb", "8"])
         .uid(NOBODY)
         .gid(NOBODY)
@@ -259,21 +259,21 @@ fn a_card_of_somebody_else_is_told_and_used_once_it_is_handed_over() {
         .spawn()
         .unwrap();
     std::thread::sleep(Duration::from_secs(3));
-    assert_eq!(std::fs::read_dir(slot.path()).unwrap().count(), 0);
+    assert_eq!(std::fs::read_dir(mount.path()).unwrap().count(), 0);
     // What windhover-card.service does after a mount.
-    std::os::unix::fs::chown(slot.path(), Some(NOBODY), Some(NOBODY)).unwrap();
+    std::os::unix::fs::chown(mount.path(), Some(NOBODY), Some(NOBODY)).unwrap();
     let output = child.wait_with_output().unwrap();
     let said = String::from_utf8_lossy(&output.stdout);
     let stopped = said.lines().find(|l| l.starts_with("recording_stopped")).expect(&said);
     assert!(stopped.contains("Permission denied"), "{stopped}");
     assert!(said.contains("recording_resumed"), "{said}");
-    assert!(!heard(&slot.path()).is_empty(), "{said}");
+    assert!(!heard(&mount.path()).is_empty(), "{said}");
 }
 
 #[test]
 fn a_full_card_stops_recording_until_space_appears() {
-    let Some(slot) = Slot::new() else { return };
-    let (card, clock) = (slot.path(), HostClock::start());
+    let Some(mount) = CardMount::new() else { return };
+    let (card, clock) = (mount.path(), HostClock::start());
     let (store, notices) = start(&card, clock);
     let handle = store.handle();
     expect(&notices, "recording_started");
@@ -292,9 +292,9 @@ fn a_full_card_stops_recording_until_space_appears() {
     expect(&notices, "recording_dropout");
     handle.put_state("warm", vec![2]);
     store.stop();
-    assert_eq!(flight::flight_names(&card).unwrap().len(), 1, "the same flight goes on");
+    assert_eq!(flight::flight_names(&card).unwrap().len(), 1, "the same flight continues");
     assert_eq!(heard(&card), ["before", "after"]);
-    // What a restart finds is what the flight learnt last, after it went on.
+    // A restart finds the state that the flight saved last, after it continued.
     let (store, _) = start(&card, clock);
     assert_eq!(store.handle().state("warm", Duration::from_secs(30)), Some(vec![2]));
     store.stop();
@@ -302,13 +302,13 @@ fn a_full_card_stops_recording_until_space_appears() {
 
 #[test]
 fn a_read_only_card_is_told_and_used_once_it_can_be_written() {
-    let Some(slot) = Slot::new() else { return };
-    slot.remount("ro");
-    let (card, clock) = (slot.path(), HostClock::start());
+    let Some(mount) = CardMount::new() else { return };
+    mount.remount("ro");
+    let (card, clock) = (mount.path(), HostClock::start());
     let (store, notices) = start(&card, clock);
     let reason = expect(&notices, "recording_stopped");
     assert!(reason.contains("Read-only file system"), "{reason}");
-    slot.remount("rw");
+    mount.remount("rw");
     expect(&notices, "recording_resumed");
     say(&store.handle(), clock.now(), "written");
     store.stop();
@@ -317,19 +317,19 @@ fn a_read_only_card_is_told_and_used_once_it_can_be_written() {
 
 #[test]
 fn a_card_taken_out_is_missed_and_the_next_one_used() {
-    let Some(slot) = Slot::new() else { return };
-    let (card, clock) = (slot.path(), HostClock::start());
+    let Some(mount) = CardMount::new() else { return };
+    let (card, clock) = (mount.path(), HostClock::start());
     let (store, notices) = start(&card, clock);
     let handle = store.handle();
     expect(&notices, "recording_started");
     say(&handle, clock.now(), "on the first");
     expect(&notices, "index_ready");
-    slot.take_out();
+    mount.take_out();
     let reason = expect(&notices, "recording_stopped");
-    assert!(reason.contains("taken away"), "{reason}");
+    assert!(reason.contains("removed"), "{reason}");
     assert!(matches!(handle.status().recording, Recording::Stopped(_)));
     assert_eq!(std::fs::read_dir(&card).unwrap().count(), 0, "nothing is written to the system card");
-    assert!(slot.put_in("size=64m"));
+    assert!(mount.put_in("size=64m"));
     expect(&notices, "recording_resumed");
     say(&handle, clock.now(), "on the second");
     expect(&notices, "index_ready");
@@ -339,9 +339,9 @@ fn a_card_taken_out_is_missed_and_the_next_one_used() {
 
 #[test]
 fn an_empty_slot_is_not_recorded_to() {
-    let Some(slot) = Slot::new() else { return };
-    slot.take_out();
-    let (card, clock) = (slot.path(), HostClock::start());
+    let Some(mount) = CardMount::new() else { return };
+    mount.take_out();
+    let (card, clock) = (mount.path(), HostClock::start());
     let (store, notices) = start(&card, clock);
     let reason = expect(&notices, "recording_stopped");
     assert!(reason.contains("nothing is mounted"), "{reason}");

@@ -1,4 +1,4 @@
-//! The store as people and power cuts meet it: the command line, kill -9, other programs' readers.
+//! The store from the outside: the command line, kill -9, other programs' readers.
 #![expect(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 use std::collections::BTreeSet;
@@ -85,8 +85,8 @@ fn the_command_line_tends_flights() {
     let verified = windhover(root, &["verify"]);
     assert!(verified.status.success(), "{}", String::from_utf8_lossy(&verified.stdout));
 
-    // What a kill leaves is unfinished and nothing is wrong: the flight not closed, its last segment without an end and
-    // with half a chunk behind, all of it not in the index yet.
+    // After a kill, parts are unfinished and nothing is wrong: the flight is not closed, its last segment has no end
+    // and half a chunk after its last complete one, and nothing of it is in the index yet.
     let cut = root.join(FLIGHTS).join("boot-2");
     let before = std::fs::read(cut.join("000000.mcap")).unwrap();
     let info = std::fs::read(cut.join(flight::FLIGHT_FILE)).unwrap();
@@ -104,7 +104,7 @@ fn the_command_line_tends_flights() {
     std::fs::write(cut.join(flight::FLIGHT_FILE), info).unwrap();
     stdout(&windhover(root, &["rebuild"]));
 
-    // A cut segment is found, mended and whole again; nothing that was in it is lost.
+    // A cut segment is found, sealed and complete again; nothing of its content is lost.
     let segment = root.join(FLIGHTS).join("boot-1/000000.mcap");
     let bytes = std::fs::read(&segment).unwrap();
     std::fs::write(&segment, &bytes[..bytes.len() - 20]).unwrap();

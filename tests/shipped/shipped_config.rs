@@ -1,4 +1,4 @@
-//! The shipped configuration explains every key and tells true defaults.
+//! The shipped configuration explains every key and shows true defaults.
 
 use windhover::config::Config;
 
@@ -6,7 +6,7 @@ fn shipped() -> String {
     std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/config/windhover.toml")).unwrap()
 }
 
-/// The file with every default that is shown behind `#` put in force.
+/// The file with every default that is shown after `#` made active.
 fn with_defaults_spelt_out(text: &str) -> String {
     let is_default = |line: &str| {
         line.strip_prefix('#').is_some_and(|rest| rest.starts_with(|c: char| c.is_ascii_lowercase()))

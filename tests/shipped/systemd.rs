@@ -1,4 +1,4 @@
-//! The unit as systemd itself judges it.
+//! The unit in the judgement of systemd itself.
 
 use std::process::Command;
 

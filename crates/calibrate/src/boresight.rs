@@ -1,4 +1,4 @@
-//! Boresight: how camera and compass are mounted and timed, from flights over markers at rest.
+//! Boresight: mounting and timing of camera and compass, from flights over markers at rest.
 
 use std::collections::BTreeMap;
 
@@ -11,13 +11,13 @@ use windhover_base::msg::{AttitudeSample, GnssEpoch, MarkerDetection, MarkerId, 
 use windhover_base::settings::{MarkerConfig, Rig, TargetConfig, TargetModel};
 use windhover_base::time::{MonoTime, Span};
 
-/// Passes over the flights: each linearises about the result of the one before.
+/// Passes over the flights: each linearises about the result of the previous one.
 const PASSES: usize = 3;
-/// A parameter is told by the flight where its sigma falls below this share of the prior's.
+/// A parameter counts as determined where its sigma is below this share of the prior's.
 const TOLD: f64 = 0.5;
-/// The compass's lateness is no better known than this: attitude between samples is a model, s.
+/// Lower limit of the sigma of the compass's lateness: attitude between samples is a model, s.
 const LATENESS_FLOOR_S: f64 = 1e-3;
-/// Flights shorter than this tell nothing, seconds.
+/// Shorter flights are refused, seconds.
 const SHORTEST_S: f64 = 5.0;
 
 /// Name, unit, one-sigma prior about the configuration's value, and the factor from the state's unit.
@@ -49,7 +49,7 @@ pub struct Recording {
 /// Why flights gave no boresight.
 #[derive(Clone, PartialEq, Eq, Debug, thiserror::Error)]
 pub enum BoresightError {
-    /// No flight at all.
+    /// No flight was given.
     #[error("no flight was given")]
     NoFlight,
     /// A flight lacks something.
@@ -62,7 +62,7 @@ pub enum BoresightError {
     },
 }
 
-/// One quantity found.
+/// One estimated quantity.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Finding {
     /// Its name.
@@ -75,30 +75,30 @@ pub struct Finding {
     pub sigma: f64,
     /// One-sigma before the flights.
     pub prior: f64,
-    /// Whether the flights told it.
+    /// Whether the flights determined it.
     pub told: bool,
 }
 
-/// A marker found.
+/// An estimated marker.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct MarkerFound {
-    /// Which.
+    /// Its identity.
     pub marker: MarkerId,
     /// Flight, from 1.
     pub flight: usize,
-    /// Where.
+    /// Its position.
     pub position: Geodetic,
     /// One-sigma north, east, down, metres.
     pub sigma_m: Vector3<f64>,
 }
 
-/// The boresight.
+/// The result.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Boresight {
     /// Mounting angles, lever arm, compass zeros, lateness.
     pub parameters: Vec<Finding>,
-    /// Mount minus compass zero: how the camera stands to what the compass calls level and north.
-    /// This is what positions a vehicle, and is told even where its parts are not.
+    /// Mount minus compass zero: the camera relative to the compass's level and north. This determines the positions of
+    /// a vehicle, and is known even where its two parts are not.
     pub camera_to_compass: Vec<Finding>,
     /// Markers.
     pub markers: Vec<MarkerFound>,
@@ -117,13 +117,13 @@ enum Item<'a> {
     Frame(&'a [MarkerDetection]),
 }
 
-/// Estimates the boresight by least squares over all raw measurements: GPS positions with a slowly
-/// varying bias, GPS velocities, compass angles, pixels of markers. Values of the configuration are
-/// the start and, loosely, the prior. `surveyed` gives markers whose positions are known.
+/// Estimates the boresight by least squares over all raw measurements: GPS positions with a slowly varying bias, GPS
+/// velocities, compass angles, pixels of markers. Values of the configuration are the initial values and weak priors.
+/// `surveyed` are markers with known positions.
 ///
 /// # Errors
-/// Without a flight, or where one has no fixes, readings or markers, or is too short. The number of the
-/// flight is given.
+/// There is no flight, or a flight has no fixes, readings or markers, or is too short. The error has the number of the
+/// flight.
 pub fn boresight(
     rig: &Rig,
     declination_rad: f64,
@@ -168,7 +168,7 @@ fn prior_of(rig: &Rig) -> (Parameters, DVector<f64>) {
     (start, sigma)
 }
 
-/// What one pass over all flights gave.
+/// The result of one pass over all flights.
 struct Pass {
     parameters: Parameters,
     covariance: DMatrix<f64>,
@@ -208,7 +208,7 @@ fn run_pass(
     Ok(Pass { parameters, covariance, markers, fit, refused })
 }
 
-/// The first instant at which GPS and compass are both known, as a filter there.
+/// A filter at the first instant at which GPS and compass are both known.
 fn begin<'a>(
     rig: &'a Rig,
     declination: f64,
@@ -218,7 +218,7 @@ fn begin<'a>(
 ) -> Result<(LocalFrame, Filter<'a>, MonoTime), &'static str> {
     let located = |e: &Stamped<GnssEpoch>| Some((e.t_valid, position_of(&e.value)?, e.value.vel_ned_mps));
     let (t, at, velocity) = flight.gnss.iter().find_map(located).ok_or("it has no GPS position")?;
-    let last = flight.frames.iter().rfind(|f| !f.1.is_empty()).ok_or("no marker is seen in it")?;
+    let last = flight.frames.iter().rfind(|f| !f.1.is_empty()).ok_or("it has no marker detections")?;
     if (last.0 - t).s() < SHORTEST_S {
         return Err("it is too short: fly at least a minute over the marker");
     }
@@ -234,7 +234,7 @@ fn begin<'a>(
         pitch: tilt.pitch - compass.pitch_offset_deg.to_radians(),
         roll: tilt.roll - compass.roll_offset_deg.to_radians(),
     };
-    let attitude = compass.angles.ned_from_body(heading, level).ok_or("its first tilt cannot be")?;
+    let attitude = compass.angles.ned_from_body(heading, level).ok_or("its first tilt is impossible")?;
     let frame = LocalFrame::new(at);
     let velocity = velocity.unwrap_or_default();
     let start = (Vector3::zeros(), velocity);
@@ -256,7 +256,7 @@ fn run_flight(filter: &mut Filter<'_>, rig: &Rig, flight: &Recording, frame: &Lo
     items.sort_by_key(|(t, _)| *t);
     let mut now = from;
     for (t, item) in items {
-        // Long silences are crossed in steps, so that each is short against the motion.
+        // Long silences are divided into steps that are short relative to the motion.
         while t > now {
             let step = (t - now).min(Span::from_ms(50.0));
             filter.advance(step.s());
@@ -346,42 +346,45 @@ impl Pass {
 }
 
 impl Boresight {
-    /// What to fly so that the rest is told too, in words; nothing where all is.
+    /// Advice on flying so that the remaining parameters are determined; empty where all are.
     pub fn advice(&self) -> Vec<String> {
         let untold = |names: &[&str]| self.parameters.iter().any(|p| !p.told && names.contains(&p.name));
         let blurred = |name: &str| self.camera_to_compass.iter().any(|p| p.name == name && !(p.sigma < 0.2));
         let mut advice = Vec::new();
         if blurred("yaw") {
-            advice.push("The camera's yaw is not told: fly to and fro past the marker at 3 m/s or more, in two directions.");
+            advice.push("The camera's yaw is not determined: fly past the marker at 3 m/s or more, in two directions.");
         }
         if blurred("pitch") || blurred("roll") {
             advice.push(
-                "The camera's pitch or roll is not told: turn the helicopter through a whole circle over the \
+                "The camera's pitch or roll is not determined: turn the helicopter through a whole circle over the \
                  marker, twice, at constant height.",
             );
         }
         if untold(&["mount yaw", "compass yaw", "compass pitch zero", "compass roll zero"]) {
             advice.push(
-                "Mount and compass zeros are told together, not apart; for positions only their difference \
-                 matters. To part yaw, bank steeply (15° and more) to both sides over the marker; to part \
+                "Mount and compass zeros are determined only together; for positions only their difference \
+                 matters. To separate yaw, bank steeply (15° and more) to both sides over the marker; to separate \
                  tilt, level the compass on the bench.",
             );
         }
         if untold(&["lever arm forward", "lever arm right"]) {
             advice.push(
-                "The lever arm is not told: turn on the spot over the marker, at 5 m and again at 15 m.",
+                "The lever arm is not determined: turn on the spot over the marker, at 5 m and again at 15 m.",
             );
         }
         if untold(&["lever arm down"]) {
-            advice.push("The lever arm's height is not told apart from GPS height: measure it with a ruler.");
+            advice
+                .push("The lever arm's height cannot be separated from GPS height: measure it with a ruler.");
         }
         if untold(&["compass late by"]) {
             advice.push(
-                "The compass's lateness is not told: yaw quickly to and fro (30° a second) over the marker.",
+                "The compass's lateness is not determined: yaw quickly left and right (30° a second) over the marker.",
             );
         }
         if untold(&["gps late by"]) {
-            advice.push("The GPS's lateness is not told: fly past the marker fast, in opposite directions.");
+            advice.push(
+                "The GPS's lateness is not determined: fly past the marker fast, in opposite directions.",
+            );
         }
         advice.into_iter().map(str::to_owned).collect()
     }

@@ -1,8 +1,7 @@
 //! The estimator of a boresight: helicopter, markers and mounting in one state, raw measurements in.
 //!
-//! A recursive least-squares pass over a flight in order of validity. Errors are small changes to the
-//! state `x ⊞ δ`; Jacobians are differences of the measurement's own function, so that there is one
-//! statement of each model.
+//! A recursive least-squares pass over a flight in order of validity. Errors are small changes to the state `x ⊞ δ`;
+//! Jacobians are finite differences of the measurement function, so that each model is written once.
 
 use std::collections::BTreeMap;
 
@@ -15,14 +14,14 @@ use windhover_base::settings::{MarkerConfig, MarkerKind, Rig};
 
 /// Jerk of the helicopter, power density, (m/s³)²/Hz: a hard stop takes a second.
 const JERK: f64 = 4.0;
-/// Angular acceleration, power density, (rad/s²)²/Hz: what a model helicopter does in flight at
-/// ease. A larger one lets the noise of the rates into the compass's lateness.
+/// Angular acceleration, power density, (rad/s²)²/Hz: of a model helicopter in calm flight. With a larger one the noise
+/// of the rates enters the compass's lateness.
 const ANGULAR: f64 = 0.1;
-/// The vertical error of GPS is this many times the horizontal one.
+/// Ratio of vertical to horizontal GPS error.
 const VERTICAL: f64 = 1.6;
-/// Pixel noise that even a perfect corner has (lens model, rolling motion), one-sigma.
+/// Least pixel noise of a corner (lens model, rolling motion), one-sigma.
 const LEAST_PX: f64 = 0.15;
-/// Largest normalised innovation squared per component that is used.
+/// Largest normalised innovation squared for each component that is used.
 const GATE: f64 = 16.0;
 
 /// One pass over one flight.
@@ -32,7 +31,7 @@ pub(super) struct Filter<'a> {
     state: State,
     covariance: DMatrix<f64>,
     known: BTreeMap<MarkerId, usize>,
-    /// Parameters about which measurements are linearised; the state's own where `None`.
+    /// Parameters at which measurements are linearised; the state's own where `None`.
     about: Option<Parameters>,
     /// Sum of squared normalised pixel residuals, and how many.
     pub(super) fit: (f64, usize),
@@ -41,7 +40,7 @@ pub(super) struct Filter<'a> {
 }
 
 impl<'a> Filter<'a> {
-    /// Begins a flight at a first position, velocity and attitude, with parameters and their covariance.
+    /// Starts a flight at a first position, velocity and attitude, with parameters and their covariance.
     pub(super) fn new(
         rig: &'a Rig,
         declination: f64,
@@ -82,7 +81,7 @@ impl<'a> Filter<'a> {
         (self.state.parameters, block)
     }
 
-    /// Markers found: their identity, centre in NED and its one-sigma.
+    /// Estimated markers: their identity, centre in NED and its one-sigma.
     pub(super) fn markers(&self) -> impl Iterator<Item = (MarkerId, Vector3<f64>, Vector3<f64>)> {
         self.known.iter().map(|(id, k)| {
             let at = BASE + PER_MARKER * k;
@@ -91,7 +90,7 @@ impl<'a> Filter<'a> {
         })
     }
 
-    /// Moves the state on by `dt` seconds.
+    /// Predicts the state by `dt` seconds.
     pub(super) fn advance(&mut self, dt: f64) {
         let n = self.state.size();
         let s = &mut self.state;
@@ -113,11 +112,11 @@ impl<'a> Filter<'a> {
         self.covariance = p;
     }
 
-    /// White jerk through acceleration, velocity and position; white angular acceleration through rate
-    /// and attitude; what the GPS bias wanders.
+    /// White jerk through acceleration, velocity and position; white angular acceleration through rate and attitude;
+    /// the random walk of the GPS bias.
     fn add_process_noise(&self, p: &mut DMatrix<f64>, dt: f64, keep: f64) {
         let sigma = self.rig.gps.bias_sigma_m;
-        // ∫ of the chain's response: [dt⁵/20 dt⁴/8 dt³/6; · dt³/3 dt²/2; · · dt].
+        // Integral of the chain's response: [dt⁵/20 dt⁴/8 dt³/6; · dt³/3 dt²/2; · · dt].
         let chain = [
             [dt.powi(5) / 20.0, dt.powi(4) / 8.0, dt.powi(3) / 6.0],
             [dt.powi(4) / 8.0, dt.powi(3) / 3.0, dt * dt / 2.0],
@@ -141,8 +140,8 @@ impl<'a> Filter<'a> {
         }
     }
 
-    /// Takes a measurement: residual (measured minus expected) as a function of the state, noise
-    /// variances, and the states it depends on. False where the gate refused it.
+    /// Takes a measurement: residual (measured minus expected) as a function of the state, noise variances, and the
+    /// states it depends on. Returns false where the gate refused it.
     fn update(
         &mut self,
         residual: &dyn Fn(&State) -> Option<DVector<f64>>,
@@ -159,7 +158,7 @@ impl<'a> Filter<'a> {
             let Some(moved) = residual(&point.moved(axis, step)) else { return false };
             h.set_column(axis, &((&r - moved) / step));
         }
-        // The residual at the state's own parameters, by the derivative at the point.
+        // The residual at the state's own parameters, from the derivative at the linearisation point.
         for (k, own) in self.state.parameters.iter().enumerate() {
             r -= h.column(FIRST + k) * (own - point.parameters[k]);
         }
@@ -183,10 +182,9 @@ impl<'a> Filter<'a> {
         true
     }
 
-    /// Pixels tell nothing of a turn of everything about the vertical. What earlier ones told was worked
-    /// out where the state then was; as the state moves, the direction they left open moves with it
-    /// (`P ← T P Tᵀ`, `T = I + d eᵀ`, `e` the yaw). Without this the filter believes to know a yaw that
-    /// nothing told it.
+    /// Pixels do not observe a rotation of everything about the vertical. Earlier measurements were linearised at
+    /// earlier states; as the state moves, the unobserved direction moves with it (`P ← T P Tᵀ`, `T = I + d eᵀ`, `e`
+    /// the yaw). Without this the filter becomes confident of a yaw that no measurement observed.
     fn shear(&mut self, d: &DVector<f64>) {
         let yaw = ATTITUDE + 2;
         let column = self.covariance.column(yaw).into_owned();
@@ -194,7 +192,7 @@ impl<'a> Filter<'a> {
         self.covariance += d * column.transpose() + &column * d.transpose() + d * d.transpose() * variance;
     }
 
-    /// GPS position in NED: the antenna's, with the slow bias, late by the GPS parameter.
+    /// GPS position in NED: of the antenna, with the slow bias, late by the GPS parameter.
     pub(super) fn gps_position(&mut self, measured: Vector3<f64>, sigma: f64) {
         let antenna = Vector3::from(self.rig.gps.antenna_position_m);
         let expect = move |s: &State| {
@@ -252,7 +250,7 @@ impl<'a> Filter<'a> {
         }
     }
 
-    /// A marker seen: the corners of a tag, or the centre of a disc.
+    /// A detected marker: the corners of a tag, or the centre of a disc.
     pub(super) fn marker(&mut self, seen: &MarkerDetection, marker: &MarkerConfig) {
         let k = match self.known.get(&seen.marker) {
             Some(k) => *k,
@@ -300,7 +298,7 @@ impl<'a> Filter<'a> {
         }
     }
 
-    /// Puts a marker where its size in the image says it is. `None` where that cannot be.
+    /// Places a marker by its size in the image. `None` where that is impossible.
     fn begin_marker(&mut self, seen: &MarkerDetection, marker: &MarkerConfig) -> Option<usize> {
         let size_m = marker.size_m.or(marker.diameter_m)?;
         let camera = &self.rig.camera.intrinsics;
@@ -320,7 +318,7 @@ impl<'a> Filter<'a> {
         self.state.markers.push(MarkerState { center, top });
         let old = self.covariance.nrows();
         self.covariance.resize_mut(old + PER_MARKER, old + PER_MARKER, 0.0);
-        // Wide: what is known of it comes from the pixels alone.
+        // Wide priors: all information comes from the pixels.
         for (axis, sigma) in [10.0, 10.0, 10.0, 0.7].into_iter().enumerate() {
             self.covariance[(old + axis, old + axis)] = f64::powi(sigma, 2);
         }

@@ -6,9 +6,9 @@ use windhover_base::settings::Rig;
 
 /// Parameters of mounting and time, in the order of the state.
 pub(super) const PARAMETERS: usize = 11;
-/// Where they begin in the state: after position, velocity, acceleration, GPS bias, attitude, rate.
+/// Where they start in the state: after position, velocity, acceleration, GPS bias, attitude, rate.
 pub(super) const FIRST: usize = 18;
-/// States of each marker: its centre (north, east, down) and where its top points.
+/// States of each marker: its centre (north, east, down) and the direction of its top.
 pub(super) const PER_MARKER: usize = 4;
 pub(super) const BASE: usize = FIRST + PARAMETERS;
 pub(super) const ATTITUDE: usize = 12;
@@ -71,7 +71,8 @@ impl State {
         BASE + PER_MARKER * self.markers.len()
     }
 
-    /// How the state changes as everything turns about the vertical, per radian, but for what is constant.
+    /// Derivative of the state with respect to a rotation of everything about the vertical, per radian, without the
+    /// constants.
     pub(super) fn turning(&self) -> DVector<f64> {
         let mut out = DVector::zeros(self.size());
         let mut put = |at: usize, v: &Vector3<f64>| {

@@ -1,4 +1,4 @@
-//! The inner corners of a chessboard in an image, found without help.
+//! The inner corners of a chessboard in an image, found automatically.
 
 use nalgebra::Vector2;
 
@@ -10,16 +10,16 @@ use windhover_base::msg::ImageView;
 /// Why an image gave no board.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, thiserror::Error)]
 pub enum BoardError {
-    /// Nothing like a board.
-    #[error("no chessboard is seen ({corners} corner-like points, the largest grid has {in_grid})")]
+    /// No board was found.
+    #[error("no chessboard is found ({corners} corner-like points, the largest grid has {in_grid})")]
     NotSeen {
         /// Points where two edges cross.
         corners: usize,
-        /// Of those, in the largest grid.
+        /// Number of those in the largest grid.
         in_grid: usize,
     },
     /// A part is hidden, outside the image, in glare or in deep shadow.
-    #[error("only a part of the board is seen: {columns}x{rows} with {found} of {wanted} corners")]
+    #[error("only a part of the board is visible: {columns}x{rows} with {found} of {wanted} corners")]
     Partial {
         /// Columns seen.
         columns: usize,
@@ -31,7 +31,7 @@ pub enum BoardError {
         wanted: usize,
     },
     /// A grid of another size.
-    #[error("the board seen has {columns}x{rows} inner corners: is --board right?")]
+    #[error("the board has {columns}x{rows} inner corners: is --board right?")]
     OtherSize {
         /// Columns seen.
         columns: usize,
@@ -40,36 +40,36 @@ pub enum BoardError {
     },
 }
 
-/// Corners row by row; `None` where one could not be placed.
+/// Corners row by row; `None` where one could not be located.
 pub type Corners = Vec<Option<Vector2<f64>>>;
 
-/// Most that an inner corner may lie aside of the middle of its neighbours, in shares of the distance
-/// to the nearest: perspective and distortion of a usable photograph stay below.
+/// Largest distance of an inner corner from the middle of its neighbours, as a share of the distance to the nearest:
+/// perspective and distortion of a usable photograph stay below it.
 const STRAY_SHARE: f64 = 0.06;
-/// Least share of the corners with which a board is used.
+/// Smallest share of the corners with which a board is used.
 const LEAST_SHARE: f64 = 0.8;
 /// Blur and ring radius, pixels, of each attempt: sharp first, then blurred or noisy images, then
 /// small squares.
 const ATTEMPTS: [(f64, f64); 4] = [(1.4, 4.5), (2.2, 6.5), (1.0, 3.2), (0.8, 2.4)];
-/// Grids looked at in each attempt; a photograph may show other boards too.
+/// Most grids that are examined in each attempt; a photograph may show other boards too.
 const MOST_GRIDS: usize = 4;
-/// A corner is looked for at no more than this many pixels across; larger images are halved first.
+/// Corners are first searched for in an image of at most this many pixels across; larger images are halved.
 const COARSE_PX: usize = 1_000;
-/// A corner moves less than this share of the distance to the nearest neighbour when it is placed.
+/// When it is located exactly, a corner moves by less than this share of the distance to the nearest neighbour.
 const REACH_SHARE: f64 = 0.5;
-/// Half the window of exact placement unless told otherwise, pixels: what OpenCV's calibration
-/// programs use, so that figures can be compared. Where it would reach more than half-way to the next
-/// corner, only the part is used that lies nearer to the corner's own edges than to the next ones.
+/// Default half-width of the window of exact location, pixels: that of OpenCV's calibration programs, so that results
+/// can be compared. Where the window would reach more than half-way to the next corner, only the part is used that is
+/// nearer to the corner's own edges than to the next ones.
 pub const WINDOW_PX: f64 = 11.0;
 
-/// The `columns × rows` inner corners, row by row, exact to a fraction of a pixel; `None` for the few
-/// (a fifth at most) that glare, the edge of a shadow or the border of the image keep from being placed.
+/// The `columns × rows` inner corners, row by row, to a fraction of a pixel; `None` for the few (at most a fifth) that
+/// cannot be located because of glare, the edge of a shadow or the border of the image.
 ///
-/// Rows run so that columns to rows turn clockwise in the image, as on the printed side; of the
-/// (two or four) ways left the one whose first corner is nearest the top-left of the image is taken.
-/// Which corner is first does not matter to calibration.
+/// Rows run so that columns to rows turn clockwise in the image, as on the printed side; of the remaining two or four
+/// orders, the one is used whose first corner is nearest the top-left of the image. The choice of the first corner does
+/// not affect calibration.
 ///
-/// `window_px` is half the width of the window in which each corner is placed ([`WINDOW_PX`]).
+/// `window_px` is half the width of the window in which each corner is located ([`WINDOW_PX`]).
 ///
 /// # Errors
 /// Where no board of this size is found, or too many of its corners are hidden.
@@ -107,7 +107,7 @@ pub fn find_corners(
 }
 
 impl BoardError {
-    /// Of two failed attempts the one that saw more.
+    /// Of two failed attempts the one that found more.
     fn nearer(self, other: Self) -> Self {
         if other.seen() > self.seen() { other } else { self }
     }
@@ -159,12 +159,12 @@ fn judge(grid: &Grid, columns: usize, rows: usize, corners: usize) -> Result<(),
     Err(BoardError::Partial { columns: wide, rows: tall, found: grid.len(), wanted: columns * rows })
 }
 
-/// The corners row by row; the grid has exactly this size, one way or the other.
+/// The corners row by row; the grid has exactly this size, in either orientation.
 fn in_order(grid: &Grid, columns: usize, rows: usize) -> Corners {
     let Some((low, high)) = extent(grid) else { return Vec::new() };
     let along_columns = (high.0 - low.0 + 1) as usize == columns;
     let square = columns == rows;
-    // Quarter turns of the board that keep its handedness; a square board may take all four.
+    // Quarter turns of the board that keep its handedness; a square board can have all four.
     let mut best: Option<(f64, Corners)> = None;
     for turn in 0..4 {
         if !square && (turn % 2 == 0) != along_columns {
@@ -188,7 +188,7 @@ fn in_order(grid: &Grid, columns: usize, rows: usize) -> Corners {
     best.map(|(_, corners)| corners).unwrap_or_default()
 }
 
-/// Places every corner exactly on the full image.
+/// Locates every corner exactly on the full image.
 fn place(full: &FloatImage, corners: Corners, columns: usize, window_px: f64) -> Result<Corners, BoardError> {
     let placed: Corners = (0..corners.len())
         .map(|k| {
@@ -201,7 +201,7 @@ fn place(full: &FloatImage, corners: Corners, columns: usize, window_px: f64) ->
                 Some((along, across)) => Window::square(room).within(along, across),
                 None => Window::square(half_way),
             };
-            // Half a square aside is another corner.
+            // Half a square away is another corner.
             let close = |p: &Vector2<f64>| (p - start).norm() < half_way;
             (room.min(half_way) >= 2.0).then(|| refine(full, start, window)).flatten().filter(close)
         })
@@ -214,8 +214,8 @@ fn place(full: &FloatImage, corners: Corners, columns: usize, window_px: f64) ->
     Ok(placed)
 }
 
-/// Leaves out inner corners that do not lie between their neighbours: the edge of a shadow or a glint
-/// drew them aside. Corners along the border of the board have no neighbours to tell.
+/// Removes inner corners that are not between their neighbours: the edge of a shadow or a glint displaced them. Corners
+/// along the border of the board have no neighbours for this check.
 fn without_strays(corners: Corners, columns: usize) -> Corners {
     let rows = corners.len() / columns;
     let at = |c: i64, r: i64| {
@@ -225,8 +225,7 @@ fn without_strays(corners: Corners, columns: usize) -> Corners {
     let between = |c: i64, r: i64, step: (i64, i64)| {
         let neighbour = |k: i64| at(c + k * step.0, r + k * step.1);
         let (before, after) = (neighbour(-1)?, neighbour(1)?);
-        // The cubic through four neighbours follows perspective and distortion; the line through two
-        // follows less.
+        // The cubic through four neighbours follows perspective and distortion better than the line through two.
         Some(match (neighbour(-2), neighbour(2)) {
             (Some(first), Some(last)) => ((before + after) * 4.0 - first - last) / 6.0,
             _ => (before + after) / 2.0,
@@ -244,8 +243,8 @@ fn without_strays(corners: Corners, columns: usize) -> Corners {
     (0..corners.len()).map(|k| corners[k].filter(|p| stays(k, *p))).collect()
 }
 
-/// From a corner to the next one along its row (`step` 1) or column (`step` the number of columns), the
-/// nearer of the two there are.
+/// From a corner to the next one along its row (`step` 1) or column (`step` the number of columns), the nearer of the
+/// two neighbours.
 fn to_next(corners: &Corners, columns: usize, k: usize, step: usize) -> Option<Vector2<f64>> {
     let own = corners[k]?;
     let same_row = |n: &usize| step != 1 || n / columns == k / columns;
@@ -289,7 +288,7 @@ mod tests {
         DrawnBoard::new(camera(), (640, 480), (9, 6), 0.025).posed(turn, pitch, roll, 0.42)
     }
 
-    /// Largest distance from the true corners, whichever of the ways round was taken.
+    /// Largest distance from the true corners, in whichever order was used.
     fn worst(found: &Corners, truth: &[Vector2<f64>]) -> f64 {
         let off = |a: &mut dyn Iterator<Item = &Option<Vector2<f64>>>| {
             a.zip(truth).filter_map(|(f, t)| Some((f.as_ref()? - t).norm())).fold(0.0, f64::max)

@@ -1,4 +1,4 @@
-//! Boards drawn for tests: a chessboard through a distorting lens, with noise and shadow.
+//! Boards rendered for tests: a chessboard through a distorting lens, with noise and shadow.
 
 use nalgebra::{Rotation3, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
@@ -45,7 +45,7 @@ impl DrawnBoard {
         Self { camera, size, inner, square_m, pose }
     }
 
-    /// Turned in the image, tilted, its middle `distance_m` in front of the camera.
+    /// Rotated in the image, tilted, its middle `distance_m` in front of the camera.
     pub(crate) fn posed(mut self, turn: f64, pitch: f64, roll: f64, distance_m: f64) -> Self {
         let rotation = ned_from_body_321(0.0, pitch, roll) * windhover_base::geo::rot_z(turn);
         let span = |n: usize| (n - 1) as f64 * self.square_m / 2.0;
@@ -96,7 +96,7 @@ impl DrawnBoard {
         image
     }
 
-    /// Brightness seen through a point of the image.
+    /// Brightness of a point of the image.
     fn light(&self, px: Vector2<f64>) -> f64 {
         let background = 110.0;
         let Some(m) = self.camera.normalised(px) else { return background };

@@ -1,4 +1,4 @@
-//! Saddle points joined into the grid of a board: neighbours along edges, then rows and columns.
+//! Saddle points combined into the grid of a board: neighbours along edges, then rows and columns.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -13,19 +13,19 @@ pub(super) type Cell = (i32, i32);
 
 /// Steps along the four edges of a saddle, in their order around the circle.
 const STEPS: [Cell; 4] = [(1, 0), (0, 1), (-1, 0), (0, -1)];
-/// Most that a neighbour may lie off the edge that leads to it, radians.
+/// Largest angle of a neighbour from the edge that leads to it, radians.
 const MOST_ASIDE: f64 = 0.22;
-/// Cost of lying aside by one radian, in lengths of the step.
+/// Cost of such an angle of one radian, in lengths of the step.
 const ASIDE_COST: f64 = 3.0;
 
-/// Most that one square's edge may be longer than the next.
+/// Largest ratio between the edges of neighbouring squares.
 const MOST_GROWTH: f64 = 1.7;
 
 /// Corners by cell.
 pub(super) type Grid = BTreeMap<Cell, Vector2<f64>>;
 
-/// The grids that the saddles form, largest first, at most `most` of them, with holes filled where the
-/// image shows a saddle.
+/// The grids that the saddles form, largest first, at most `most` of them, with gaps filled where the image has a
+/// saddle.
 pub(super) fn grids(blurred: &FloatImage, saddles: &[Saddle], radius: f64, most: usize) -> Vec<Grid> {
     let links = link(blurred, saddles);
     let mut seen = vec![false; saddles.len()];
@@ -46,7 +46,7 @@ pub(super) fn grids(blurred: &FloatImage, saddles: &[Saddle], radius: f64, most:
     found
 }
 
-/// Drops outermost rows and columns that hold next to nothing: stray points beside the board.
+/// Removes outermost rows and columns that are nearly empty: stray points beside the board.
 fn shed(grid: &mut Grid) {
     while let Some((low, high)) = extent(grid) {
         let (wide, tall) = (high.0 - low.0 + 1, high.1 - low.1 + 1);
@@ -78,7 +78,7 @@ fn link(blurred: &FloatImage, saddles: &[Saddle]) -> Links {
         |a: usize, edge: usize| chosen[a][edge].filter(|&(b, back)| chosen[b][back] == Some((a, edge)));
     let links: Links = (0..saddles.len()).map(|a| std::array::from_fn(|edge| mutual(a, edge))).collect();
     let length = |a: usize, edge: usize| links[a][edge].map(|(b, _)| (saddles[b].px - saddles[a].px).norm());
-    // Squares in a row grow and shrink slowly: a link much longer than the one before leaves the board.
+    // Squares in a row change in size slowly: a link much longer than the previous one leaves the board.
     let in_step = |a: usize, edge: usize| match (length(a, edge), length(a, (edge + 2) % 4)) {
         (Some(this), Some(opposite)) => this < MOST_GROWTH * opposite,
         _ => true,
@@ -101,7 +101,7 @@ fn nearest_along(blurred: &FloatImage, saddles: &[Saddle], a: usize, edge: usize
         }
         let back = (0..4).find(|&k| {
             let off = wrap_angle(to.edges[k] - bearing - std::f64::consts::PI).abs();
-            // The light side of an edge is the same seen from both ends.
+            // The light side of an edge is the same at both ends.
             off < 2.0 * MOST_ASIDE && to.rises(k) != from.rises(edge)
         });
         if let Some(back) = back {
@@ -113,11 +113,11 @@ fn nearest_along(blurred: &FloatImage, saddles: &[Saddle], a: usize, edge: usize
     candidates.into_iter().take(3).find(|&(_, b, _)| is_edge(b)).map(|(_, b, back)| (b, back))
 }
 
-/// Whether the line between two corners has its light side where the first corner says.
+/// Whether the line between two corners has its light side where the first corner indicates.
 fn edge_holds(blurred: &FloatImage, from: Vector2<f64>, to: Vector2<f64>, rises: bool) -> bool {
     let along = to - from;
     let aside = Vector2::new(-along.y, along.x) * 0.2;
-    // A wide square is probed near its edge: a shadow may fall across it.
+    // A wide square is sampled near its edge: a shadow may fall across it.
     let aside = aside * (6.0 / aside.norm()).min(1.0);
     [0.3, 0.5, 0.7].into_iter().all(|share| {
         let at = from + along * share;
@@ -134,7 +134,7 @@ fn walk(saddles: &[Saddle], links: &Links, start: usize, seen: &mut [bool]) -> G
     let mut queue = VecDeque::from([(start, (0, 0), 0usize)]);
     seen[start] = true;
     grid.insert((0, 0), saddles[start].px);
-    // `turn` is the step that the saddle's first edge takes.
+    // `turn` is the step of the saddle's first edge.
     while let Some((a, cell, turn)) = queue.pop_front() {
         for (edge, end) in links[a].iter().enumerate() {
             let Some((b, back)) = *end else { continue };
@@ -175,7 +175,7 @@ fn fill(blurred: &FloatImage, grid: &mut Grid, radius: f64) {
     }
 }
 
-/// Where a cell should be by the lines through its neighbours, and how far its neighbours are.
+/// The predicted place of a cell from the lines through its neighbours, and the distance of its neighbours.
 fn continuation(grid: &Grid, cell: Cell) -> Option<(Vector2<f64>, f64)> {
     let at = |k: i32, s: Cell| grid.get(&(cell.0 + k * s.0, cell.1 + k * s.1));
     let mut guesses: Vec<(Vector2<f64>, f64)> = Vec::new();

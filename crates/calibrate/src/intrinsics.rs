@@ -20,26 +20,26 @@ pub enum IntrinsicsError {
     TooFewViews(usize),
     /// The views do not determine the camera.
     #[error(
-        "the views do not tell the camera's parameters apart: tilt the board by 20 to 45 degrees, in several directions"
+        "the views do not determine the camera's parameters: tilt the board by 20 to 45 degrees, in several directions"
     )]
     Degenerate,
-    /// A view's points lie on a line or are too few.
+    /// A view has too few points, or all on a line.
     #[error("view {0} has too few points, or points on a line")]
     BadView(usize),
 }
 
-/// How one view fits.
+/// Fit of one view.
 #[derive(Clone, PartialEq, Debug)]
 pub struct ViewFit {
-    /// Where the plane was.
+    /// Pose of the plane.
     pub pose: PlanePose,
-    /// Seen minus projected, pixels, in the order of the view's points.
+    /// Observed minus projected, pixels, in the order of the view's points.
     pub residuals_px: Vec<Vector2<f64>>,
     /// Root of the mean squared length of the residuals.
     pub rms_px: f64,
 }
 
-/// The camera found.
+/// The estimated camera.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Intrinsics {
     /// Its parameters.
@@ -49,9 +49,9 @@ pub struct Intrinsics {
     pub sigma: [f64; COUNT],
     /// Root of the mean squared length of all residuals, as OpenCV reports it.
     pub rms_px: f64,
-    /// One-sigma of a residual per axis, with the degrees of freedom taken off.
+    /// One-sigma of a residual per axis, corrected for the degrees of freedom.
     pub noise_px: f64,
-    /// How each view fits, in the order given.
+    /// Fit of each view, in the given order.
     pub views: Vec<ViewFit>,
     /// Points used.
     pub points: usize,
@@ -63,7 +63,7 @@ pub struct Intrinsics {
 /// plane's pose by Levenberg–Marquardt; poses are eliminated view by view (Schur complement).
 ///
 /// # Errors
-/// With too few views, or where they do not determine the camera (all square to the lens, for example).
+/// With too few views, or where they do not determine the camera (for example all parallel to the image plane).
 pub fn calibrate(
     views: &[PlaneView],
     width: f64,
@@ -108,7 +108,7 @@ fn result(problem: Problem<'_>) -> Result<Intrinsics, IntrinsicsError> {
     if !problem.wanted.skew {
         sigma[SKEW] = 0.0;
     }
-    // A focal length known to no better than a fifth of itself is not known.
+    // A focal length whose sigma is more than a fifth of it is not known.
     if !(sigma[0] < 0.2 * problem.camera.fx && sigma[1] < 0.2 * problem.camera.fy) {
         return Err(IntrinsicsError::Degenerate);
     }
@@ -207,7 +207,7 @@ mod tests {
         assert!((0.7..1.4).contains(&mean), "{mean}");
     }
 
-    /// The camera found by photographs of these boards, each corner placed in a window so wide.
+    /// The camera estimated from photographs of these boards, each corner located in a window of this width.
     fn photographed(boards: &[DrawnBoard], window_px: f64) -> Intrinsics {
         let view = |b: &DrawnBoard| {
             let found = find_corners(b.image(None).view(), 9, 6, window_px).expect("in full view");
@@ -235,7 +235,7 @@ mod tests {
         assert!(found.rms_px < 0.12, "{}", found.rms_px);
     }
 
-    /// Tilted by 62°, squares are half as high as wide, and an 11 px window lies over the next edges.
+    /// Tilted by 62°, squares are half as high as wide, and an 11 px window covers the next edges.
     #[test]
     fn steep_boards_are_placed_within_their_own_squares() {
         let steep = |k: usize| {

@@ -14,7 +14,7 @@ pub(super) const K3: usize = 8;
 pub(super) const SKEW: usize = 9;
 
 const MOST_STEPS: usize = 100;
-/// The search ends when the sum of squares falls by less than this share of itself.
+/// The search ends when the sum of squares decreases by less than this share of itself.
 const LEAST_GAIN: f64 = 1e-10;
 
 /// Which of the optional parameters are estimated; the others stay zero.
@@ -26,7 +26,7 @@ pub struct Wanted {
     pub skew: bool,
 }
 
-/// A least-squares problem at its present guess.
+/// A least-squares problem at its present values.
 #[derive(Clone)]
 pub(super) struct Problem<'a> {
     pub(super) views: &'a [PlaneView],
@@ -38,7 +38,7 @@ pub(super) struct Problem<'a> {
 type OfCamera = SMatrix<f64, COUNT, COUNT>;
 type Mixed = SMatrix<f64, COUNT, 6>;
 
-/// Normal equations in blocks: camera, each pose, and between.
+/// Normal equations in blocks: camera, each pose, and cross terms.
 pub(super) struct Normal {
     camera: OfCamera,
     camera_right: SVector<f64, COUNT>,
@@ -60,7 +60,7 @@ impl Problem<'_> {
         (0..self.views.len()).map(|k| self.residuals(k).map(|r| r.norm_squared()).sum::<f64>()).sum()
     }
 
-    /// Goes downhill until nothing is gained.
+    /// Iterates until nothing is gained.
     pub(super) fn solve(&mut self) {
         let mut damping = 1e-3;
         let mut cost = self.cost();
@@ -74,7 +74,7 @@ impl Problem<'_> {
         }
     }
 
-    /// One accepted step and what it gained; `None` when no damping helps.
+    /// One accepted step and its gain; `None` when no damping helps.
     fn improve(&mut self, normal: &Normal, cost: f64, damping: &mut f64) -> Option<f64> {
         while *damping < 1e12 {
             if let Some(next) = self.stepped(normal, *damping) {
@@ -90,7 +90,7 @@ impl Problem<'_> {
         None
     }
 
-    /// Normal equations `Jᵀ J`, `Jᵀ r` at the present guess.
+    /// Normal equations `Jᵀ J`, `Jᵀ r` at the present values.
     pub(super) fn normal(&self) -> Normal {
         let mut camera = OfCamera::zeros();
         let mut camera_right = SVector::zeros();
@@ -110,8 +110,8 @@ impl Problem<'_> {
         Normal { camera, camera_right, poses }
     }
 
-    /// Residual of a point and the derivatives of its projection by camera and pose. The pose moves
-    /// by a small rotation ε on the left and a shift τ: `p = exp(ε) R x + t + τ`.
+    /// Residual of a point and the derivatives of its projection with respect to camera and pose. The pose changes by a
+    /// small rotation ε on the left and a translation τ: `p = exp(ε) R x + t + τ`.
     fn linearised(
         &self,
         pose: &PlanePose,
@@ -153,8 +153,8 @@ impl Problem<'_> {
         (px - projected, of_camera, of_pose)
     }
 
-    /// The camera's own normal equations with the poses eliminated: `A − Σ B C⁻¹ Bᵀ`. Parameters that
-    /// are not estimated get a unit diagonal and stay where they are.
+    /// The camera's own normal equations with the poses eliminated: `A − Σ B C⁻¹ Bᵀ`. Parameters that are not estimated
+    /// get a unit diagonal and do not change.
     pub(super) fn reduced(&self, normal: &Normal, damping: f64) -> Option<(OfCamera, SVector<f64, COUNT>)> {
         let damp = 1.0 + damping;
         let mut left = normal.camera;

@@ -35,24 +35,24 @@ pub const SOURCES: [&str; SOURCE_COUNT] = [
     "principal point v",
 ];
 const SOURCE_COUNT: usize = 16;
-/// The farthest slant accepted; far beyond any camera that could see a vehicle.
+/// Largest accepted slant range; far beyond any camera that could see a vehicle.
 const LIMIT_M: f64 = 1e5;
 
 /// One value per source of [`SOURCES`]; metres, radians, pixels.
 pub type PerSource = [f64; SOURCE_COUNT];
 
-/// What is analysed.
+/// The setup of an analysis.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Setup {
     /// The lens.
     pub camera: CameraModel,
-    /// How the camera is mounted.
+    /// The camera's mounting.
     pub mount: CameraMount,
     /// Camera position, north-east-down, metres; ground at down = 0.
     pub position_ned_m: Vector3<f64>,
     /// Heading, pitch, roll of the aircraft (3-2-1), radians.
     pub attitude_rad: [f64; 3],
-    /// Pixel looked at.
+    /// The pixel.
     pub pixel: Vector2<f64>,
     /// Height of the point over the ground, metres.
     pub above_m: f64,
@@ -62,7 +62,7 @@ pub struct Setup {
     pub distribution: Distribution,
 }
 
-/// What came of it. Errors are estimated minus true, metres.
+/// The result. Errors are estimated minus true, metres.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Analysis {
     /// (north, east) error of each sample that met the ground.
@@ -75,33 +75,33 @@ pub struct Analysis {
     pub sample_m2: Matrix2<f64>,
     /// First-order covariance, m².
     pub closed_m2: Matrix2<f64>,
-    /// Radii about the true point that hold 50 % and 95 % of the samples.
+    /// Radii about the true point that contain 50 % and 95 % of the samples.
     pub r50_m: f64,
     /// 95 %.
     pub r95_m: f64,
-    /// The worst sample.
+    /// The largest error.
     pub max_m: f64,
-    /// What each source alone does to first order, largest first.
+    /// First-order effect of each source alone, largest first.
     pub budget: Vec<BudgetLine>,
 }
 
-/// One source's part in the error.
+/// One source's contribution to the error.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct BudgetLine {
     /// Its name.
     pub source: &'static str,
     /// Its one-sigma in its own unit: metres, radians or pixels.
     pub sigma: f64,
-    /// What it does to north, one-sigma, metres.
+    /// Its effect on north, one-sigma, metres.
     pub north_m: f64,
-    /// What it does to east, one-sigma, metres.
+    /// Its effect on east, one-sigma, metres.
     pub east_m: f64,
     /// Its share of the total variance, 0 to 1.
     pub share: f64,
 }
 
 impl Setup {
-    /// From `[montecarlo]`, and `[camera.intrinsics]` and `[camera.mount]` of a camera.
+    /// A setup from `[montecarlo]`, and `[camera.intrinsics]` and `[camera.mount]` of a camera.
     pub fn new(mc: &MonteCarloConfig, camera: &CameraConfig) -> Self {
         let CameraConfig { intrinsics: camera, mount: camera_mount, .. } = *camera;
         let on_axis = Vector2::new(camera.cx, camera.cy);
@@ -148,7 +148,7 @@ impl Setup {
             )
     }
 
-    /// Where geo-positioning puts the point with these errors in what it is fed: (north, east).
+    /// The geo-positioned point with these errors in the inputs: (north, east).
     fn located(&self, error: &PerSource) -> Result<Vector2<f64>, LocateError> {
         let mut camera = self.camera;
         camera.fx += error[12];
@@ -174,7 +174,7 @@ impl Setup {
     /// along the body axes. An error of focal length or principal point acts as one of the pixel.
     ///
     /// # Errors
-    /// Where the ray of the pixel looked at does not meet the ground.
+    /// Where the ray of the pixel does not meet the ground.
     pub fn closed_form(&self, sigmas: &PerSource) -> Result<Matrix2<f64>, LocateError> {
         let square = |k: usize| sigmas[k] * sigmas[k];
         let xd = {
@@ -202,8 +202,8 @@ impl Setup {
         Ok(at.covariance_m2)
     }
 
-    /// Covariance of the camera's attitude as small rotations about north, east and down, rad²: each
-    /// Euler angle turns about its own axis of the sequence.
+    /// Covariance of the camera's attitude as small rotations about north, east and down, rad²: each Euler angle
+    /// rotates about its own axis of the sequence.
     fn attitude_covariance(&self, sigmas: &PerSource) -> Matrix3<f64> {
         let turn_axes = |yaw: f64, pitch: f64| {
             [Vector3::z(), rot_z(yaw) * Vector3::y(), rot_z(yaw) * rot_y(pitch) * Vector3::x()]
@@ -217,10 +217,10 @@ impl Setup {
         sources.map(|(axis, sigma)| axis * axis.transpose() * (sigma * sigma)).sum()
     }
 
-    /// Runs the analysis over `samples` draws; the same seed gives the same figures.
+    /// Runs the analysis over `samples` draws; the same seed gives the same results.
     ///
     /// # Errors
-    /// Where the ray of the pixel looked at does not meet the ground without any error.
+    /// Where the ray of the pixel, without any error, does not meet the ground.
     pub fn run(&self, samples: usize, seed: u64) -> Result<Analysis, LocateError> {
         let truth = self.located(&[0.0; SOURCE_COUNT])?;
         let closed_m2 = self.closed_form(&self.sigmas)?;
@@ -301,7 +301,7 @@ mod tests {
     fn row(gps_m: f64, tilt_deg: f64, distribution: Distribution) -> Setup {
         let mut setup = paper_setup();
         setup.sigmas[..2].fill(gps_m);
-        // Receivers are about 1.6 times worse in height.
+        // Receivers have about 1.6 times larger errors in height.
         setup.sigmas[2] = 1.6 * gps_m;
         setup.sigmas[4..6].fill(tilt_deg.to_radians());
         setup.distribution = distribution;
@@ -321,7 +321,7 @@ mod tests {
             let normal = row(gps, tilt, Distribution::Normal).run(SAMPLES, 7).expect("below");
             for axis in 0..2 {
                 assert!((normal.closed_m2[(axis, axis)].sqrt() - closed).abs() < 1e-4, "{closed}");
-                // The deviation of a standard deviation is 1/√(2N): 0.35 %; four of them.
+                // The deviation of a standard deviation is 1/√(2N): 0.35 %; the tolerance is four of them.
                 assert!((normal.sample_m2[(axis, axis)].sqrt() / closed - 1.0).abs() < 0.015);
             }
             // Quantiles: 0.7 % deviation each here and in the table, which has three figures.
@@ -359,7 +359,7 @@ mod tests {
 
     #[test]
     fn closed_form_matches_samples_of_every_source() {
-        // A crooked pose and mount; each source alone, small enough to be linear.
+        // A tilted pose and mount; each source alone, small enough to be linear.
         let mut setup = paper_setup();
         setup.attitude_rad = [0.7, 0.12, -0.2];
         (setup.mount.yaw_deg, setup.mount.pitch_deg, setup.mount.roll_deg) = (4.0, -3.0, 5.0);

@@ -92,10 +92,10 @@ impl FloatImage {
     }
 }
 
-/// A point where two edges cross, light and dark alternating around it.
+/// A point where two edges cross, with light and dark alternating around it.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(super) struct Saddle {
-    /// Where, pixels.
+    /// Its place, pixels.
     pub(super) px: Vector2<f64>,
     /// Directions (radians, u toward v) of the four edges outward, ascending around the circle.
     pub(super) edges: [f64; 4],
@@ -105,23 +105,23 @@ pub(super) struct Saddle {
 
 /// Samples on the ring around a candidate.
 const RING: usize = 40;
-/// Least difference from the centre, grey levels, that the four quarters around a saddle must show.
+/// Least difference from the centre, grey levels, in each of the four quarters around a saddle.
 const LEAST_CONTRAST: f64 = 3.0;
-/// Least share of the strongest quarter's contrast that the weakest must show.
+/// Least contrast of the weakest quarter, as a share of the strongest.
 const LEAST_BALANCE: f64 = 0.2;
-/// Most that opposite edges may differ from a straight line, radians.
+/// Largest deviation of opposite edges from a straight line, radians.
 const MOST_BEND: f64 = 0.45;
 /// Least angle between neighbouring edges, radians.
 const LEAST_SECTOR: f64 = 0.30;
-/// Response of the weakest candidate looked at, as a share of the strongest: a board half in deep
-/// shadow has a tenth of the contrast there, and the response goes with its square.
+/// Response of the weakest examined candidate, as a share of the strongest: a board half in deep shadow has a tenth of
+/// the contrast there, and the response is proportional to its square.
 const LEAST_RESPONSE: f32 = 0.002;
-/// Most candidates looked at closely.
+/// Most candidates that are examined closely.
 const MOST_CANDIDATES: usize = 4_000;
 
 impl Saddle {
-    /// The saddle at `px` of a blurred image, seen on a ring of `radius` pixels; `None` where the
-    /// ring does not show two straight crossing edges.
+    /// The saddle at `px` of a blurred image, examined on a ring of `radius` pixels; `None` where the ring does not
+    /// show two straight crossing edges.
     pub(super) fn at(blurred: &FloatImage, px: Vector2<f64>, radius: f64) -> Option<Self> {
         let center = blurred.sample(px)?;
         let angle = |k: f64| k * std::f64::consts::TAU / RING as f64;
@@ -181,7 +181,7 @@ fn quarters_are_even(ring: &[f64; RING]) -> bool {
     weakest > LEAST_CONTRAST && weakest > LEAST_BALANCE * strongest
 }
 
-/// Every saddle of a blurred image, seen on a ring of `radius` pixels.
+/// Every saddle of a blurred image, examined on a ring of `radius` pixels.
 pub(super) fn saddles(blurred: &FloatImage, radius: f64) -> Vec<Saddle> {
     let (width, height) = (blurred.width, blurred.height);
     if width < 8 || height < 8 {

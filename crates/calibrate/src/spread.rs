@@ -1,4 +1,4 @@
-//! How errors in the plane are spread.
+//! Statistics of errors in the plane.
 
 use nalgebra::{Matrix2, Vector2};
 
@@ -19,7 +19,7 @@ pub fn moments(errors_m: &[[f64; 2]]) -> (Vector2<f64>, Matrix2<f64>) {
     (mean, spread / (n - 1) as f64)
 }
 
-/// Radii that hold 50 % and 95 % of the errors, and the largest; zero where there are none.
+/// Radii that contain 50 % and 95 % of the errors, and the largest; zero where there are none.
 pub fn radii(errors_m: &[[f64; 2]]) -> (f64, f64, f64) {
     let mut distances: Vec<f64> = errors_m.iter().map(|e| e[0].hypot(e[1])).collect();
     distances.sort_by(f64::total_cmp);

@@ -1,4 +1,4 @@
-//! Where exactly two edges cross: the point all brightness gradients around it are square to.
+//! Exact crossing of two edges: the point to which all brightness gradients around it are perpendicular.
 
 use nalgebra::{Matrix2, Vector2};
 
@@ -7,15 +7,15 @@ use super::saddle::FloatImage;
 /// Steps smaller than this end the search, pixels.
 const SETTLED_PX: f64 = 1e-3;
 const MOST_STEPS: usize = 40;
-/// How far a window goes of the way to the next lines of the board: beyond, their blurred edges begin.
+/// How far a window reaches toward the next lines of the board, as a share: beyond it their blurred edges begin.
 const CELL_SHARE: f64 = 0.45;
 
-/// Where a corner is looked at.
+/// The window around a corner.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(super) struct Window {
     /// Half the side of the square of pixels.
     half: i32,
-    /// Turns an offset in pixels into shares of the way to the next corners along rows and columns.
+    /// Converts an offset in pixels to shares of the distance to the next corners along rows and columns.
     cell: Option<Matrix2<f64>>,
 }
 
@@ -25,9 +25,8 @@ impl Window {
         Self { half: reach.round().max(2.0) as i32, cell: None }
     }
 
-    /// The part of it that belongs to this corner alone, where the next ones lie at `along` and `across`:
-    /// squares seen slantwise are narrow parallelograms, and a window over their neighbours' edges is
-    /// drawn aside by them.
+    /// The part of it that belongs to this corner alone, where the next ones are at `along` and `across`: squares in a
+    /// slanted view are narrow parallelograms, and the edges of their neighbours would displace the result.
     pub(super) fn within(self, along: Vector2<f64>, across: Vector2<f64>) -> Self {
         let basis = Matrix2::from_columns(&[along, across]);
         let reach = (basis.abs() * Vector2::repeat(CELL_SHARE)).max().ceil().max(2.0) as i32;
@@ -41,9 +40,9 @@ impl Window {
 
 /// Refines a corner on the unblurred image within a window.
 ///
-/// Solves `Σ w g gᵀ (q − p) = 0` over the window, the point `q` for which each gradient `g` at `p` is
-/// square to `p − q` (Förstner and Gülch 1987), again and again around the new point. `None` where
-/// the window leaves the image, holds one edge only, or the point wanders off.
+/// Solves `Σ w g gᵀ (q − p) = 0` over the window, the point `q` for which each gradient `g` at `p` is perpendicular to
+/// `p − q` (Förstner and Gülch 1987), repeatedly around the new point. `None` where the window leaves the image,
+/// contains only one edge, or the point moves away.
 pub(super) fn refine(image: &FloatImage, start: Vector2<f64>, window: Window) -> Option<Vector2<f64>> {
     let mut at = start;
     for _ in 0..MOST_STEPS {

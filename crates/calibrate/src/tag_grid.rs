@@ -1,4 +1,4 @@
-//! A grid of tags as calibration target: which corner seen is which point of the sheet.
+//! A grid of tags as calibration target: which detected corner is which point of the sheet.
 
 use nalgebra::Vector2;
 
@@ -6,9 +6,9 @@ use super::zhang::{PlaneView, homography};
 use windhover_base::msg::{ImageView, TagFamily};
 use windhover_detect::{Detector, Limits, TagDetection, TagLayout};
 
-/// Smallest edge of a tag that is used, pixels: corners of smaller ones are too rough.
+/// Smallest edge of a tag that is used, pixels: corners of smaller ones are too inaccurate.
 const LEAST_PX: f64 = 14.0;
-/// Fewest tags with which an image is used: fewer tell little of the lens.
+/// Fewest tags with which an image is used: fewer determine little of the lens.
 const FEWEST: usize = 3;
 
 /// Tags numbered row by row from 0, all upright, a gap between neighbours.
@@ -20,7 +20,7 @@ pub struct TagGrid {
     pub columns: usize,
     /// Rows.
     pub rows: usize,
-    /// Edge of a tag's border, the square that is configured elsewhere too, metres.
+    /// Edge of a tag's border, the same square as in the configuration, metres.
     pub tag_m: f64,
     /// From a tag's border to the next one's, metres.
     pub gap_m: f64,
@@ -30,35 +30,35 @@ pub struct TagGrid {
 #[derive(Clone, Copy, PartialEq, Eq, Debug, thiserror::Error)]
 pub enum TagGridError {
     /// No tag, or too few.
-    #[error("{found} of the grid's {wanted} tags are seen, at least {FEWEST} are needed")]
+    #[error("{found} of the grid's {wanted} tags are visible, at least {FEWEST} are needed")]
     TooFew {
         /// Tags of the grid seen.
         found: usize,
         /// Tags of the grid.
         wanted: usize,
     },
-    /// The tags do not lie as the grid says.
-    #[error("the tags seen do not lie in a grid of {columns}x{rows}: is --board right?")]
+    /// The arrangement of the tags is not that of the grid.
+    #[error("the visible tags are not in a grid of {columns}x{rows}: is --board right?")]
     OtherGrid {
-        /// Columns asked for.
+        /// Requested columns.
         columns: usize,
-        /// Rows asked for.
+        /// Requested rows.
         rows: usize,
     },
 }
 
 impl TagGrid {
-    /// The corners of every tag seen, with their places on the sheet (x right, y down, origin at the
-    /// first corner of the tag at top left). A part of the grid will do.
+    /// The corners of every visible tag, with their places on the sheet (x right, y down, origin at the first corner of
+    /// the tag at top left). A part of the grid is sufficient.
     ///
-    /// Borders of one cell and of two, as Kalibr prints them, are both looked for: of a sheet that was printed with
-    /// either, more is seen with its own.
+    /// Borders of one cell and of two, as Kalibr prints them, are both tried: more tags of a sheet are found with its
+    /// own border.
     ///
-    /// Numbers may count from the top row down or, as Kalibr prints them, from the bottom row up:
-    /// whichever the image agrees with is taken.
+    /// Numbers may count from the top row down or, as Kalibr prints them, from the bottom row up: the one that agrees
+    /// with the image is used.
     ///
     /// # Errors
-    /// Where too few tags of the grid are seen, or they do not lie as on this grid.
+    /// Too few tags of the grid are visible, or their arrangement is not that of the grid.
     pub fn find(&self, image: ImageView<'_>) -> Result<PlaneView, TagGridError> {
         let limits = Limits { min_px: LEAST_PX, max_hamming: 1 };
         let [narrow, wide] = [1, 2].map(|border| {
@@ -78,7 +78,7 @@ impl TagGrid {
         let ways = [false, true].map(|from_below| self.view(&tags, from_below));
         let misfits = ways.each_ref().map(misfit_px);
         let best = usize::from(misfits[1] < misfits[0]);
-        // Half a tag aside is another place on the sheet; distortion of a lens stays far below.
+        // Half a tag away is another place on the sheet; distortion of a lens stays far below that.
         let size = seen.iter().map(|m| m.size_px).fold(f64::INFINITY, f64::min);
         if !(misfits[best] < 0.25 * size) {
             return Err(other);
@@ -108,7 +108,7 @@ impl TagGrid {
     }
 }
 
-/// Root of the mean squared distance to where the best homography puts the points, pixels.
+/// Root of the mean squared distance to the points' places by the best homography, pixels.
 fn misfit_px(view: &PlaneView) -> f64 {
     let Some(h) = homography(view) else { return f64::INFINITY };
     let squared = view.plane_m.iter().zip(&view.px).map(|(p, px)| {
@@ -141,7 +141,7 @@ mod tests {
         CameraModel { fx: 640.0, fy: 636.0, cx: 324.0, cy: 238.0, distortion, skew: 0.0 }
     }
 
-    /// Whether the sheet is dark at a point; numbers count from the bottom row up with `from_below`.
+    /// Whether the sheet is dark at a point; with `from_below` numbers count from the bottom row up.
     fn is_dark(at: Vector2<f64>, from_below: bool) -> bool {
         let pitch = GRID.tag_m + GRID.gap_m;
         let (c, r) = ((at.x / pitch).floor(), (at.y / pitch).floor());
@@ -196,7 +196,7 @@ mod tests {
         let views: Vec<PlaneView> = photos.iter().map(|p| GRID.find(p.view()).expect("tags")).collect();
         let found =
             calibrate(&views, 640.0, 480.0, Wanted { k3: false, skew: false }).expect("tilted enough");
-        // Then it is found within its own sigmas.
+        // Then the result is within its own sigmas.
         assert!(views[4].px.len() < views[0].px.len(), "the last is partly outside");
         let truth = camera();
         let (c, s) = (&found.camera, &found.sigma);

@@ -1,10 +1,10 @@
-//! Zhang's start: homographies of a plane, and the camera matrix they agree on.
+//! Zhang's initial values: homographies of a plane, and the camera matrix on which they agree.
 
 use nalgebra::{DMatrix, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
 
 use windhover_base::geo::CameraModel;
 
-/// Points of a plane (its own coordinates, metres) and where a camera saw them (pixels).
+/// Points of a plane (its own coordinates, metres) and their observations in an image (pixels).
 #[derive(Clone, PartialEq, Debug)]
 pub struct PlaneView {
     /// In the plane, metres.
@@ -13,7 +13,7 @@ pub struct PlaneView {
     pub px: Vec<Vector2<f64>>,
 }
 
-/// Where the plane was: `p_camera = rotation · (x, y, 0) + translation`.
+/// Pose of the plane: `p_camera = rotation · (x, y, 0) + translation`.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct PlanePose {
     /// `camera_from_plane`.
@@ -22,9 +22,8 @@ pub struct PlanePose {
     pub translation: Vector3<f64>,
 }
 
-/// The homography that takes plane points to pixels, `λ [u v 1]ᵀ = H [x y 1]ᵀ`: the direct linear
-/// transform over points brought to zero mean and unit spread (Hartley 1997). `None` for fewer than
-/// four points or points on a line.
+/// The homography that maps plane points to pixels, `λ [u v 1]ᵀ = H [x y 1]ᵀ`: the direct linear transform over points
+/// normalised to zero mean and unit spread (Hartley 1997). `None` for fewer than four points or points on a line.
 pub fn homography(view: &PlaneView) -> Option<Matrix3<f64>> {
     if view.plane_m.len() < 4 || view.plane_m.len() != view.px.len() {
         return None;
@@ -44,7 +43,7 @@ pub fn homography(view: &PlaneView) -> Option<Matrix3<f64>> {
     (whole.determinant().abs() > 1e-300 && whole[(2, 2)] != 0.0).then(|| whole / whole[(2, 2)])
 }
 
-/// The similarity that brings points to zero mean and mean square radius 2, and the points so brought.
+/// The similarity that normalises points to zero mean and mean square radius 2, and the normalised points.
 fn normalised(points: &[Vector2<f64>]) -> Option<(Matrix3<f64>, Vec<Vector2<f64>>)> {
     let n = points.len() as f64;
     let mean = points.iter().sum::<Vector2<f64>>() / n;
@@ -54,8 +53,8 @@ fn normalised(points: &[Vector2<f64>]) -> Option<(Matrix3<f64>, Vec<Vector2<f64>
     (spread > 0.0 && scale.is_finite()).then(|| (matrix, points.iter().map(|p| (p - mean) * scale).collect()))
 }
 
-/// Cameras to start from, most trusted first: Zhang's closed form without skew (Zhang 2000, section
-/// 3.1), the same with the principal point held in the middle of the image, and a plain guess.
+/// Initial cameras, most reliable first: Zhang's closed form without skew (Zhang 2000, section 3.1), the same with the
+/// principal point fixed in the middle of the image, and a plain guess.
 pub fn starts(homographies: &[Matrix3<f64>], width: f64, height: f64) -> Vec<CameraModel> {
     let middle = Vector2::new((width - 1.0) / 2.0, (height - 1.0) / 2.0);
     let scale = width.max(height);
@@ -118,7 +117,7 @@ fn closed_form(
     })
 }
 
-/// The plane's pose by its homography, in front of the camera; distortion is not looked at.
+/// The plane's pose from its homography, in front of the camera; distortion is ignored.
 pub fn pose_of(homography: &Matrix3<f64>, camera: &CameraModel) -> Option<PlanePose> {
     let k = Matrix3::new(camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0);
     let m = k.try_inverse()? * homography;

@@ -1,4 +1,4 @@
-//! The boresight proved on simulated flights with crooked mounts, as values, without rendering.
+//! The boresight on simulated flights with wrong mounting angles, as values, without rendering.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -8,14 +8,14 @@ use windhover_base::time::Span;
 use windhover_calibrate::boresight::{Boresight, BoresightError, Recording, boresight};
 use windhover_simulate::{HelicopterPath, Route, Sample, Scenario, SensorSuite, World};
 
-/// A minute over a marker at rest with a crooked camera and compass: a figure of eight, turning.
+/// A minute over a marker at rest with a misaligned camera and compass: a figure of eight, with turns.
 fn pattern(seed: u64) -> Scenario {
     let mut scenario = Scenario::named("static-survey").expect("a named scenario");
     let crooked = |k: u64| (((seed * 7 + k * 13) % 17) as f64 / 8.0 - 1.0) * 3.0;
     scenario.camera.mount_error_deg = [crooked(1), crooked(2), crooked(3)];
     scenario.compass.bias_sigma_deg = 1.5;
     scenario.camera.features = 0;
-    // A guide that nobody sees leads the helicopter around its eight.
+    // An invisible guide leads the helicopter around its eight.
     scenario.follow_guide(2.5, Route::Eight { a_m: 5.0, b_m: 3.0 });
     scenario.helicopter.heading_wander_deg = 80.0;
     scenario.helicopter.agitation_mps2 = 0.5;
@@ -38,7 +38,7 @@ fn pattern_over_a_cross(seed: u64) -> Scenario {
     scenario
 }
 
-/// What was found, and each truth in the order of the findings (parameters, then camera to compass).
+/// The result, and each truth in the order of the findings (parameters, then camera to compass).
 fn fly(scenario: Scenario, seed: u64) -> (Boresight, Vec<f64>) {
     let mut suite = SensorSuite::new(Arc::new(World::new(scenario.clone(), seed)));
     let mut recording = Recording::default();
@@ -113,8 +113,8 @@ fn a_flight_without_fixes_is_refused() {
     assert!(matches!(empty, Err(BoresightError::Unusable { number: 1, .. })));
 }
 
-/// The proof asked for: 40 crooked mounts, each parameter within 3 of its own sigmas in 95 % of the runs,
-/// and none of the camera's angles wrong by 0.2° in any. `cargo test -p windhover-calibrate --test boresight -- --ignored --nocapture`.
+/// 40 misaligned mounts: each parameter is within 3 of its own sigmas in 95 % of the runs, and no angle of the camera
+/// is wrong by 0.2° in any. `cargo test -p windhover-calibrate --test boresight -- --ignored --nocapture`.
 #[test]
 #[ignore = "40 flights take minutes"]
 fn forty_crooked_mounts_over_a_cross_of_tags() {
@@ -124,7 +124,7 @@ fn forty_crooked_mounts_over_a_cross_of_tags() {
     }
 }
 
-/// One tag alone is out of view half of the time: its angles are honest, and good to 0.2° in the root mean
+/// One tag alone is out of view half of the time: its angles are consistent, and accurate to 0.2° in the root mean
 /// square.
 #[test]
 #[ignore = "40 flights take a minute"]
@@ -135,7 +135,7 @@ fn forty_crooked_mounts_over_one_tag() {
     }
 }
 
-/// Flies a pattern over 40 crooked mounts and prints what came of it.
+/// Flies a pattern over 40 misaligned mounts and prints the results.
 fn forty(pattern: fn(u64) -> Scenario) -> Vec<Tally> {
     const RUNS: u64 = 40;
     let mut tally: Vec<Tally> = Vec::new();
@@ -158,7 +158,7 @@ fn forty(pattern: fn(u64) -> Scenario) -> Vec<Tally> {
     tally
 }
 
-/// What many runs gave of one parameter.
+/// The results of many runs for one parameter.
 #[derive(Default)]
 struct Tally {
     name: &'static str,

@@ -1,4 +1,4 @@
-//! What decoding costs: 200 kB/s of mixed bytes on a line, as a share of a core. The bar is 5 %.
+//! Cost of decoding: 200 kB/s of mixed bytes on a line, as a share of a core. The limit is 5 %.
 //!
 //! `cargo bench -p windhover-decode --bench pace`
 
@@ -13,7 +13,7 @@ const PACE: usize = 200_000;
 /// Seconds decoded; the least of five runs counts.
 const SECONDS: usize = 20;
 
-/// Sentences, packets and noise in turn, so many bytes; the same ones every time.
+/// Sentences, packets and noise in turn, of this many bytes; the same ones in every run.
 fn mixed(pieces: &[Vec<u8>], bytes: usize) -> Vec<u8> {
     let (mut out, mut dice) = (Vec::with_capacity(bytes), 0x9E37_79B9u32);
     for n in 0.. {
@@ -42,7 +42,7 @@ fn sentences(bodies: &[&str]) -> Vec<Vec<u8>> {
     bodies.iter().map(|body| (framed(body) + "\r\n").into_bytes()).collect()
 }
 
-/// Share of a core, percent, of handing these bytes over in reads of a serial line.
+/// Share of a core, percent, for decoding these bytes in the reads of a serial line.
 fn share(bytes: &[u8], mut decode: impl FnMut(&[u8], MonoTime)) -> f64 {
     let run = |decode: &mut dyn FnMut(&[u8], MonoTime)| {
         let (began, mut t) = (Instant::now(), MonoTime::from_ns(1_795_014_245_000_000_000));

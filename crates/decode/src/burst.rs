@@ -1,27 +1,27 @@
-//! The order of sentences in a device's burst, learnt from the stream: which sentence ends a
-//! cycle, and which ones lead it although they carry no time.
+//! The order of sentences in a device's burst, learnt from the stream: which sentence ends a cycle, and which ones come
+//! before the time of their burst.
 
 use super::lines::LineSpan;
 use windhover_base::time::Span;
 
-/// Bytes of an address that tell sentences apart.
+/// Bytes of an address that distinguish sentences.
 type Address = [u8; 6];
-/// Sentence types remembered; no receiver sends more.
+/// Most sentence types that are remembered; no receiver sends more.
 const ADDRESSES_MAX: usize = 48;
-/// Sentences remembered since the last one that carried a time.
+/// Most sentences remembered since the last one with a time.
 const SINCE_MAX: usize = 48;
-/// A silence shorter than this tells nothing.
+/// A shorter silence is not evaluated.
 const SILENCE_MIN: Span = Span::from_ns(20_000_000);
-/// How sure the votes get.
+/// Largest number of votes.
 const VOTES_MAX: i8 = 8;
-/// Votes after which a sentence is taken to lead its burst.
+/// Votes after which a sentence is assumed to lead its burst.
 const VOTES_LEADING: i8 = 2;
 
 /// Which sentences come before the first one with a time in a burst.
 ///
-/// A sentence without time between two of different time belongs to the burst it is nearer to: the
-/// longer silence lies between the bursts. Single silences lie (the host stalls), so each one is a
-/// vote only; without votes, as in files, sentences follow the time they belong to.
+/// A sentence without time between two of different times belongs to the nearer burst: the longer silence is between
+/// the bursts. Single silences may mislead (the host stalls), so each one is only a vote; without votes, as in files,
+/// sentences follow the time to which they belong.
 #[derive(Clone, Debug, Default)]
 pub(super) struct BurstOrder {
     votes: Vec<(Address, i8)>,
@@ -45,7 +45,7 @@ fn key(address: &str) -> Address {
 }
 
 impl BurstOrder {
-    /// A sound sentence, of whatever kind, in the order they come.
+    /// Takes a valid sentence of any kind, in order of arrival.
     pub(super) fn heard(&mut self, address: &str, span: LineSpan) {
         let silence_before = self.last.map_or(Span::ZERO, |last| span.t_first - last.t_last);
         if self.since.len() == SINCE_MAX {
@@ -55,13 +55,13 @@ impl BurstOrder {
         self.last = Some(span);
     }
 
-    /// The sentence just heard is of the open epoch's time: all before it was of this burst.
+    /// The last sentence has the open epoch's time: all sentences before it were of this burst.
     pub(super) fn same_burst(&mut self) {
         self.since.clear();
     }
 
-    /// The sentence just heard opens an epoch; gives where its burst began. `earlier`: a sentence heard
-    /// before that is known to be of the same burst.
+    /// The last sentence opens an epoch; returns where its burst began. `earlier`: an earlier sentence that is known to
+    /// be of the same burst.
     pub(super) fn new_burst(&mut self, earlier: Option<LineSpan>) -> LineSpan {
         self.vote();
         let known = earlier.and_then(|span| self.since.iter().position(|heard| heard.span == span));
@@ -76,7 +76,7 @@ impl BurstOrder {
         first.or(self.last).unwrap_or_default()
     }
 
-    /// Whether a sentence heard before is nearer to the one just heard than to what came before it.
+    /// Whether an earlier sentence is nearer to the last one than to the one before it.
     pub(super) fn is_of_this_burst(&self, span: LineSpan) -> bool {
         let Some(at) = self.since.iter().position(|heard| heard.span == span) else {
             return false;
@@ -85,7 +85,7 @@ impl BurstOrder {
         after.is_none_or(|after| after <= self.since[at].silence_before)
     }
 
-    /// Whether this sentence comes before the one that tells its time.
+    /// Whether this sentence comes before the one with its time.
     pub(super) fn leads(&self, address: &str) -> bool {
         self.votes_of(key(address)) >= VOTES_LEADING
     }
@@ -116,13 +116,13 @@ impl BurstOrder {
     }
 }
 
-/// Cycles of the same sentences seen before their end is believed.
+/// Cycles of the same sentences before their end counts as known.
 const CYCLES_FIRST: u32 = 3;
-/// Most cycles asked for where the belief was wrong before.
+/// Most cycles that are required after the end was wrong.
 const CYCLES_MAX: u32 = 64;
 
-/// The sentences of a cycle, learnt, so that an epoch (or a compass's reading) can be given out with its last
-/// sentence and not only when the next one begins.
+/// The learnt sentences of a cycle, so that an epoch (or a compass's reading) can be output with its last sentence and
+/// not only when the next one begins.
 #[derive(Clone, Debug)]
 pub(super) struct Cycle<K> {
     expected: Vec<K>,
@@ -137,7 +137,7 @@ impl<K> Default for Cycle<K> {
 }
 
 impl<K: PartialEq + Clone> Cycle<K> {
-    /// An epoch ended because the next began: these were its sentences.
+    /// An epoch ended because the next one began; these were its sentences.
     pub(super) fn ended(&mut self, kinds: &[K]) {
         if kinds == self.expected {
             self.seen = self.seen.saturating_add(1);
@@ -147,14 +147,14 @@ impl<K: PartialEq + Clone> Cycle<K> {
         }
     }
 
-    /// A sentence came after the epoch had been given out: be slower to believe.
+    /// A sentence came after the epoch had been output: requires more cycles from now on.
     pub(super) fn was_longer(&mut self) {
         self.seen = 0;
         self.expected.clear();
         self.needed = (self.needed * 2).min(CYCLES_MAX);
     }
 
-    /// Whether these are all the sentences to be expected (some may have been lost before the last).
+    /// Whether these are all expected sentences (some may have been lost before the last).
     pub(super) fn is_complete(&self, kinds: &[K]) -> bool {
         let Some(last) = self.expected.last() else {
             return false;

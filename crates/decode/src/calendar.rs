@@ -1,4 +1,4 @@
-//! Dates of epochs: believed only of a receiver with a fix, and held against what can be.
+//! Dates of epochs: accepted only from a receiver with a fix, and checked for plausibility.
 
 use super::report::Date;
 use windhover_base::time::{Civil, EARLIEST_UTC, MonoTime, NS_PER_S, UtcTime};
@@ -9,22 +9,22 @@ const DAY_NS: i64 = 86_400 * NS_PER_S;
 const ERA_NS: i64 = 1_024 * 7 * DAY_NS;
 /// How near a date must be to the host's clock to be confirmed by it.
 const CONFIRMED_NS: i64 = 2 * DAY_NS;
-/// How far the host's clock may be off where it is believed to be set (boards without a battery go on from
-/// where they were switched off).
+/// Largest error of the host's clock where it counts as set (boards without a battery continue from where they were
+/// switched off).
 const HOST_OFF_NS: i64 = 180 * DAY_NS;
-/// How long after [`EARLIEST_UTC`] a date is believed. Shorter than an era, so that the era of a date is
-/// known, and short enough that the days 0 and 1024 weeks after GPS began are not taken for later ones.
+/// How long after [`EARLIEST_UTC`] a date is accepted. Shorter than an era, so that the era of a date is known, and
+/// short enough that the days 0 and 1024 weeks after the start of GPS are not taken for later ones.
 const BELIEVED_NS: i64 = 10 * 365 * DAY_NS;
 
-/// Puts dates to times of day.
+/// Assigns dates to times of day.
 ///
-/// A date is believed only with a fix: before it a receiver tells the day its memory begins with. In a
-/// stream that is heard as it comes the date is held against the host's clock and against
-/// [`EARLIEST_UTC`]: one whose week number has rolled over is put right where the era is known, and one that
-/// cannot be is none. A recording without times of arrival may be of any year: there it stands as told.
+/// A date is accepted only with a fix: before it a receiver reports the first day of its memory. In a live stream the
+/// date is compared with the host's clock and with [`EARLIEST_UTC`]: one whose week number has rolled over is corrected
+/// where the era is known, and an impossible one is dropped. A recording without times of arrival may be of any year:
+/// there the date is used unchanged.
 #[derive(Clone, Debug)]
 pub(super) struct Calendar {
-    /// Whether arrivals are of a clock.
+    /// Whether arrivals are times of a clock.
     has_host: bool,
     last: Option<(UtcTime, MonoTime)>,
     date_alone: Option<Date>,
@@ -37,8 +37,8 @@ impl Calendar {
         Self { has_host, last: None, date_alone: None, had_fix: false, refused: 0 }
     }
 
-    /// UTC of an epoch heard at `t_recv`: with its own date, else with the day that makes it nearest
-    /// to where the last dated epoch and the time since lead. `None` until a date was told with a fix.
+    /// UTC of an epoch received at `t_recv`: with its own date, else with the day that is nearest to the last dated
+    /// epoch plus the time since. `None` until a date was received with a fix.
     pub(super) fn utc_of(
         &mut self,
         time_of_day_ns: Option<i64>,
@@ -66,8 +66,8 @@ impl Calendar {
         Some(utc)
     }
 
-    /// A sentence of no epoch told the date and time, while the receiver had a fix or not (`None`: as
-    /// at the last epoch).
+    /// A sentence outside of epochs reported date and time, while the receiver had a fix or not (`None`: as at the last
+    /// epoch).
     pub(super) fn told(&mut self, time_of_day_ns: i64, date: Date, has_fix: Option<bool>, t_recv: MonoTime) {
         if has_fix.unwrap_or(self.had_fix)
             && let Some(utc) = self.dated(date, time_of_day_ns, t_recv)
@@ -76,7 +76,7 @@ impl Calendar {
         }
     }
 
-    /// How many dates were refused since this was asked last.
+    /// Number of dates refused since the last call.
     pub(super) fn take_refused(&mut self) -> u64 {
         std::mem::take(&mut self.refused)
     }
@@ -89,7 +89,7 @@ impl Calendar {
     }
 }
 
-/// The time of day on the day that is nearest to where `last` and the time since lead.
+/// The time of day on the day that is nearest to `last` plus the time since.
 fn nearest((last, heard): (UtcTime, MonoTime), time_of_day_ns: i64, t_recv: MonoTime) -> UtcTime {
     let expected = last.unix_ns().saturating_add((t_recv - heard).ns());
     let midnight = expected.div_euclid(DAY_NS) * DAY_NS;
@@ -111,8 +111,8 @@ fn utc_on(date: Date, time_of_day_ns: i64) -> Option<UtcTime> {
     Some(UtcTime::from_unix_ns(UtcTime::from_civil(midnight)?.unix_ns() + time_of_day_ns))
 }
 
-/// What was said, whole eras of 1024 weeks later where the receiver's week number has rolled over;
-/// `None` where neither the host's clock nor the age of this program tells the era.
+/// The reported time, whole eras of 1024 weeks later where the receiver's week number has rolled over; `None` where
+/// neither the host's clock nor the age of this program determines the era.
 fn in_its_era(said: UtcTime, t_recv: MonoTime) -> Option<UtcTime> {
     let (said, host, earliest) = (said.unix_ns(), t_recv.ns(), EARLIEST_UTC.unix_ns());
     let rolled = |eras: i64| UtcTime::from_unix_ns(said.saturating_add(eras.saturating_mul(ERA_NS)));
@@ -180,7 +180,7 @@ mod tests {
                 at("150405", &mut calendar, Date::new(2026, 11, 18), HOST_S),
                 "2026-11-18T15:04:05.000Z"
             );
-            // What it says later without a fix does not move the day.
+            // Its later reports without a fix do not move the day.
             assert_eq!(
                 of("150406", &mut calendar, Date::new(1980, 1, 6), false, HOST_S + 1),
                 "2026-11-18T15:04:06.000Z"
@@ -191,7 +191,7 @@ mod tests {
 
     #[test]
     fn a_rolled_over_week_is_put_right() {
-        // 2026-11-18 less 1024 weeks is 2007-04-04
+        // 2026-11-18 minus 1024 weeks is 2007-04-04
         let at = |date, host_s| at("150405", &mut Calendar::new(true), date, host_s);
         let old = Date::new(2007, 4, 4);
         let right = "2026-11-18T15:04:05.000Z";

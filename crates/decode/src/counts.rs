@@ -1,4 +1,4 @@
-//! What a decoder made of the bytes it was given, counted.
+//! Counts of a decoder's bytes by result.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -17,18 +17,18 @@ pub enum Refusal {
     NoChecksum,
     /// Checksum or CRC does not match.
     BadChecksum,
-    /// Fields missing or not of the kind the format says.
+    /// Fields missing or of the wrong type.
     Malformed,
-    /// A value that cannot be: latitude beyond the poles, hour 25, not a number.
+    /// An impossible value: latitude beyond the poles, hour 25, not a number.
     OutOfRange,
-    /// Arrived after its epoch was given out.
+    /// Arrived after its epoch was output.
     AfterItsEpoch,
     /// Belongs to a burst whose sentences with a time were lost.
     NoTime,
 }
 
 impl Refusal {
-    /// In words, for people.
+    /// As text.
     pub const fn words(self) -> &'static str {
         match self {
             Self::TooLong => "too long",
@@ -44,16 +44,16 @@ impl Refusal {
     }
 }
 
-/// What a decoder made of its bytes.
+/// Counts of a decoder.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct DecodeCounts {
-    /// Sentences or packets understood and used.
+    /// Sentences or packets that were used.
     pub used: u64,
-    /// Sound sentences or packets that carry nothing wanted.
+    /// Valid sentences or packets that have no wanted values.
     pub ignored: u64,
     /// Bytes outside any sentence or packet.
     pub noise_bytes: u64,
-    /// Sound readings of which the device itself said that something is not valid.
+    /// Valid readings of which the device itself marked a part as invalid.
     pub flagged: u64,
     refused: BTreeMap<Refusal, u64>,
     left_out: BTreeMap<Cow<'static, str>, u64>,
@@ -68,18 +68,17 @@ impl DecodeCounts {
         *self.left_out.entry(field.into()).or_insert(0) += 1;
     }
 
-    /// Fields left out of sentences that were used otherwise, by name, with how often.
+    /// Fields left out of sentences that were used otherwise, by name, with their counts.
     pub fn left_out(&self) -> impl Iterator<Item = (&str, u64)> + '_ {
         self.left_out.iter().map(|(field, count)| (field.as_ref(), *count))
     }
 
-    /// Whether nothing at all was a sound sentence or packet: bytes of another device, another speed
-    /// or another format.
+    /// Whether there was no valid sentence or packet at all: the bytes are of another device, speed or format.
     pub const fn understood_nothing(&self) -> bool {
         self.used == 0 && self.ignored == 0
     }
 
-    /// How often something was refused for this reason.
+    /// How often this was the reason for a refusal.
     pub fn refused(&self, why: Refusal) -> u64 {
         self.refused.get(&why).copied().unwrap_or(0)
     }
@@ -89,7 +88,7 @@ impl DecodeCounts {
         self.refused.values().sum()
     }
 
-    /// Every reason that occurred, with how often.
+    /// Every reason that occurred, with its count.
     pub fn refusals(&self) -> impl Iterator<Item = (Refusal, u64)> + '_ {
         self.refused.iter().map(|(why, count)| (*why, *count))
     }

@@ -1,4 +1,4 @@
-//! An epoch put together of sentences of one time.
+//! An epoch, combined from sentences of one time.
 
 use super::calendar::Calendar;
 use super::lines::LineSpan;
@@ -6,21 +6,21 @@ use super::report::{Date, Kind, Report, Solution};
 use nalgebra::Vector3;
 use windhover_base::msg::{FixKind, GnssEpoch};
 
-/// Most sentences one epoch is made of; more are not kept in its order.
+/// Most sentences of one epoch; the order of further ones is not kept.
 const KINDS_MAX: usize = 24;
 
-/// An epoch being put together.
+/// An epoch in progress.
 #[derive(Clone, Debug)]
 pub(super) struct Draft {
     pub time_of_day_ns: Option<i64>,
     pub date: Option<Date>,
-    /// Its sentences in the order they came.
+    /// Its sentences in order of arrival.
     pub kinds: Vec<Kind>,
     /// Where its burst began.
     pub begin: LineSpan,
-    /// Where its last sentence lies.
+    /// The place of its last sentence.
     pub end: LineSpan,
-    /// Whether the first sentence of a burst opened it, so that its arrival tells the time.
+    /// Whether it was opened by the first sentence of a burst, so that its arrival determines the time.
     pub opens_burst: bool,
     void: bool,
     confirmed: bool,
@@ -31,7 +31,7 @@ pub(super) struct Draft {
     ranks: Ranks,
 }
 
-/// Which sentence a value was taken from: the smaller, the better.
+/// The sentence from which a value was taken: a smaller rank is better.
 #[derive(Clone, Copy, Debug)]
 struct Ranks {
     position: u8,
@@ -66,12 +66,12 @@ impl Draft {
         }
     }
 
-    /// Whether it holds a sentence that tells the receiver's main solution.
+    /// Whether it has a sentence of the receiver's main solution.
     pub(super) fn has_main(&self) -> bool {
         self.kinds.iter().any(|kind| matches!(kind, Kind::Rmc | Kind::Gga | Kind::Gns | Kind::Pvt))
     }
 
-    /// Adds what a sentence of the same time says.
+    /// Adds the values of a sentence of the same time.
     pub(super) fn merge(&mut self, report: &Report, span: LineSpan) {
         if self.kinds.len() < KINDS_MAX {
             self.kinds.push(report.kind);
@@ -129,7 +129,7 @@ impl Draft {
         }
     }
 
-    /// A covariance says more than the figures beside the solution, and these more than GST.
+    /// A covariance takes precedence over the accuracies in the solution, and these over GST.
     fn merge_accuracy(&mut self, report: &Report) {
         let rank = accuracy_rank(report.kind);
         let says = report.position_sigma_m.is_some() || report.velocity_sigma_mps.is_some();
@@ -169,12 +169,12 @@ impl Draft {
         epoch
     }
 
-    /// Whether what it holds so far is a fix.
+    /// Whether its values so far are a fix.
     pub(super) fn has_fix(&self) -> bool {
         self.fix_kind() != FixKind::None
     }
 
-    /// What all sentences agree on: one that calls the fix void is believed.
+    /// The fix kind on which all sentences agree: a sentence that marks the fix as void decides.
     fn fix_kind(&self) -> FixKind {
         if self.void || !self.confirmed || self.epoch.lat_deg.is_none() {
             return FixKind::None;
@@ -192,14 +192,14 @@ impl Draft {
     }
 }
 
-/// Horizontal velocity of speed and course. Without a course (receivers leave it out when slow) it
-/// is known only when the speed is nothing.
+/// Horizontal velocity from speed and course. Without a course (receivers omit it at low speed) it is known only when
+/// the speed is zero.
 fn velocity_of(speed_mps: Option<f64>, course_deg: Option<f64>) -> Option<Vector3<f64>> {
     let speed = speed_mps?;
     match course_deg {
         Some(course) => {
             let (sin, cos) = course.to_radians().sin_cos();
-            // Adding zero takes the sign off a zero.
+            // Adding zero removes the sign of −0.
             Some(Vector3::new(speed * cos + 0.0, speed * sin + 0.0, 0.0))
         }
         None => (speed == 0.0).then(Vector3::zeros),

@@ -8,7 +8,7 @@ use super::report::{Date, Kind, Report, angle_deg, time_of_day_ns};
 use super::sentence::Sentence;
 use windhover_base::msg::FixKind;
 
-/// What a Garmin sentence says; `None` where it says nothing of a fix.
+/// The report of a Garmin sentence; `None` where it has no part of a fix.
 pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<Report>, Refusal> {
     match sentence.address() {
         "PGRME" => of_pgrme(sentence).map(Some),
@@ -42,8 +42,8 @@ fn of_pgrmv(sentence: &Sentence<'_>) -> Result<Report, Refusal> {
     Ok(report)
 }
 
-/// Fix: week, time of week, ddmmyy, hhmmss, leap seconds, latitude, N/S, longitude, E/W, A/M,
-/// fix 0/1/2, speed km/h, course, PDOP, TDOP. The ten-bit week is not used: the date is beside it.
+/// Fix: week, time of week, ddmmyy, hhmmss, leap seconds, latitude, N/S, longitude, E/W, A/M, fix 0/1/2, speed km/h,
+/// course, PDOP, TDOP. The ten-bit week is not used, because the sentence has the date.
 fn of_pgrmf(sentence: &Sentence<'_>) -> Result<Report, Refusal> {
     if sentence.fields() < 13 {
         return Err(Refusal::Malformed);

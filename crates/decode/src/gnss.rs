@@ -1,4 +1,4 @@
-//! GPS bytes to epochs: every epoch of one UTC time only, given out as soon as it is safe.
+//! GPS bytes to epochs: every epoch has one UTC time only, and is output as soon as possible.
 
 use super::burst::{BurstOrder, Cycle};
 use super::calendar::Calendar;
@@ -13,35 +13,35 @@ use windhover_base::msg::GnssEpoch;
 use windhover_base::settings::GpsFormat;
 use windhover_base::time::{MonoTime, Span};
 
-/// An epoch and when its burst was heard.
+/// An epoch and the arrival of its burst.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub struct HeardEpoch {
-    /// What the receiver said of one instant.
+pub struct ReceivedEpoch {
+    /// The receiver's report of one instant.
     pub epoch: GnssEpoch,
     /// When the read returned that held the first byte of its burst.
     pub t_first_byte: MonoTime,
-    /// Bytes of that read from the burst's first byte to the end of the read. The first byte began
-    /// no later than `t_first_byte` less the transmission time of these.
+    /// Bytes of that read from the burst's first byte to the end of the read. The first byte began no later than
+    /// `t_first_byte` minus the transmission time of these.
     pub bytes_before_end: usize,
     /// When the read returned that held the last byte of its last sentence.
     pub t_last_byte: MonoTime,
-    /// Whether it came in a burst of its own, so that its arrival tells the time of its validity.
-    /// Not so for the GLL of some receivers, which gives another instant within the burst.
+    /// Whether it came in its own burst, so that its arrival determines the time of its validity. This is not so for
+    /// the GLL of some receivers, which is of another instant within the burst.
     pub opens_burst: bool,
 }
 
-/// Silence after which an open epoch is given out, before the receiver's period is known.
+/// Silence after which an open epoch is output, before the receiver's period is known.
 const QUIET_FIRST: Span = Span::from_ns(300_000_000);
-/// Bounds of that silence once it is: half the period.
+/// Bounds of that silence afterwards: half the period.
 const QUIET_BOUNDS_NS: (i64, i64) = (60_000_000, 500_000_000);
-/// Sentences kept that lead a burst whose time is still to come.
+/// Most sentences that are kept before the time of their burst is known.
 const LEADING_MAX: usize = 8;
 
-/// Puts epochs together from the bytes of a GPS receiver.
+/// Combines the bytes of a GPS receiver to epochs.
 ///
-/// Sentences that carry no time (GSA, VTG, PGRME, PGRMV) go to the epoch of the burst they are in.
-/// An epoch is given out with the last sentence of the receiver's cycle once that is known, else
-/// when the next epoch begins, or by [`GnssDecoder::tick`] after silence.
+/// Sentences without a time (GSA, VTG, PGRME, PGRMV) go to the epoch of their burst. An epoch is output with the last
+/// sentence of the receiver's cycle once that is known, else when the next epoch begins, or by [`GnssDecoder::tick`]
+/// after silence.
 #[derive(Clone, Debug)]
 pub struct GnssDecoder {
     format: GpsFormat,
@@ -51,7 +51,7 @@ pub struct GnssDecoder {
     assembler: Assembler,
 }
 
-/// A ZDA of another time than the open epoch: it leads the burst to come, or tells the date only.
+/// A ZDA of another time than the open epoch: it leads the next burst, or only has the date.
 #[derive(Clone, Debug, Default)]
 struct DateAhead {
     heard: Option<(Report, LineSpan)>,
@@ -59,30 +59,30 @@ struct DateAhead {
     leads: bool,
 }
 
-/// What is remembered of an epoch that was given out.
+/// The memory of an epoch that was output.
 #[derive(Clone, Debug)]
 struct Done {
     time_of_day_ns: Option<i64>,
     kinds: Vec<Kind>,
-    /// When its last sentence was heard.
+    /// When its last sentence arrived.
     t_last: MonoTime,
 }
 
 #[derive(Clone, Debug)]
 struct Assembler {
-    /// Wait for the next epoch's begin instead of the learnt end of the cycle.
+    /// Whether it waits for the start of the next epoch instead of the learnt end of the cycle.
     patient: bool,
     checksums: Checksums,
     order: BurstOrder,
     cycle: Cycle<Kind>,
     calendar: Calendar,
     draft: Option<Draft>,
-    /// A GLL of another time than the burst it came in.
+    /// A GLL of another time than its burst.
     aside: Option<Draft>,
-    /// Sentences without time that lead the burst to come.
+    /// Sentences without time that lead the next burst.
     leading: Vec<(Report, LineSpan)>,
     date: DateAhead,
-    /// The epoch just given out.
+    /// The epoch that was output last.
     done: Option<Done>,
     last_begin: Option<MonoTime>,
     period: Option<Span>,
@@ -95,13 +95,13 @@ impl Default for GnssDecoder {
 }
 
 impl GnssDecoder {
-    /// A decoder that gives each epoch out as early as is safe.
+    /// A decoder that outputs each epoch as early as possible.
     pub fn new() -> Self {
         Self::with_patience(false)
     }
 
-    /// A decoder for recordings without arrival times, that gives each epoch out only when the next
-    /// one begins and so misses no sentence of it.
+    /// A decoder for recordings without arrival times, which outputs each epoch only when the next one begins and so
+    /// misses no sentence of it.
     pub fn patient() -> Self {
         Self::with_patience(true)
     }
@@ -129,7 +129,7 @@ impl GnssDecoder {
         }
     }
 
-    /// The same for a receiver that speaks this; both is what it takes otherwise.
+    /// The same for a receiver of this format; the default is both.
     #[must_use]
     pub const fn of_format(mut self, format: GpsFormat) -> Self {
         self.format = format;
@@ -143,8 +143,8 @@ impl GnssDecoder {
         self
     }
 
-    /// Takes the bytes one read returned at `t_recv`; appends the epochs they complete to `out`.
-    pub fn push(&mut self, bytes: &[u8], t_recv: MonoTime, out: &mut Vec<HeardEpoch>) {
+    /// Takes the bytes that one read returned at `t_recv`; appends the completed epochs to `out`.
+    pub fn push(&mut self, bytes: &[u8], t_recv: MonoTime, out: &mut Vec<ReceivedEpoch>) {
         let Self { format, splitter, framer, counts, assembler } = self;
         let mut piece = |piece: Piece<'_>, counts: &mut DecodeCounts| match piece {
             Piece::Outside(bytes, _) if *format == GpsFormat::Ubx => counts.noise_bytes += bytes.len() as u64,
@@ -160,14 +160,14 @@ impl GnssDecoder {
         self.note_dates();
     }
 
-    /// Time passed: gives out an open epoch the receiver has fallen silent after.
-    pub fn tick(&mut self, now: MonoTime, out: &mut Vec<HeardEpoch>) {
+    /// Time has passed: outputs an open epoch after which the receiver has fallen silent.
+    pub fn tick(&mut self, now: MonoTime, out: &mut Vec<ReceivedEpoch>) {
         self.assembler.tick(now, out);
         self.note_dates();
     }
 
-    /// The stream has ended: gives out what is open.
-    pub fn flush(&mut self, out: &mut Vec<HeardEpoch>) {
+    /// The stream has ended: outputs the open epoch.
+    pub fn flush(&mut self, out: &mut Vec<ReceivedEpoch>) {
         self.assembler.close(out);
         self.assembler.close_aside(None, out);
         self.note_dates();
@@ -179,14 +179,14 @@ impl GnssDecoder {
         }
     }
 
-    /// What was made of the bytes so far.
+    /// Counts of the decoded bytes.
     pub const fn counts(&self) -> &DecodeCounts {
         &self.counts
     }
 }
 
 impl Assembler {
-    fn line(&mut self, line: &Line<'_>, counts: &mut DecodeCounts, out: &mut Vec<HeardEpoch>) {
+    fn line(&mut self, line: &Line<'_>, counts: &mut DecodeCounts, out: &mut Vec<ReceivedEpoch>) {
         let sentence = match self.checksums.sentence(line.text) {
             Ok(sentence) => sentence,
             Err(why) => return counts.refuse(why),
@@ -206,7 +206,7 @@ impl Assembler {
         packet: &[u8],
         span: LineSpan,
         counts: &mut DecodeCounts,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) {
         let address = ubx::address(packet);
         self.order.heard(&address, span);
@@ -219,7 +219,7 @@ impl Assembler {
         address: &str,
         span: LineSpan,
         counts: &mut DecodeCounts,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) {
         let placed = match read {
             Ok(None) => return counts.ignored += 1,
@@ -240,7 +240,7 @@ impl Assembler {
         report: Report,
         address: &str,
         span: LineSpan,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) -> Result<(), Refusal> {
         if report.kind == Kind::Zda {
             self.place_date(report, span, out);
@@ -262,20 +262,20 @@ impl Assembler {
         }
     }
 
-    /// TIM-TP dates, and is of the pulse to come: of no epoch.
+    /// TIM-TP has a date, for the next pulse; it belongs to no epoch.
     fn place_pulse(&mut self, report: &Report, span: LineSpan) {
         if let Some((time, date)) = report.time_of_day_ns.zip(report.date) {
             self.calendar.told(time, date, self.draft.as_ref().map(Draft::has_fix), span.t_first);
         }
     }
 
-    /// A GST is of the open epoch, led its burst or came too late; it never opens one.
+    /// A GST belongs to the open epoch, led its burst or came too late; it never opens an epoch.
     fn place_errors(
         &mut self,
         report: Report,
         address: &str,
         span: LineSpan,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) -> Result<(), Refusal> {
         let time = report.time_of_day_ns;
         if self.is_open(time) {
@@ -306,8 +306,8 @@ impl Assembler {
         time.is_some() && self.draft.as_ref().is_some_and(|draft| draft.time_of_day_ns == time)
     }
 
-    /// A ZDA dates and never opens an epoch: some receivers tell it of another second.
-    fn place_date(&mut self, report: Report, span: LineSpan, out: &mut Vec<HeardEpoch>) {
+    /// A ZDA has a date and never opens an epoch: in some receivers it is of another second.
+    fn place_date(&mut self, report: Report, span: LineSpan, out: &mut Vec<ReceivedEpoch>) {
         let Some(time) = report.time_of_day_ns else { return };
         if self.is_open(Some(time)) {
             self.order.same_burst();
@@ -327,7 +327,7 @@ impl Assembler {
         self.date.heard = Some((report, span));
     }
 
-    /// The ZDA that led the burst of this time, if one did.
+    /// The ZDA that led the burst of this time, if there was one.
     fn date_of_burst(&mut self, time: i64) -> Option<(Report, LineSpan)> {
         let (report, span) = self.date.heard.take()?;
         self.date.leads = report.time_of_day_ns == Some(time) && self.order.is_of_this_burst(span);
@@ -340,7 +340,7 @@ impl Assembler {
         report: &Report,
         time: i64,
         span: LineSpan,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) -> Result<(), Refusal> {
         let open = self.draft.as_ref();
         if !self.is_told_again(report.kind, span) {
@@ -374,7 +374,7 @@ impl Assembler {
         &mut self,
         report: &Report,
         span: LineSpan,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) -> Result<(), Refusal> {
         match (&self.draft, &self.done) {
             (Some(draft), _) if !draft.kinds.contains(&report.kind) => {}
@@ -398,12 +398,12 @@ impl Assembler {
         &mut self,
         report: &Report,
         span: LineSpan,
-        out: &mut Vec<HeardEpoch>,
+        out: &mut Vec<ReceivedEpoch>,
     ) -> Result<(), Refusal> {
         if let Some(draft) = &self.draft {
             let one_of_several = report.kind == Kind::Gsa && draft.kinds.last() == Some(&Kind::Gsa);
             if draft.kinds.contains(&report.kind) && !one_of_several {
-                // The burst of this sentence has lost the ones that told its time.
+                // The sentences with the time of this burst were lost.
                 self.close(out);
                 self.done = None;
                 return Err(Refusal::NoTime);
@@ -422,7 +422,7 @@ impl Assembler {
         }
     }
 
-    fn merge(&mut self, report: &Report, span: LineSpan, out: &mut Vec<HeardEpoch>) {
+    fn merge(&mut self, report: &Report, span: LineSpan, out: &mut Vec<ReceivedEpoch>) {
         let Some(draft) = &mut self.draft else {
             return;
         };
@@ -432,8 +432,8 @@ impl Assembler {
         }
     }
 
-    /// Opens the epoch of a new time, with the GLL that came before it and what led its burst.
-    fn open(&mut self, time: i64, out: &mut Vec<HeardEpoch>) {
+    /// Opens the epoch of a new time, with the GLL before it and the sentences that led its burst.
+    fn open(&mut self, time: i64, out: &mut Vec<ReceivedEpoch>) {
         self.close_aside(Some(time), out);
         let date = self.date_of_burst(time);
         let begin = self.order.new_burst(date.as_ref().map(|(_, span)| *span));
@@ -457,21 +457,21 @@ impl Assembler {
     }
 
     /// The open epoch ends because another begins.
-    fn close(&mut self, out: &mut Vec<HeardEpoch>) {
+    fn close(&mut self, out: &mut Vec<ReceivedEpoch>) {
         if let Some(draft) = &self.draft {
             self.cycle.ended(&draft.kinds);
             self.give_out(out);
         }
     }
 
-    /// Gives out the GLL that stood aside, unless it is of the time that now begins.
-    fn close_aside(&mut self, time: Option<i64>, out: &mut Vec<HeardEpoch>) {
+    /// Outputs the GLL that was kept apart, unless it has the time of the new epoch.
+    fn close_aside(&mut self, time: Option<i64>, out: &mut Vec<ReceivedEpoch>) {
         if let Some(aside) = self.aside.take_if(|aside| time.is_none() || aside.time_of_day_ns != time) {
             out.push(heard(&aside, &mut self.calendar));
         }
     }
 
-    fn give_out(&mut self, out: &mut Vec<HeardEpoch>) {
+    fn give_out(&mut self, out: &mut Vec<ReceivedEpoch>) {
         if let Some(draft) = self.draft.take() {
             out.push(heard(&draft, &mut self.calendar));
             let (time_of_day_ns, t_last) = (draft.time_of_day_ns, draft.end.t_last);
@@ -479,7 +479,7 @@ impl Assembler {
         }
     }
 
-    fn tick(&mut self, now: MonoTime, out: &mut Vec<HeardEpoch>) {
+    fn tick(&mut self, now: MonoTime, out: &mut Vec<ReceivedEpoch>) {
         let (low, high) = QUIET_BOUNDS_NS;
         let quiet = self.period.map_or(QUIET_FIRST, |p| Span::from_ns((p.ns() / 2).clamp(low, high)));
         if self.draft.as_ref().is_some_and(|draft| now - draft.end.t_last >= quiet) {
@@ -492,13 +492,13 @@ impl Assembler {
         self.draft.is_none() && self.done.as_ref().is_some_and(|done| done.kinds.iter().any(main))
     }
 
-    /// Whether the epoch of this time was given out last.
+    /// Whether the epoch of this time was output last.
     fn is_done(&self, time: i64) -> bool {
         self.draft.is_none() && self.done.as_ref().is_some_and(|done| done.time_of_day_ns == Some(time))
     }
 
-    /// Whether a sentence the last epoch has comes after a silence: a burst of its own, whatever its
-    /// time. A receiver that learns of a leap second tells a second twice.
+    /// Whether a sentence that the last epoch already has comes after a silence: this is a new burst, whatever its
+    /// time. A receiver that learns of a leap second repeats a second.
     fn is_told_again(&self, kind: Kind, span: LineSpan) -> bool {
         let last = match (&self.draft, &self.done) {
             (Some(draft), _) => Some((&draft.kinds, draft.end.t_last)),
@@ -516,8 +516,8 @@ impl Draft {
     }
 }
 
-fn heard(draft: &Draft, calendar: &mut Calendar) -> HeardEpoch {
-    HeardEpoch {
+fn heard(draft: &Draft, calendar: &mut Calendar) -> ReceivedEpoch {
+    ReceivedEpoch {
         epoch: draft.finish(calendar),
         t_first_byte: draft.begin.t_first,
         bytes_before_end: draft.begin.first_read_bytes,

@@ -1,8 +1,8 @@
-//! Bursts as receivers send them, and what must come of them.
+//! Bursts as receivers send them, and the expected epochs.
 
 use proptest::prelude::*;
 
-use super::gnss::{GnssDecoder, HeardEpoch};
+use super::gnss::{GnssDecoder, ReceivedEpoch};
 use super::sentence::framed;
 use super::{DecodeCounts, Refusal};
 use windhover_base::msg::FixKind;
@@ -35,14 +35,14 @@ fn garmin(second: u32) -> String {
         + &line(&format!("PGRMV,{value},-1.0,0.5"))
 }
 
-fn decode(mut decoder: GnssDecoder, text: &str) -> (Vec<HeardEpoch>, DecodeCounts) {
+fn decode(mut decoder: GnssDecoder, text: &str) -> (Vec<ReceivedEpoch>, DecodeCounts) {
     let mut out = Vec::new();
     decoder.push(text.as_bytes(), MonoTime::default(), &mut out);
     decoder.flush(&mut out);
     (out, decoder.counts().clone())
 }
 
-fn seconds(epochs: &[HeardEpoch]) -> Vec<Option<i64>> {
+fn seconds(epochs: &[ReceivedEpoch]) -> Vec<Option<i64>> {
     epochs.iter().map(|e| e.epoch.time_of_day_ns.map(|ns| ns / 1_000_000_000 % 60)).collect()
 }
 
@@ -58,7 +58,7 @@ fn an_epoch_holds_its_own_second_only() {
                 (epoch.fix, epoch.alt_msl_m, epoch.hpe_m),
                 (FixKind::ThreeD, Some(value), Some(value))
             );
-            let velocity = epoch.vel_ned_mps.expect("PGRMV tells it");
+            let velocity = epoch.vel_ned_mps.expect("PGRMV has it");
             assert_eq!((velocity.x, velocity.y, velocity.z), (-1.0, value, -0.5));
             assert!(epoch.vel_has_down && heard.opens_burst);
         }
@@ -73,10 +73,10 @@ fn the_last_sentence_of_a_known_cycle_gives_the_epoch_out() {
     for second in 1..=4 {
         decoder.push(garmin(second).as_bytes(), MonoTime::from_ns(i64::from(second) * 200_000_000), &mut out);
     }
-    // When the fifth burst is whole, or lacks a sentence before the last
+    // When the fifth burst is complete, or lacks a sentence before the last
     out.clear();
     decoder.push(garmin(5).as_bytes(), MonoTime::from_ns(1_000_000_000), &mut out);
-    // Then its epoch is out with it
+    // Then its epoch is output with it
     assert_eq!(seconds(&out), [Some(5)]);
     let damaged = garmin(6).replace("$GPGGA", "$GPGGB");
     decoder.push(damaged.as_bytes(), MonoTime::from_ns(1_200_000_000), &mut out);
@@ -97,7 +97,7 @@ fn silence_gives_an_open_epoch_out() {
 
 #[test]
 fn a_gll_of_the_next_second_stays_apart() {
-    // Given the order of an old Garmin, whose GLL in the burst of one second is of the next
+    // Given the order of an old Garmin, in which the GLL in the burst of one second has the time of the next
     let burst = |second: u32| {
         let time = format!("2253{second:02}");
         rmc(&time, "3030.00000")
@@ -108,7 +108,7 @@ fn a_gll_of_the_next_second_stays_apart() {
     };
     let text: String = (0..4).map(|n| burst(8 + 2 * n)).collect();
     let (epochs, counts) = decode(GnssDecoder::new(), &text);
-    // Then each is an epoch of its own and the errors go with the burst, not with the GLL
+    // Then each is a separate epoch and the errors belong to the burst, not to the GLL
     assert_eq!(seconds(&epochs), [8, 9, 10, 11, 12, 13, 14, 15].map(Some), "{counts}");
     for pair in epochs.chunks(2) {
         let (main, gll) = (&pair[0], &pair[1]);
@@ -136,7 +136,7 @@ fn what_lost_its_time_goes_to_no_epoch() {
     // Given a burst whose RMC and GGA were damaged
     let text = garmin(1) + &garmin(2).replace("GPRMC", "GPRMX").replace("GPGGA", "GPGGX") + &garmin(3);
     let (epochs, counts) = decode(GnssDecoder::new(), &text);
-    // Then its errors and velocity are neither the second before's nor after's
+    // Then its errors and velocity belong neither to the second before nor to the one after
     assert_eq!(seconds(&epochs), [Some(1), Some(3)]);
     assert_eq!((epochs[0].epoch.hpe_m, epochs[1].epoch.hpe_m), (Some(1.5), Some(3.5)));
     assert_eq!(counts.refused(Refusal::NoTime), 3);
@@ -171,8 +171,8 @@ fn zda(time: &str) -> String {
     line(&format!("GPZDA,{time},01,02,2026,00,00"))
 }
 
-/// Pushes each line of the text when it is sent, bursts 1 s apart, lines 20 ms, and ticks between.
-fn live(bursts: &[String]) -> (Vec<HeardEpoch>, DecodeCounts) {
+/// Pushes each line of the text at its time, bursts 1 s apart, lines 20 ms, and ticks between them.
+fn live(bursts: &[String]) -> (Vec<ReceivedEpoch>, DecodeCounts) {
     let (mut decoder, mut out) = (GnssDecoder::new(), Vec::new());
     for (second, burst) in bursts.iter().enumerate() {
         let begin = MonoTime::from_ns(HOST_NS) + Span::from_s(second as f64);
@@ -191,7 +191,7 @@ fn live(bursts: &[String]) -> (Vec<HeardEpoch>, DecodeCounts) {
 /// 2026-02-01T10:11:00Z.
 const HOST_NS: i64 = 1_769_940_660_000_000_000;
 
-/// The order of sentences in a burst, and whether its ZDA is of the same second, so many later, or leads.
+/// The order of sentences in a burst, and whether its ZDA is of the same second, of later ones, or leads.
 fn dated(second: u32, ahead: i64, leads: bool) -> String {
     let time = format!("1011{second:02}");
     let told = format!("1011{:02}", i64::from(second) + ahead);
@@ -216,8 +216,8 @@ fn a_zda_dates_and_never_opens_an_epoch() {
                 assert_eq!(utc, Some(format!("2026-02-01T10:11:{}.000Z", index + 12)), "{what}");
             }
         }
-        // Its burst begins with the ZDA only where that leads it.
-        let begins = |heard: &HeardEpoch| (heard.t_first_byte.ns() - HOST_NS) % 1_000_000_000 / 1_000_000;
+        // Its burst begins with the ZDA only where the ZDA leads it.
+        let begins = |heard: &ReceivedEpoch| (heard.t_first_byte.ns() - HOST_NS) % 1_000_000_000 / 1_000_000;
         let late = if leads && ahead != 0 { 20 } else { 0 };
         let settled = live(&bursts).0;
         assert!(
@@ -225,7 +225,7 @@ fn a_zda_dates_and_never_opens_an_epoch() {
             "ahead {ahead}"
         );
         if ahead == 0 || !leads {
-            // Before the first burst nothing tells what its first sentence belongs to.
+            // Before the first burst it is not known to which burst its first sentence belongs.
             assert!(settled[1..].iter().all(|heard| begins(heard) == 0), "ahead {ahead}, leads {leads}");
         }
     }
@@ -244,7 +244,7 @@ fn a_date_without_a_fix_is_none() {
             assert!(!epochs.is_empty() && epochs.iter().all(|heard| heard.epoch.utc.is_none()), "{date}");
         }
     }
-    // With the fix comes the date, and the zeros before it are forgotten.
+    // The date comes with the fix, and the zeros before it are dropped.
     let bursts = [cold("060180"), cold("060180"), garmin(20), garmin(21)];
     let (epochs, _) = live(&bursts);
     let utc: Vec<_> = epochs.iter().map(|heard| heard.epoch.utc.map(|utc| utc.to_string())).collect();
@@ -337,7 +337,7 @@ fn rtk_is_told_by_quality_or_modes() {
         (gns("RRNR"), FixKind::RtkFixed),
         (gns("RF"), FixKind::RtkFloat),
         (gns("RA"), FixKind::ThreeD),
-        // GGA decides over the others, whatever their order is.
+        // GGA takes precedence over the others in any order.
         (rmc("R") + &gga(5), FixKind::RtkFloat),
         (gga(4) + &rmc("A"), FixKind::RtkFixed),
         (gns("FF") + &rmc("R"), FixKind::RtkFloat),
@@ -401,7 +401,7 @@ proptest! {
             cut.push(read, MonoTime::default(), &mut in_pieces);
             rest = after;
         }
-        let epochs = |heard: &[HeardEpoch]| heard.iter().map(|h| h.epoch).collect::<Vec<_>>();
+        let epochs = |heard: &[ReceivedEpoch]| heard.iter().map(|h| h.epoch).collect::<Vec<_>>();
         prop_assert_eq!(epochs(&at_once), epochs(&in_pieces));
         prop_assert_eq!(whole.counts(), cut.counts());
     }

@@ -19,12 +19,12 @@ mod ubx;
 #[cfg(test)]
 mod ubx_tests;
 
-pub use compass::{CompassDecoder, CompassReading, HeardAttitude};
+pub use compass::{CompassDecoder, CompassReading, ReceivedAttitude};
 pub use counts::{DecodeCounts, Refusal};
-pub use gnss::{GnssDecoder, HeardEpoch};
+pub use gnss::{GnssDecoder, ReceivedEpoch};
 pub use mavlink::{
-    AutopilotDecoder, AutopilotSaid, HeardAutopilot, MavlinkFrame, MavlinkFrames, asked as timesync_asked,
-    is_autopilot, question as timesync_question,
+    AutopilotDecoder, AutopilotMeasurement, MavlinkFrame, MavlinkFrames, ReceivedAutopilot,
+    asked as timesync_asked, is_autopilot, question as timesync_question,
 };
 pub use sentence::{Sentence, framed};
 pub use ubx::{ubx_framed, ubx_packets};

@@ -1,14 +1,14 @@
-//! Lines out of a serial stream, whatever its bytes; bounded, and back in step after any damage.
+//! Lines from a serial stream with arbitrary bytes; bounded, and in step again after any damage.
 
 use super::counts::{DecodeCounts, Refusal};
 use windhover_base::time::MonoTime;
 
-/// Longest line kept. NMEA allows 82 characters, real receivers send up to 120.
+/// Longest line. NMEA allows 82 characters, real receivers send up to 120.
 const LINE_MAX: usize = 200;
-/// Longest line that begins with `#`: NovAtel's long messages, of which those that are read have up to 250.
+/// Longest line that begins with `#`: NovAtel's long messages, of which the supported ones have up to 250 characters.
 const LONG_MAX: usize = 320;
 
-/// A complete line and where in time it lies.
+/// A complete line and its place in time.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Line<'a> {
     /// The line from its first byte, without CR and LF.
@@ -17,7 +17,7 @@ pub(super) struct Line<'a> {
     pub span: LineSpan,
 }
 
-/// Where in time a line lies: reads are stamped, bytes are not.
+/// Place of a line in time: reads are stamped, bytes are not.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub(super) struct LineSpan {
     /// When the read returned that held the first byte.
@@ -28,18 +28,18 @@ pub(super) struct LineSpan {
     pub t_last: MonoTime,
     /// Bytes of that read after the line.
     pub bytes_after: usize,
-    /// Length on the wire, the line's end included.
+    /// Length on the wire, including the line's end.
     pub bytes: usize,
 }
 
-/// How a line begins.
+/// The start of a line.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) enum LineStart {
-    /// With `$`; anything before it is noise, and a `$` inside a line begins a new one.
+    /// `$`; bytes before it are noise, and a `$` inside a line begins a new one.
     Dollar,
-    /// The same, or at the end of another line with `#` (NovAtel's and Unicore's long messages).
+    /// The same, or `#` directly after another line (NovAtel's and Unicore's long messages).
     DollarOrHash,
-    /// With whatever follows the end of the line before.
+    /// Any byte after the end of the previous line.
     Any,
 }
 
@@ -58,7 +58,7 @@ enum State {
     Between,
     /// Inside a line.
     Inside,
-    /// Inside a line too long to be one: skipping to its end.
+    /// Inside a line that is too long: skipping to its end.
     Skipping,
 }
 
@@ -67,8 +67,8 @@ impl LineFramer {
         Self { start, buffer: Vec::with_capacity(LINE_MAX), span: LineSpan::default(), state: State::Between }
     }
 
-    /// Takes the bytes of one read, of which `after` more follow that are no text, and hands every line they
-    /// complete to `sink`.
+    /// Takes the bytes of one read, after which `after` more bytes follow that are not text, and passes every completed
+    /// line to `sink`.
     pub(super) fn push(
         &mut self,
         bytes: &[u8],

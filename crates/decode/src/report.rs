@@ -1,4 +1,4 @@
-//! What one sentence says of a fix, whatever sentence it was.
+//! The report of one sentence about a fix, for all kinds of sentences.
 
 use nalgebra::Vector3;
 
@@ -7,7 +7,7 @@ use super::sentence::number;
 use windhover_base::msg::FixKind;
 use windhover_base::time::{NS_PER_S, days_in_month};
 
-/// Sentences an epoch is made of.
+/// Sentences of an epoch.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub(super) enum Kind {
     Gga,
@@ -45,14 +45,14 @@ pub(super) struct Date {
 }
 
 impl Date {
-    /// Checked; `None` where there is no such day.
+    /// A checked date; `None` where the day does not exist.
     pub(super) fn new(year: i32, month: u8, day: u8) -> Option<Self> {
         let real = (1..=12).contains(&month) && day >= 1 && day <= days_in_month(year, month);
         real.then_some(Self { year, month, day })
     }
 
-    /// `ddmmyy` as RMC and PGRMF give it; years 83 to 99 are of the last century, since NMEA 0183
-    /// is of 1983. `None` where empty or no day.
+    /// `ddmmyy` as in RMC and PGRMF; years 83 to 99 are of the last century, because NMEA 0183 is of 1983. `None` where
+    /// empty or not a day.
     pub(super) fn of_ddmmyy(text: &str) -> Option<Self> {
         if text.len() != 6 || !text.bytes().all(|byte| byte.is_ascii_digit()) {
             return None;
@@ -63,7 +63,7 @@ impl Date {
     }
 }
 
-/// How a position was measured: by codes, or by carrier phases with whole cycles unknown or known.
+/// How a position was measured: from codes, or from carrier phases with float or fixed ambiguities.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 pub(super) enum Solution {
     Code,
@@ -71,19 +71,19 @@ pub(super) enum Solution {
     RtkFixed,
 }
 
-/// What one sentence says. Positions and motion are left out where the sentence calls them void.
+/// The content of one sentence. Positions and motion are left out where the sentence marks them as void.
 #[derive(Clone, PartialEq, Debug)]
 pub(super) struct Report {
-    /// Which sentence.
+    /// Its kind.
     pub kind: Kind,
     /// Nanoseconds since UTC midnight; from 86 400 s on during a leap second.
     pub time_of_day_ns: Option<i64>,
     pub date: Option<Date>,
-    /// Whether the sentence calls its fix valid.
+    /// Whether the sentence marks its fix as valid.
     pub valid: Option<bool>,
-    /// Kind of fix where the sentence tells it.
+    /// Kind of fix where the sentence has it.
     pub fix: Option<FixKind>,
-    /// How the position was measured, where the sentence tells it.
+    /// How the position was measured, where the sentence has it.
     pub solution: Option<Solution>,
     /// Latitude and longitude, degrees.
     pub position_deg: Option<(f64, f64)>,
@@ -97,12 +97,12 @@ pub(super) struct Report {
     /// One-sigma of position and velocity along north, east, down.
     pub position_sigma_m: Option<Vector3<f64>>,
     pub velocity_sigma_mps: Option<Vector3<f64>>,
-    /// Satellites used, as a count.
+    /// Number of satellites used.
     pub sats: Option<u32>,
-    /// Satellites used, as GSA lists them; GSA comes once for each constellation.
+    /// Number of satellites used in GSA's list; there is one GSA for each constellation.
     pub sats_listed: Option<u32>,
     pub hdop: Option<f64>,
-    /// Fields that were there and could not be: the sentence is used without them.
+    /// Fields with impossible values: the sentence is used without them.
     pub left_out: Vec<&'static str>,
 }
 
@@ -132,7 +132,7 @@ impl Report {
         }
     }
 
-    /// Keeps what a field says, or notes that it says what cannot be.
+    /// Takes the value of a field, or notes that it is impossible.
     pub(super) fn optional<T>(&mut self, name: &'static str, read: Result<Option<T>, Refusal>) -> Option<T> {
         read.unwrap_or_else(|_| {
             self.left_out.push(name);
@@ -161,9 +161,8 @@ pub(super) fn time_of_day_ns(text: &str) -> Result<Option<i64>, Refusal> {
     Ok(Some((hour * 3600 + minute * 60 + second) * NS_PER_S + fraction_ns))
 }
 
-/// Degrees from `dddmm.mmmm` and its hemisphere letter; `None` where the number is empty. The last
-/// two digits before the point are minutes, however many digits stand before them: receivers differ
-/// in how many zeros they write.
+/// Degrees from `dddmm.mmmm` and its hemisphere letter; `None` where the number is empty. The last two digits before
+/// the point are minutes, whatever the number of digits before them: receivers differ in the number of leading zeros.
 pub(super) fn angle_deg(
     text: &str,
     letter: &str,

@@ -2,10 +2,10 @@
 
 use super::counts::Refusal;
 
-/// A sentence whose checksum holds.
+/// A sentence with a correct checksum.
 #[derive(Clone, Copy, Debug)]
 pub struct Sentence<'a> {
-    /// What stands between `$` and `*`.
+    /// The text between `$` and `*`.
     pub body: &'a str,
 }
 
@@ -19,8 +19,7 @@ pub fn framed(body: &str) -> String {
     format!("${body}*{:02X}", checksum(body.as_bytes()))
 }
 
-/// Whether a line without a checksum is a sentence: where it is said that the device sends none, and it was seen to
-/// send none.
+/// Whether a line without a checksum is a sentence: where this is configured, and the device was seen to send none.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Checksums {
     required: bool,
@@ -48,7 +47,7 @@ impl<'a> Sentence<'a> {
     /// From a line `$body*HH`, nothing after the checksum.
     ///
     /// # Errors
-    /// Where the line is no ASCII sentence, or its checksum is missing or wrong.
+    /// Where the line is not an ASCII sentence, or its checksum is missing or wrong.
     pub fn of_line(line: &'a [u8]) -> Result<Self, Refusal> {
         let line = std::str::from_utf8(line).map_err(|_| Refusal::NotAscii)?;
         if !line.bytes().all(|byte| (0x20..0x7F).contains(&byte)) {
@@ -89,12 +88,12 @@ impl<'a> Sentence<'a> {
         (address.len() == 5 && !address.starts_with('P')).then(|| &address[2..])
     }
 
-    /// Field `index`, counted from 1 after the address; empty where there is none.
+    /// Field `index`, counted from 1 after the address; empty where absent.
     pub(super) fn field(&self, index: usize) -> &'a str {
         self.body.split(',').nth(index).unwrap_or_default().trim()
     }
 
-    /// How many fields follow the address.
+    /// Number of fields after the address.
     pub(super) fn fields(&self) -> usize {
         self.body.split(',').count() - 1
     }
@@ -105,7 +104,7 @@ impl<'a> Sentence<'a> {
     }
 }
 
-/// A plain decimal: sign, digits, point. Not `nan`, `inf` or an exponent, which Rust would read.
+/// A plain decimal: sign, digits, point. Not `nan`, `inf` or an exponent, which Rust would accept.
 pub(super) fn number(text: &str, low: f64, high: f64) -> Result<Option<f64>, Refusal> {
     if text.is_empty() {
         return Ok(None);

@@ -1,10 +1,9 @@
-//! Standard NMEA sentences, read by the `nmea` crate one by one and checked.
+//! Standard NMEA sentences, read one by one with the `nmea` crate and checked.
 //!
-//! The time, the position and the status (validity, or the kind of fix) decide over a sentence: it is
-//! refused where one of them cannot be. Every other field is left out alone where it cannot be, and
-//! counted by its name.
+//! The time, the position and the status (validity, or the kind of fix) decide about a sentence: it is refused where
+//! one of them is impossible. Any other impossible field is left out alone, and counted by its name.
 //!
-//! | sentence | decide | used where sound | checked only |
+//! | sentence | deciding | used where valid | checked only |
 //! |---|---|---|---|
 //! | RMC | time, status, position | speed, course, date, mode (also: RTK) | variation |
 //! | GGA | time, position | quality (also: RTK), satellites, HDOP, altitude, geoid | |
@@ -15,13 +14,12 @@
 //! | ZDA | time | day, month, year | |
 //! | GST | time | one-sigma of latitude, longitude, altitude | the ellipse |
 //!
-//! A mode or quality that is unknown counts as no measured fix, but an unknown quality of GGA leaves
-//! the decision to the other sentences of its epoch. Fields not named are not read.
+//! An unknown mode or quality counts as no measured fix, but an unknown quality of GGA leaves the decision to the other
+//! sentences of its epoch. Fields that are not listed are not read.
 //!
-//! The crate is used without its state: it merges sentences of different times. It splits angles at
-//! fixed columns, accepts what cannot be (altitude "NaN") and refuses a whole sentence for one odd
-//! field, so positions are read here, and it gets the sentence with the fields it needs, checked and
-//! put into a form it reads.
+//! The crate is used without its state, because it merges sentences of different times. It splits angles at fixed
+//! columns, accepts impossible values (altitude "NaN") and refuses a whole sentence for one unusual field. So positions
+//! are read here, and the crate gets the sentence with the fields that it needs, checked and in a form that it reads.
 
 use chrono::Datelike;
 use nalgebra::Vector3;
@@ -33,13 +31,13 @@ use super::report::{Date, Kind, Report, Solution, angle_deg, time_of_day_ns};
 use super::sentence::{Sentence, framed, number};
 use windhover_base::msg::FixKind;
 
-/// Largest one-sigma of a position, m: what is beyond tells that nothing is known.
+/// Largest one-sigma of a position, m: a larger one means that the error is not known.
 const SIGMA_MAX_M: f64 = 1.0e5;
 
 /// Metres a second in a knot.
 const KNOT_MPS: f64 = 1852.0 / 3600.0;
 
-/// What a standard sentence says; `None` where it says nothing of a fix.
+/// The report of a standard sentence; `None` where it has no part of a fix.
 pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<Report>, Refusal> {
     let Some(kind) = sentence.formatter().and_then(kind_of) else {
         return Ok(None);
@@ -106,7 +104,7 @@ const fn latitude_field(kind: Kind) -> Option<usize> {
     }
 }
 
-/// Fields a sentence has at least, up to the last that every version of it has.
+/// Fewest fields of a sentence: up to the last that every version of it has.
 const fn fields_min(kind: Kind) -> usize {
     match kind {
         Kind::Rmc | Kind::Gga => 9,
@@ -118,7 +116,7 @@ const fn fields_min(kind: Kind) -> usize {
     }
 }
 
-/// Fields handed to the crate: what follows is not read, and empty fields stand for missing ones.
+/// Fields passed to the crate: later ones are not read, and empty fields replace missing ones.
 const fn fields_read(kind: Kind) -> Option<usize> {
     match kind {
         Kind::Rmc => Some(12),
@@ -130,7 +128,7 @@ const fn fields_read(kind: Kind) -> Option<usize> {
     }
 }
 
-/// A number that may be left out: its field, its name, the range it can have.
+/// An optional number: its field, its name, its range.
 type Optional = (usize, &'static str, f64, f64);
 
 const fn optional_numbers(kind: Kind) -> &'static [Optional] {
@@ -181,13 +179,13 @@ fn position_deg(kind: Kind, sentence: &Sentence<'_>) -> Result<Option<(f64, f64)
     Ok(lat_deg.zip(lon_deg))
 }
 
-/// The body in a form the crate reads, without the fields that cannot be; these go to `report`.
+/// The body in a form that the crate reads, without impossible fields; these go to `report`.
 fn readable_body(kind: Kind, sentence: &Sentence<'_>, report: &mut Report) -> String {
     let mut fields: Vec<String> = sentence.body.split(',').map(|field| field.trim().to_owned()).collect();
     for &(index, name, low, high) in optional_numbers(kind) {
         if let Some(field) = fields.get_mut(index) {
             let value = report.optional(name, number(field, low, high));
-            // Adding zero takes the sign off a zero.
+            // Adding zero removes the sign of −0.
             *field = value.map_or_else(String::new, |value| (value + 0.0).to_string());
         }
     }
@@ -218,7 +216,7 @@ fn readable_body(kind: Kind, sentence: &Sentence<'_>, report: &mut Report) -> St
     fields.join(",")
 }
 
-/// The date only where it is one (000000 is none yet), and no variation.
+/// The date only where it is valid (000000 means none yet), and no variation.
 fn readable_rmc(fields: &mut [String], report: &mut Report) {
     let date = &mut fields[9];
     if Date::of_ddmmyy(date).is_none() {
@@ -233,11 +231,11 @@ fn readable_rmc(fields: &mut [String], report: &mut Report) {
     fields[10..].iter_mut().for_each(String::clear);
 }
 
-/// A quality the crate knows, metres only, and nothing of the corrections.
+/// A quality that the crate knows, metres only, and no fields of the corrections.
 fn readable_gga(fields: &mut [String], report: &mut Report) {
     match fields[6].as_str() {
         "0" | "1" | "2" | "3" | "4" | "5" | "6" | "7" | "8" => {}
-        // A fix with corrections from satellites, as NovAtel numbers it.
+        // A fix with corrections from satellites, in NovAtel's numbering.
         "9" => fields[6] = "2".to_owned(),
         other => {
             if !other.is_empty() {
@@ -256,7 +254,7 @@ fn readable_gga(fields: &mut [String], report: &mut Report) {
     fields[13].clear();
 }
 
-/// The modes are read by their letters; the crate knows two of them at most, and wants a count.
+/// The modes are read by their letters; the crate knows at most two of them, and needs a count.
 fn readable_gns(fields: &mut [String]) {
     fields[6] = "N".to_owned();
     if fields[7].is_empty() {
@@ -265,7 +263,7 @@ fn readable_gns(fields: &mut [String]) {
     fields[11..].iter_mut().for_each(String::clear);
 }
 
-/// Only a date that exists, and no zone: some write its sign, and the time is UTC anyway.
+/// Only a valid date, and no zone: some write its sign, and the time is UTC anyway.
 fn readable_zda(fields: &mut [String], report: &mut Report) {
     let date = &fields[2..5];
     let whole = |field: &String| field.parse::<u16>().unwrap_or(0);
@@ -286,8 +284,8 @@ fn mode_is_measured(mode: &str) -> bool {
     mode.is_empty() || mode.chars().any(|letter| matches!(letter, 'A' | 'D' | 'F' | 'P' | 'R'))
 }
 
-/// How a measured position came about, by the letters of its modes, a letter a constellation: no better than the
-/// worst of those that took part.
+/// How a measured position was obtained, by the letters of its modes, one for each constellation: as good as the worst
+/// of those that took part.
 fn solution_of_modes(modes: &str) -> Option<Solution> {
     let letters = modes.chars().filter(|letter| *letter != 'N');
     let solutions = letters.map(|letter| match letter {
@@ -314,7 +312,7 @@ fn of_gga(report: &mut Report, data: &GgaData, sentence: &Sentence<'_>) {
     let measured = data.fix_type.is_some_and(|fix| {
         !matches!(fix, FixType::Invalid | FixType::Estimated | FixType::Manual | FixType::Simulation)
     });
-    // A fix of no satellites, or of a quality unknown, is one only if another sentence says so.
+    // A fix without satellites, or of unknown quality, is a fix only if another sentence says so.
     let decided = quality_known && (!measured || data.fix_satellites != Some(0));
     report.valid = decided.then_some(measured);
     report.solution = decided.then_some(match data.fix_type {
@@ -387,7 +385,7 @@ fn of_gst(report: &mut Report, sentence: &Sentence<'_>) -> Result<(), Refusal> {
         |name, field| report.optional(name, sentence.number(field, 0.0, SIGMA_MAX_M)).filter(|s| *s > 0.0);
     let across = sigma("GST latitude", 6).zip(sigma("GST longitude", 7));
     let up = sigma("GST altitude", 8);
-    // Without an altitude the solution is flat, and its height is not used.
+    // Without an altitude the solution is two-dimensional, and its height is not used.
     report.position_sigma_m =
         across.map(|(north, east)| Vector3::new(north, east, up.unwrap_or(SIGMA_MAX_M)));
     Ok(())
@@ -398,7 +396,7 @@ fn of_zda(report: &mut Report, data: &ZdaData) {
         data.utc_date().and_then(|date| Date::new(date.year(), date.month() as u8, date.day() as u8));
 }
 
-/// The decimal that was written: the crate keeps single precision, whose shortest form is it.
+/// The decimal as it was written: the crate stores single precision, whose shortest form it is.
 fn decimal(value: f32) -> f64 {
     value.to_string().parse().unwrap_or(f64::from(value))
 }
@@ -517,7 +515,7 @@ mod tests {
         }
     }
 
-    /// A sound sentence of each kind with a position, and the fields that decide over it.
+    /// A valid sentence of each kind with a position, and the fields that decide about it.
     const POSITIONED: [(&str, &[usize]); 4] = [
         ("GPRMC,101112,A,3030.0,N,08530.0,W,5.0,90.0,010226,3.4,W,A,V", &[1, 2, 3, 4, 5, 6, 12]),
         ("GPGGA,101112,3030.0,N,08530.0,W,1,08,1.1,43.0,M,50.0,M,1.0,0001", &[1, 2, 3, 4, 5]),

@@ -1,16 +1,16 @@
 //! u-blox's binary packets (UBX), among sentences or alone.
 //!
-//! Packet: B5 62, class, identity, u16 length, payload, Fletcher sum over all between; little-endian. The `ublox`
-//! crate knows the payloads; only its plain fields are used, since what it maps flags to may not exist.
+//! Packet: B5 62, class, identity, u16 length, payload, Fletcher sum over all between; little-endian. The `ublox` crate
+//! reads the payloads; only its plain fields are used, because its enums do not cover all values of flags.
 //!
-//! | packet | what is used |
+//! | packet | used |
 //! |---|---|
 //! | NAV-PVT | time and date where valid, kind of fix (also: RTK), position, both heights, velocity, accuracies, satellites |
 //! | NAV-COV | one-sigma of position and velocity along north, east, down, where valid |
 //! | NAV-TIMEUTC, TIM-TP | the date, where UTC is valid |
 //! | NAV-RELPOSNED | the heading between two antennas ([`relative_heading`]) |
 //!
-//! Others are passed over. Source: u-blox's interface descriptions.
+//! Others are skipped. Source: u-blox's interface descriptions.
 
 use nalgebra::Vector3;
 use ublox::UbxProtocol;
@@ -29,21 +29,21 @@ use windhover_base::time::{MonoTime, NS_PER_S, UtcTime};
 const HEAD: usize = 6;
 /// Bytes around a payload.
 const AROUND: usize = HEAD + 2;
-/// Longest payload waited for: raw measurements of every satellite there is.
+/// Longest accepted payload: raw measurements of all satellites.
 const PAYLOAD_MAX: usize = 4_096;
-/// Classes there are. Two marks before anything else are chance.
+/// Existing classes. Two marks before anything else are chance.
 const CLASSES: [u8; 15] =
     [0x01, 0x02, 0x04, 0x05, 0x06, 0x09, 0x0A, 0x0B, 0x0D, 0x10, 0x13, 0x21, 0x27, 0x28, 0x29];
 
-/// What a stream is made of.
+/// A piece of a stream.
 pub(super) enum Piece<'a> {
-    /// Bytes outside packets, and how many of the read follow.
+    /// Bytes outside packets, and how many bytes of the read follow.
     Outside(&'a [u8], usize),
-    /// A whole packet and where in time it lies.
+    /// A complete packet and its place in time.
     Packet(&'a [u8], LineSpan),
 }
 
-/// Takes packets out of a stream.
+/// Extracts packets from a stream.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Splitter {
     packet: Vec<u8>,
@@ -59,7 +59,7 @@ enum Held {
 }
 
 impl Splitter {
-    /// Takes the bytes of one read, of which `after` more follow, and hands its pieces to `sink`.
+    /// Takes the bytes of one read, after which `after` more follow, and passes its pieces to `sink`.
     pub(super) fn push(
         &mut self,
         bytes: &[u8],
@@ -100,7 +100,7 @@ impl Splitter {
                     if matches!(broken, Held::Damaged) {
                         counts.refuse(Refusal::BadChecksum);
                     }
-                    // Its mark is noise; what follows may be anything.
+                    // Its mark is noise; the following bytes may be anything.
                     let held = std::mem::take(&mut self.packet);
                     sink(Piece::Outside(&held[..1], held.len() - 1 + rest.len() + after), counts);
                     self.push(&held[1..], rest.len() + after, t_recv, counts, sink);
@@ -136,7 +136,7 @@ fn checksum(summed: &[u8]) -> [u8; 2] {
     [a, b]
 }
 
-/// A whole packet on the wire. Payloads have 65,535 bytes at the most; the rest of a longer one is left out.
+/// A packet as sent. Payloads have at most 65,535 bytes; the rest of a longer one is left out.
 pub fn ubx_framed(class: u8, identity: u8, payload: &[u8]) -> Vec<u8> {
     let length = u16::try_from(payload.len()).unwrap_or(u16::MAX);
     let mut packet = vec![0xB5, 0x62, class, identity];
@@ -147,7 +147,7 @@ pub fn ubx_framed(class: u8, identity: u8, payload: &[u8]) -> Vec<u8> {
     packet
 }
 
-/// Class, identity and payload of each whole packet in bytes, checksum sound.
+/// Class, identity and payload of each complete packet with a correct checksum.
 pub fn ubx_packets(bytes: &[u8]) -> impl Iterator<Item = (u8, u8, &[u8])> {
     bytes.windows(HEAD).enumerate().filter_map(|(at, head)| {
         let &[0xB5, 0x62, class, identity, low, high] = head else { return None };
@@ -167,11 +167,11 @@ fn packet_ref(packet: &[u8]) -> Result<PacketRef<'_>, Refusal> {
     Proto31::match_packet(packet[2], packet[3], payload).map_err(|_| Refusal::Malformed)
 }
 
-/// What a packet says of a fix; `None` where it says nothing.
+/// The report of a packet; `None` where it has no part of a fix.
 pub(super) fn read(packet: &[u8]) -> Result<Option<Report>, Refusal> {
     match (packet[2], packet[3]) {
         (0x01, 0x07) if packet.len() == PVT_OLD + AROUND => {
-            // The seventh generation ends before what is not used here.
+            // The packet of the seventh generation is shorter; it lacks only fields that are not used here.
             let mut longer = packet[..HEAD + PVT_OLD].to_vec();
             longer.resize(HEAD + PVT_NEW + 2, 0);
             of_packet(&packet_ref(&longer)?)
@@ -181,7 +181,7 @@ pub(super) fn read(packet: &[u8]) -> Result<Option<Report>, Refusal> {
     }
 }
 
-/// Payloads of NAV-PVT up to the seventh generation, and since.
+/// Payload of NAV-PVT up to the seventh generation, and in later ones.
 const PVT_OLD: usize = 84;
 const PVT_NEW: usize = 92;
 
@@ -215,7 +215,7 @@ fn solution(pvt: &NavPvtRef<'_>) -> Result<Report, Refusal> {
     let mut report = Report::new(Kind::Pvt);
     clock.fill(&mut report, valid & 2 != 0, valid & 1 != 0)?;
     let ok = flags & 1 != 0;
-    // Dead reckoning alone (1) and time alone (5) are no fixes.
+    // Dead reckoning alone (1) and time alone (5) are not fixes.
     let fix = match pvt.fix_type_raw() {
         2 if ok => FixKind::TwoD,
         3 | 4 if ok => FixKind::ThreeD,
@@ -243,13 +243,13 @@ fn solution(pvt: &NavPvtRef<'_>) -> Result<Report, Refusal> {
     report.course_deg = Some(pvt.heading_motion().rem_euclid(360.0));
     let (across, up, speed) = (pvt.horizontal_accuracy(), pvt.vertical_accuracy(), pvt.speed_accuracy());
     (report.hpe_m, report.vpe_m) = (Some(across), Some(up));
-    // Of the whole horizontal error and of the whole speed: along an axis it is no more.
+    // The errors of the whole horizontal position and speed: along one axis they are at most that.
     report.position_sigma_m = sigmas([across, across, up]);
     report.velocity_sigma_mps = sigmas([speed; 3]);
     Ok(report)
 }
 
-/// Its time of week is that of the solution it comes with.
+/// Its time of week is that of the solution with which it comes.
 fn covariance(cov: &NavCovRef<'_>) -> Result<Option<Report>, Refusal> {
     let of = |valid: u8, variances: [f32; 3]| match valid {
         0 => Ok(None),
@@ -265,12 +265,12 @@ fn covariance(cov: &NavCovRef<'_>) -> Result<Option<Report>, Refusal> {
     Ok(Some(report))
 }
 
-/// One-sigmas that can be; `None` where one is nothing, endless or no number.
+/// Plausible one-sigmas; `None` where one is zero, infinite or not a number.
 fn sigmas(values: [f64; 3]) -> Option<Vector3<f64>> {
     values.iter().all(|sigma| sigma.is_finite() && *sigma > 0.0).then(|| Vector3::from(values))
 }
 
-/// TIM-TP: the time of the pulse to come; `None` where it is not of UTC.
+/// TIM-TP: the time of the next pulse; `None` where it is not UTC.
 fn next_pulse(pulse: &TimTpRef<'_>) -> Result<Option<Report>, Refusal> {
     let flags = pulse.flags();
     if flags.time_base() != TimTpTimeBase::Utc || !flags.utc_available() {
@@ -289,15 +289,14 @@ fn next_pulse(pulse: &TimTpRef<'_>) -> Result<Option<Report>, Refusal> {
     Ok(Some(report))
 }
 
-/// 1980-01-06, from which weeks are counted.
+/// 1980-01-06, the start of the week count.
 const GPS_BEGAN: UtcTime = UtcTime::from_unix_ns(315_964_800 * NS_PER_S);
 const DAY_NS: i64 = 86_400 * NS_PER_S;
 const WEEK_NS: i64 = 7 * DAY_NS;
 /// Two centuries of weeks.
 const WEEK_MAX: i64 = 10_000;
 
-/// Flags of NAV-RELPOSNED that a heading needs: fix, relative position, a solution of known or unknown whole
-/// cycles (two bits), heading.
+/// Flags of NAV-RELPOSNED that a heading needs: fix, relative position, float or fixed ambiguities (two bits), heading.
 const RELATIVE: [u32; 4] = [1, 1 << 2, 3 << 3, 1 << 8];
 
 /// The heading from one antenna to the other, degrees, of NAV-RELPOSNED: `Some(None)` where it is not valid, `None`
@@ -318,16 +317,16 @@ pub(super) fn relative_heading(packet: &[u8]) -> Result<Option<Option<f64>>, Ref
     Ok(Some(Some(degrees.rem_euclid(360.0))))
 }
 
-/// Date and time as the packets have them.
+/// Date and time as in the packets.
 struct Clock {
     time: [u8; 3],
     nanoseconds: i32,
     date: (u16, u8, u8),
 }
 
-/// Times of epochs are told to so many nanoseconds: what is beside them is the receiver's clock.
+/// Resolution of the epochs' times, ns: the rest is the receiver's clock error.
 const EPOCH_STEP_NS: i64 = 1_000_000;
-/// The same of sentences, where that is near.
+/// The same for sentences, where the time is near such a step.
 const SENTENCE_STEP_NS: i64 = 10_000_000;
 
 impl Clock {
@@ -344,7 +343,7 @@ impl Clock {
         let coarse_ns = rounded(SENTENCE_STEP_NS);
         let near = (coarse_ns - exact_ns).abs() <= EPOCH_STEP_NS;
         let time_ns = if near { coarse_ns } else { rounded(EPOCH_STEP_NS) };
-        // A whole second before midnight may be told as a little less than midnight's.
+        // A whole second before midnight may be reported as slightly before midnight.
         report.time_of_day_ns = Some(time_ns.max(0));
         if has_date {
             let (year, month, day) = self.date;

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 use proptest::prelude::*;
 
-use super::gnss::{GnssDecoder, HeardEpoch};
+use super::gnss::{GnssDecoder, ReceivedEpoch};
 use super::sentence::framed;
 use super::ubx::ubx_framed;
 use super::{DecodeCounts, Refusal};
@@ -11,7 +11,7 @@ use windhover_base::msg::FixKind;
 use windhover_base::settings::GpsFormat;
 use windhover_base::time::MonoTime;
 
-/// NAV-PVT of 2026-11-18 15:04:`second`, `nanoseconds` beside it, with this fix type and flags.
+/// NAV-PVT of 2026-11-18 15:04:`second` plus `nanoseconds`, with this fix type and flags.
 fn pvt(second: u8, nanoseconds: i32, fix: u8, flags: u8) -> Vec<u8> {
     let mut payload = vec![0; 92];
     payload[4..11].copy_from_slice(&[0xEA, 0x07, 11, 18, 15, 4, second]);
@@ -37,7 +37,7 @@ fn pvt(second: u8, nanoseconds: i32, fix: u8, flags: u8) -> Vec<u8> {
     ubx_framed(1, 7, &payload)
 }
 
-fn decode(format: GpsFormat, bytes: &[u8]) -> (Vec<HeardEpoch>, DecodeCounts) {
+fn decode(format: GpsFormat, bytes: &[u8]) -> (Vec<ReceivedEpoch>, DecodeCounts) {
     let (mut decoder, mut out) = (GnssDecoder::patient().of_format(format), Vec::new());
     decoder.push(bytes, MonoTime::default(), &mut out);
     decoder.flush(&mut out);
@@ -84,7 +84,7 @@ fn sentences_beside_it_are_of_the_same_epoch() {
         .into_bytes()
     };
     for packet_first in [true, false] {
-        // The packet's nanoseconds are the receiver's clock: the time is the sentences'.
+        // The packet's nanoseconds are the receiver's clock error: the time is that of the sentences.
         let burst = |second| {
             let (packet, text) = (pvt(second, -300_000, 3, 1), sentences(second));
             if packet_first { [packet, text].concat() } else { [text, packet].concat() }
@@ -140,7 +140,7 @@ fn accuracies_and_rtk_are_told() {
     let of = |v: Option<Vector3<f64>>| v.expect("told");
     assert_eq!(of(alone.position_sigma_m), Vector3::new(0.8, 0.8, 1.2));
     assert_eq!(of(alone.velocity_sigma_mps), Vector3::repeat(0.12));
-    assert_eq!(epoch(&[with(1, 0)]).velocity_sigma_mps, None, "nothing is no accuracy");
+    assert_eq!(epoch(&[with(1, 0)]).velocity_sigma_mps, None, "zero is no accuracy");
     assert_eq!(epoch(&[with(0x41, 9)]).fix, FixKind::RtkFloat);
     assert_eq!(epoch(&[with(0x81, 9)]).fix, FixKind::RtkFixed);
     let covered = epoch(&[with(1, 120), cov([1, 1], [0.25, 0.5, 4.0], [0.01, 0.04, 0.09])]);

@@ -147,7 +147,7 @@ impl Detector {
         Self { simd, refiner: Refiner::new(simd), ..self }
     }
 
-    /// Looks for tags from this edge on, pixels, from now on.
+    /// Appearance for tags from this edge on, pixels, from now on.
     pub fn set_min_px(&mut self, min_px: f64) {
         self.min_px = min_px as f32;
     }
@@ -220,7 +220,7 @@ impl Detector {
         }
     }
 
-    /// Looks for tags in a level; how their parts are to be looked at afterwards.
+    /// Appearance for tags in a level; how their parts are to be looked at afterwards.
     fn search_level(
         &mut self,
         image: ImageView<'_>,
@@ -256,7 +256,7 @@ impl Detector {
         }
     }
 
-    /// Looks for tags among what is left of regions when those that touch by a corner alone are taken apart.
+    /// Appearance for tags among what is left of regions when those that touch by a corner alone are taken apart.
     fn search_parts(
         &mut self,
         image: ImageView<'_>,
@@ -287,7 +287,7 @@ impl Detector {
         self.binariser.measure(level.image, (gate, gate.max(CLEAR_GATE as u8)), inverted, self.simd);
     }
 
-    /// Looks for tags among the dark regions that one division into dark and light makes of a level.
+    /// Appearance for tags among the dark regions that one division into dark and light makes of a level.
     fn search_division(
         &mut self,
         image: ImageView<'_>,
@@ -304,7 +304,7 @@ impl Detector {
         self.search_regions(image, n, at, touch, inverted);
     }
 
-    /// Looks for tags among the marked regions of a level.
+    /// Appearance for tags among the marked regions of a level.
     fn search_regions(&mut self, image: ImageView<'_>, n: usize, at: Where, touch: Touch, inverted: bool) {
         let Self { pyramid, bits, labeller, finder, refiner, found, tried, families, noise, .. } = self;
         let level = pyramid.level(image, n);

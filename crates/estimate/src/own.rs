@@ -153,7 +153,7 @@ pub(crate) struct Terms<'a> {
 }
 
 /// How a slow state moves.
-enum Wander {
+enum SmoothNoise {
     /// A random walk, units per √s.
     Walk(f64),
     /// Gauss–Markov about zero: correlation time, s. Its variance is that it starts with.
@@ -165,7 +165,7 @@ struct Slow {
     first: usize,
     mean: for<'a> fn(&'a mut Own) -> &'a mut [f64],
     start_var: fn(&Terms<'_>) -> [f64; 3],
-    wander: Wander,
+    wander: SmoothNoise,
 }
 
 /// The slow states in the order of their columns.
@@ -174,117 +174,117 @@ const SLOW: [Slow; 18] = [
         first: place(own::GUST),
         mean: |own| own.gust.as_mut_slice(),
         start_var: |terms| [terms.learnt.gust_var; 3],
-        wander: Wander::Reverts(|terms| terms.models.tau.gust_s),
+        wander: SmoothNoise::Reverts(|terms| terms.models.tau.gust_s),
     },
     Slow {
         first: place(own::THRUST),
         mean: |own| std::slice::from_mut(&mut own.thrust),
         start_var: |terms| [terms.learnt.thrust_var; 3],
-        wander: Wander::Reverts(|terms| terms.models.tau.thrust_s),
+        wander: SmoothNoise::Reverts(|terms| terms.models.tau.thrust_s),
     },
     Slow {
         first: place(own::TILT_ERROR),
         mean: |own| own.tilt_error.as_mut_slice(),
         start_var: |terms| [terms.learnt.tilt_error_var; 3],
-        wander: Wander::Reverts(|terms| terms.senses.tilt_error_tau_s),
+        wander: SmoothNoise::Reverts(|terms| terms.senses.tilt_error_tau_s),
     },
     Slow {
         first: place(own::WIND),
         mean: |own| own.wind.as_mut_slice(),
         // 8 m/s of wind at a drag of 0.2 /s.
         start_var: |_| [1.5f64.powi(2); 3],
-        wander: Wander::Walk(0.1),
+        wander: SmoothNoise::Walk(0.1),
     },
     Slow {
         first: place(own::TRIM),
         mean: |own| own.trim.as_mut_slice(),
         // 3.5°: a tail rotor alone makes a helicopter hang by some degrees.
         start_var: |_| [0.06f64.powi(2); 3],
-        wander: Wander::Walk(1e-4),
+        wander: SmoothNoise::Walk(1e-4),
     },
     Slow {
         first: place(own::GPS_BIAS),
         mean: |own| own.gps_bias.as_mut_slice(),
         start_var: |terms| terms.senses.gps_bias_var,
-        wander: Wander::Reverts(|terms| terms.models.tau.gps_bias_s),
+        wander: SmoothNoise::Reverts(|terms| terms.models.tau.gps_bias_s),
     },
     Slow {
         first: place(own::HEADING_BIAS),
         mean: |own| std::slice::from_mut(&mut own.heading_bias),
         start_var: |terms| [terms.models.heading_bias_var[COMPASS]; 3],
         // A tenth of a degree over 100 s would be 2e-4.
-        wander: Wander::Walk(3e-4),
+        wander: SmoothNoise::Walk(3e-4),
     },
     Slow {
         first: place(own::TILT_GAIN),
         mean: |own| std::slice::from_mut(&mut own.tilt_gain),
         // It is one, or found out beside the filter (`kind.rs`).
         start_var: |_| [0.0; 3],
-        wander: Wander::Walk(0.0),
+        wander: SmoothNoise::Walk(0.0),
     },
     Slow {
         first: place(own::TILT_BIAS),
         mean: |own| own.tilt_bias.as_mut_slice(),
         // 0.4°: data sheets allow 0.2° to 0.5°.
         start_var: |_| [0.007f64.powi(2); 3],
-        wander: Wander::Walk(3e-4),
+        wander: SmoothNoise::Walk(3e-4),
     },
     Slow {
         first: place(own::GPS_DELAY),
         mean: |own| std::slice::from_mut(&mut own.gps_delay_s),
         start_var: |terms| [terms.models.gps_delay_var; 3],
-        wander: Wander::Walk(2e-4),
+        wander: SmoothNoise::Walk(2e-4),
     },
     Slow {
         first: place(own::DRAG),
         mean: |own| std::slice::from_mut(&mut own.drag_per_s),
         // About START_DRAG_PER_S.
         start_var: |_| [0.1f64.powi(2); 3],
-        wander: Wander::Walk(1e-4),
+        wander: SmoothNoise::Walk(1e-4),
     },
     Slow {
         first: place(own::COMPASS_DELAY),
         mean: |own| std::slice::from_mut(&mut own.compass_delay_s),
         // Filters of compasses and drivers of cameras have tens of milliseconds that no data sheet tells.
         start_var: |_| [0.03f64.powi(2); 3],
-        wander: Wander::Walk(1e-4),
+        wander: SmoothNoise::Walk(1e-4),
     },
     Slow {
         first: place(own::RATE_BIAS),
         mean: |own| own.rate_bias.as_mut_slice(),
         start_var: |terms| [terms.models.rate_bias_var; 3],
-        wander: Wander::Walk(1e-4),
+        wander: SmoothNoise::Walk(1e-4),
     },
     Slow {
         first: place(own::FORCE_BIAS),
         mean: |own| own.force_bias.as_mut_slice(),
         start_var: |terms| [terms.models.force_bias_var; 3],
         // What vibration rectifies changes with the load.
-        wander: Wander::Walk(0.05),
+        wander: SmoothNoise::Walk(0.05),
     },
     Slow {
         first: place(own::SECOND_HEADING_BIAS),
         mean: |own| std::slice::from_mut(&mut own.second.heading_bias),
         start_var: |terms| [terms.models.heading_bias_var[SECOND]; 3],
-        wander: Wander::Walk(3e-4),
+        wander: SmoothNoise::Walk(3e-4),
     },
     Slow {
         first: place(own::SECOND_TILT_GAIN),
         mean: |own| std::slice::from_mut(&mut own.second.tilt_gain),
         start_var: |_| [0.0; 3],
-        wander: Wander::Walk(0.0),
+        wander: SmoothNoise::Walk(0.0),
     },
     Slow {
         first: place(own::SECOND_TILT_BIAS),
         mean: |own| own.second.tilt_bias.as_mut_slice(),
         start_var: |_| [0.007f64.powi(2); 3],
-        wander: Wander::Walk(3e-4),
+        wander: SmoothNoise::Walk(3e-4),
     },
     Slow {
         first: place(own::SECOND_TILT_ERROR),
         mean: |own| own.second.tilt_error.as_mut_slice(),
         start_var: |terms| [terms.senses.second_error_var; 3],
-        wander: Wander::Reverts(|terms| terms.senses.second_error_tau_s),
+        wander: SmoothNoise::Reverts(|terms| terms.senses.second_error_tau_s),
     },
 ];
 
@@ -369,8 +369,8 @@ impl Terms<'_> {
     /// Variances that the slow states gain over a time.
     pub(crate) fn growth(&self, dt_s: f64) -> [f64; SLOW_STATES] {
         by_row(|slow| match slow.wander {
-            Wander::Walk(walk) => [walk.powi(2) * dt_s; 3],
-            Wander::Reverts(_) => {
+            SmoothNoise::Walk(walk) => [walk.powi(2) * dt_s; 3],
+            SmoothNoise::Reverts(_) => {
                 let decay = slow.decay(self, dt_s);
                 (slow.start_var)(self).map(|var| var * (1.0 - decay * decay))
             }
@@ -381,8 +381,8 @@ impl Terms<'_> {
 impl Slow {
     fn decay(&self, terms: &Terms<'_>, dt_s: f64) -> f64 {
         match self.wander {
-            Wander::Reverts(tau_s) => (-dt_s / tau_s(terms)).exp(),
-            Wander::Walk(_) => 1.0,
+            SmoothNoise::Reverts(tau_s) => (-dt_s / tau_s(terms)).exp(),
+            SmoothNoise::Walk(_) => 1.0,
         }
     }
 }

@@ -70,7 +70,7 @@ impl Senses {
 }
 
 impl Core {
-    /// Looks at the quality of a fix: where its kind changes, the receiver's error is another one; where it is said to be
+    /// Appearance at the quality of a fix: where its kind changes, the receiver's error is another one; where it is said to be
     /// larger, it may have grown.
     pub(crate) fn sense_fix(&mut self, fix: FixKind, told_m: Option<Vector3<f64>>) {
         let (state, models) = (&mut self.state, &self.models);

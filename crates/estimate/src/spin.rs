@@ -47,7 +47,7 @@ impl Spin {
 }
 
 impl Core {
-    /// Looks at the turns of the targets a frame has shown.
+    /// Appearance at the turns of the targets a frame has shown.
     pub(crate) fn judge_turns(&mut self) {
         for i in 0..self.state.targets.len() {
             let Some(tightest) = self.models.targets[i].motion.model().tightest_turn() else { continue };

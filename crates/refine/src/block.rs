@@ -1,8 +1,8 @@
-//! A few rows of the least-squares problem, whitened, and the figures on their noise.
+//! A few rows of the least-squares problem, whitened, and their noise factors.
 
 use crate::front::{cholesky, forward};
 
-/// What rows are of.
+/// The source of rows.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum Source {
     /// Positions of the receiver.
@@ -17,28 +17,28 @@ pub enum Source {
     Marker(usize),
     /// Ground features.
     Feature,
-    /// Roll and pitch of the helicopter as it moves by itself.
+    /// Roll and pitch motion of the helicopter.
     TiltMotion,
-    /// Its turning.
+    /// Yaw motion of the helicopter.
     YawMotion,
-    /// Its gusts.
+    /// Gusts on the helicopter.
     Gust,
-    /// Its climbing.
+    /// Vertical force on the helicopter.
     Thrust,
-    /// How a target drives.
+    /// Motion of a target along its course.
     Drive(usize),
-    /// How a target turns.
+    /// Turning of a target.
     Turn(usize),
-    /// Positions from outside.
+    /// External positions.
     Outside,
-    /// What is finer than a gust in the helicopter's velocity.
+    /// Changes of the helicopter's velocity that are faster than a gust.
     Vibration,
-    /// What has figures that are not fitted.
+    /// Rows with noise that is not fitted.
     Known,
 }
 
 impl Source {
-    /// Whether it is a measurement, which may be wrong.
+    /// Whether it is a measurement, which may be an outlier.
     pub(crate) const fn is_measured(self) -> bool {
         matches!(
             self,
@@ -52,12 +52,12 @@ impl Source {
         )
     }
 
-    /// Whether it is motion whose figure changes with time: driving on and turning in are other things than standing still.
+    /// Whether it is motion whose intensity changes with time: starting and turning in differ from standing still.
     pub(crate) const fn is_local(self) -> bool {
         matches!(self, Self::TiltMotion | Self::YawMotion | Self::Drive(_) | Self::Turn(_))
     }
 
-    /// Where its figure stands.
+    /// The index of its factor.
     pub(crate) const fn index(self) -> usize {
         match self {
             Self::GpsPosition => 0,
@@ -78,7 +78,7 @@ impl Source {
         }
     }
 
-    /// How many there are with so many targets.
+    /// Number of sources with this many targets.
     pub(crate) const fn count(targets: usize) -> usize {
         12 + 3 * targets
     }
@@ -88,13 +88,13 @@ impl Source {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Block {
     pub(crate) columns: Vec<usize>,
-    /// A figure a column, one row behind the other.
+    /// One value for each column, row after row.
     pub(crate) rows: Vec<f64>,
     pub(crate) right: Vec<f64>,
 }
 
 impl Block {
-    /// Empties it for so many rows.
+    /// Clears it for this number of rows.
     pub(crate) fn begin(&mut self, rows: usize) {
         self.columns.clear();
         self.rows.clear();
@@ -118,7 +118,7 @@ impl Block {
         &mut self.rows[row * self.columns.len() + place]
     }
 
-    /// Multiplies by `L⁻¹` of the rows' covariance `L Lᵀ`, given row by row; `false` where it is none.
+    /// Multiplies by `L⁻¹` of the rows' covariance `L Lᵀ`, given row by row; `false` where it is not positive definite.
     pub(crate) fn whiten(&mut self, covariance: &mut [f64]) -> bool {
         let n = self.len();
         if cholesky(covariance, n).is_err() {
@@ -130,17 +130,17 @@ impl Block {
         true
     }
 
-    /// Sum of the squares of what is left over.
+    /// Sum of the squared residuals.
     pub(crate) fn square(&self) -> f64 {
         self.right.iter().map(|r| r * r).sum()
     }
 }
 
-/// Variances, or intensities, by source: factors on what is configured of measurements, figures of motion.
+/// Variances, or intensities, by source: factors on the configured noise of measurements, values for motion.
 #[derive(Clone, Debug)]
 pub(crate) struct Noise {
     figures: Vec<f64>,
-    /// By source, factors on its figure in each window of time: none where it is the same at all times.
+    /// By source, factors in each window of time: none where it is constant.
     local: Vec<Vec<f64>>,
 }
 
@@ -154,12 +154,12 @@ impl Noise {
         self.figures[source.index()]
     }
 
-    /// The figure in a window of time.
+    /// The factor in a window of time.
     pub(crate) fn at(&self, source: Source, window: usize) -> f64 {
         self.of(source) * self.local[source.index()].get(window).unwrap_or(&1.0)
     }
 
-    /// Puts a source's figures in the windows of time, one behind the other.
+    /// Sets a source's factors in the windows of time, in order.
     pub(crate) fn set_local(&mut self, source: Source, figures: &[f64]) {
         let whole = self.of(source);
         self.local[source.index()] = figures.iter().map(|figure| figure / whole).collect();
@@ -170,8 +170,8 @@ impl Noise {
     }
 }
 
-/// How far a block's square may be from what noise makes of it: beyond, its weight falls as `gate/s²`, and its loss grows as
-/// `gate (1 + ln(s²/gate))`: what is grossly wrong hardly pulls.
+/// Robust loss: how large a block's square may be by its noise. Beyond the gate its weight falls as `gate/s²`, and its
+/// loss grows as `gate (1 + ln(s²/gate))`, so that a gross error has little effect.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Loss {
     pub(crate) weight: f64,

@@ -1,19 +1,19 @@
-//! Normal equations along time: each unknown is eliminated as soon as nothing that comes later touches it.
+//! Normal equations along time: each unknown is eliminated as soon as no later row contains it.
 //!
-//! The unknowns are ordered as they pass: knot 0, the landmarks last seen there, knot 1, …, and the constants at the end. At
-//! any moment only a *front* of them is open: two neighbouring knots, the landmarks in view, the constants. Its normal
+//! The order of the unknowns is: knot 0, the landmarks last seen there, knot 1, …, and the constants at the end. At any
+//! moment only a *front* of them is open: two neighbouring knots, the landmarks in view, the constants. Its normal
 //! equations are one dense matrix, whatever the length of the flight:
 //!
 //! `H = [H_ee H_er; H_re H_rr]`, `L Lᵀ = H_ee`, `W = L⁻¹ H_er`, `y = L⁻¹ g_e`; then `H_rr −= Wᵀ W`, `g_r −= Wᵀ y`.
 //!
-//! Backward, `x_e = L⁻ᵀ (y − W x_r)`, and of the inverse of the whole matrix only the part over each front is ever made
+//! Backward, `x_e = L⁻ᵀ (y − W x_r)`, and of the inverse of the whole matrix only the part over each front is computed
 //! (selected inversion; Takahashi 1973): `G = −L⁻ᵀ W`, `P_er = G P_rr`, `P_ee = (L Lᵀ)⁻¹ + P_er Gᵀ`.
 
-/// Where the unknowns of a front stand: two knots, then landmarks of two components each, then the constants.
+/// Layout of a front: two knots, then landmarks of two components each, then the constants.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(crate) struct Shape {
     pub(crate) knot: usize,
-    /// Landmarks that may be open at once.
+    /// Most landmarks that are open at once.
     pub(crate) landmarks: usize,
     pub(crate) constants: usize,
 }
@@ -24,7 +24,7 @@ impl Shape {
         2 * self.knot + 2 * self.landmarks + self.constants
     }
 
-    /// The first unknown of knot `k`: neighbours take turns.
+    /// The first unknown of knot `k`: neighbouring knots alternate.
     pub(crate) const fn knot_at(self, k: usize) -> usize {
         (k % 2) * self.knot
     }
@@ -48,14 +48,14 @@ pub(crate) struct Front {
     g: Vec<f64>,
 }
 
-/// What is kept of unknowns that were eliminated.
+/// The stored result of eliminated unknowns.
 #[derive(Clone, Debug)]
 pub(crate) struct Eliminated {
     first: usize,
     len: usize,
     /// Lower Cholesky factor, `len` × `len`.
     l: Vec<f64>,
-    /// Unknowns that it was tied to.
+    /// Unknowns to which it was coupled.
     rest: Vec<u16>,
     /// `L⁻¹ H_er`, `len` × `rest`.
     w: Vec<f64>,
@@ -63,18 +63,18 @@ pub(crate) struct Eliminated {
 }
 
 impl Eliminated {
-    /// By how much the sum of squares falls by its solution.
+    /// By how much its solution reduces the sum of squares.
     pub(crate) fn gain(&self) -> f64 {
         self.y.iter().map(|y| y * y).sum()
     }
 
-    /// Where its unknowns stand in the front.
+    /// Places of its unknowns in the front.
     pub(crate) fn range(&self) -> std::ops::Range<usize> {
         self.first..self.first + self.len
     }
 }
 
-/// The normal equations are singular, or no numbers.
+/// The normal equations are singular, or not finite.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(crate) struct Singular;
 
@@ -84,8 +84,8 @@ impl Front {
         Self { n, h: vec![0.0; n * n], g: vec![0.0; n] }
     }
 
-    /// Adds rows `J x ≈ r` of unit variance with a weight; `rows` holds them one behind the other, a figure a column of
-    /// `columns`.
+    /// Adds rows `J x ≈ r` of unit variance with a weight; `rows` has them one after the other, with one value for each
+    /// of `columns`.
     pub(crate) fn add(&mut self, columns: &[usize], rows: &[f64], right: &[f64], weight: f64) {
         let width = columns.len();
         for (row, right) in rows.chunks_exact(width).zip(right) {
@@ -110,12 +110,12 @@ impl Front {
         self.g[column] += information * value;
     }
 
-    /// Adds information about an unknown that pulls it nowhere.
+    /// Adds information about an unknown with the value zero.
     pub(crate) fn hold(&mut self, column: usize, information: f64) {
         self.add_prior(column, information, 0.0);
     }
 
-    /// Eliminates `len` unknowns from `first` on, their diagonal raised by a share (Marquardt 1963).
+    /// Eliminates `len` unknowns from `first` on, their diagonal increased by a share (Marquardt 1963).
     pub(crate) fn eliminate(
         &mut self,
         first: usize,
@@ -170,12 +170,12 @@ impl Front {
     }
 }
 
-/// The solution, and the inverse of the normal equations, over the front as it opens again.
+/// The solution, and the inverse of the normal equations, over the front in the backward pass.
 #[derive(Clone, Debug)]
 pub(crate) struct Back {
     n: usize,
     pub(crate) x: Vec<f64>,
-    /// Covariance, row by row; what is not open means nothing.
+    /// Covariance, row by row; entries of closed unknowns are undefined.
     p: Vec<f64>,
 }
 
@@ -199,7 +199,7 @@ impl Back {
         terms.sum()
     }
 
-    /// Opens what was eliminated: its solution.
+    /// Opens eliminated unknowns: their solution.
     pub(crate) fn solve(&mut self, e: &Eliminated) {
         let width = e.rest.len();
         let mut x = e.y.clone();
@@ -211,7 +211,7 @@ impl Back {
         self.x[e.first..e.first + e.len].copy_from_slice(&x);
     }
 
-    /// Opens what was eliminated: its solution, and its covariance with all that is open.
+    /// Opens eliminated unknowns: their solution, and their covariance with all open ones.
     pub(crate) fn solve_with_covariance(&mut self, e: &Eliminated) {
         self.solve(e);
         let (n, width) = (self.n, e.rest.len());
@@ -297,7 +297,8 @@ mod tests {
 
     use super::*;
 
-    /// Twelve knots of three unknowns, landmarks that come and go, two constants: the same as the dense equations.
+    /// Twelve knots of three unknowns, landmarks that appear and disappear, two constants: the same result as the dense
+    /// equations.
     #[test]
     fn solution_and_covariances_are_those_of_the_dense_equations() {
         let shape = Shape { knot: 3, landmarks: 2, constants: 2 };

@@ -1,5 +1,5 @@
-//! Every row of the least-squares problem against central differences of what is left over, at states of a simulated flight
-//! that were moved at random.
+//! Every row of the least-squares problem against central differences of its residual, at randomly changed states of a
+//! simulated flight.
 
 use std::sync::Arc;
 
@@ -12,7 +12,7 @@ use windhover_estimate::batch::Predictor;
 use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 
 use crate::block::{Block, Noise, Source};
-use crate::first::filtered;
+use crate::initial::filtered;
 use crate::problem::{Origin, Pass, Problem};
 use crate::recording::Recording;
 use crate::refine::{first_values, planned, stated};
@@ -21,7 +21,7 @@ use crate::values::Values;
 
 /// Step of the differences, in each unknown's own unit.
 const STEP: f64 = 1e-5;
-/// Knots that are looked at.
+/// Knots that are checked.
 const KNOTS: [usize; 2] = [20, 31];
 
 fn flown() -> (World, Site, Recording) {
@@ -47,7 +47,7 @@ fn flown() -> (World, Site, Recording) {
     (Arc::into_inner(world).expect("no other owner"), site, recording)
 }
 
-/// What is left over of each block of a knot.
+/// The residuals of each block of a knot.
 fn left_over(pass: &mut Pass<'_>, k: usize, values: &Values, noise: &Noise) -> Vec<(Origin, Block)> {
     let mut all = Vec::new();
     pass.begin(values);
@@ -55,7 +55,7 @@ fn left_over(pass: &mut Pass<'_>, k: usize, values: &Values, noise: &Noise) -> V
     all
 }
 
-/// Moves one unknown of the front that is open at knot `k`.
+/// Changes one unknown of the front that is open at knot `k`.
 fn moved(problem: &Problem<'_>, values: &Values, k: usize, column: usize, by: f64) -> Values {
     let (mut values, shape) = (values.clone(), problem.shape);
     if column >= shape.constants_at() {
@@ -130,13 +130,14 @@ fn rows_are_the_derivatives_of_what_is_left_over() {
             }
         }
     }
-    assert!(checked > 2_000, "{checked} derivatives were looked at");
+    assert!(checked > 2_000, "{checked} derivatives were checked");
 }
 
-/// What may differ, of a whitened row: a share of the derivative, and what a sigma of the unknown makes of a row's own.
+/// Tolerance of a whitened row: a share of the derivative, and the effect of a sigma of the unknown.
 fn allowed(source: Source, column: usize, problem: &Problem<'_>, wanted: f64) -> f64 {
     let (share, of_sigma) = match source {
-        // What a row's time makes of where and how a point is seen, and the delay's part in a fix, are left out.
+        // The dependence of a row's exposure time on the place of a point, and the delay's effect within a fix, are
+        // left out.
         Source::Marker(_) | Source::Feature | Source::GpsPosition | Source::GpsVelocity => (0.03, 0.1),
         _ => (0.01, 0.01),
     };

@@ -2,11 +2,11 @@
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 mod block;
-mod first;
+mod initial;
 mod front;
 #[cfg(test)]
 mod jacobians;
-mod look;
+mod covariance_pass;
 mod measure;
 mod motion;
 mod noise;
@@ -15,12 +15,12 @@ mod problem;
 mod recording;
 mod refine;
 mod solve;
-mod told;
+mod result;
 mod unknowns;
 mod values;
 
 pub use block::Source;
 pub use recording::{OutsidePosition, Recording};
 pub use refine::{RefineError, refine};
-pub use told::{Constant, Outlier, Refined, Tally};
+pub use result::{Constant, Outlier, Refined, Tally};
 pub use unknowns::ConstantKind;

@@ -1,5 +1,6 @@
-//! Rows of a knot's measurements: the filter's own models at the knot's state, carried to the instant of the measurement, with
-//! the columns that only a whole flight can tell: delays, mount, places, focal length, read-out, iron.
+//! Rows of a knot's measurements: the filter's own models at the knot's state, propagated to the time of the
+//! measurement, with the columns that only a whole flight can determine: delays, mount, places, focal length, read-out,
+//! iron.
 
 use nalgebra::{Vector2, Vector3};
 
@@ -11,14 +12,14 @@ use crate::motion::Pushed;
 use crate::unknowns::{Place, constant, knot};
 use crate::values::Knot;
 
-/// A knot's state a moment `dt` after it, where a measurement is predicted.
+/// A knot's state a time `dt` after it, where a measurement is predicted.
 pub(crate) struct Instant<'a> {
-    /// The state then.
+    /// The state at that time.
     pub(crate) state: &'a Knot,
     /// Acceleration at the knot.
     pub(crate) pushed: &'a Pushed,
     pub(crate) dt: f64,
-    /// First column of the knot, and of the landmark.
+    /// InitialValues column of the knot, and of the landmark.
     pub(crate) at: usize,
     pub(crate) landmark_at: usize,
     pub(crate) shape: Shape,
@@ -87,7 +88,7 @@ impl ByState {
 }
 
 impl Instant<'_> {
-    /// Writes rows of a linearised measurement; gives, of each component, how it changes with time.
+    /// Writes rows of a linearised measurement; returns the rate of change of each component.
     pub(crate) fn write(&self, linear: &Linear<'_>, rows: &mut Rows) -> Vec<f64> {
         rows.begin(linear.len());
         (0..linear.len()).map(|row| self.write_row(linear, row, rows)).collect()
@@ -125,7 +126,7 @@ impl Instant<'_> {
         by.position.dot(&v) + by.velocity.dot(&self.pushed.0) + turned.dot(&rate) + by.rate.dot(&spin)
     }
 
-    /// Adds what a target's motion makes of a component until the instant; gives how it changes with time by it.
+    /// Adds the effect of a target's motion on a component until that time; returns its rate of change.
     pub(crate) fn target(&self, linear: &Linear<'_>, row: usize, target: usize, rows: &mut Rows) -> f64 {
         let mut by = [0.0; 5];
         for (column, value) in linear.columns().iter().zip(linear.row(row)) {
@@ -156,8 +157,8 @@ impl Instant<'_> {
         }
     }
 
-    /// Adds what the camera is beside its configuration to the two components of a pixel that begin at `row`; `flow` is how
-    /// they change with time, `seen` and `left` where they were seen and what is left over of that.
+    /// Adds the camera's deviation from its configuration to the two components of a pixel that begin at `row`; `flow`
+    /// is their rate of change, `seen` and `left` the pixel and its residual.
     pub(crate) fn camera(
         &self,
         linear: &Linear<'_>,
@@ -185,7 +186,7 @@ impl Instant<'_> {
         }
     }
 
-    /// Adds where the antenna is beside its configuration: `R l` to a position, `R (ω × l)` to a velocity.
+    /// Adds the antenna's deviation from its configuration: `R l` to a position, `R (ω × l)` to a velocity.
     pub(crate) fn antenna(&self, linear: &Linear<'_>, rows: &mut Rows) {
         let r = self.state.attitude.matrix();
         let rate = self.state.three(knot::RATE);
@@ -200,7 +201,7 @@ impl Instant<'_> {
     }
 }
 
-/// What of the camera its own constants depend on.
+/// Quantities on which the camera's constants depend.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Lens {
     pub(crate) principal_px: Vector2<f64>,
@@ -210,7 +211,7 @@ pub(crate) struct Lens {
 }
 
 impl Lens {
-    /// The share of the frame's height at which a row lies, −½ at the top.
+    /// The share of the frame's height at which a row is, −½ at the top.
     fn share(&self, v_px: f64) -> f64 {
         v_px / (self.height_px - 1.0) - 0.5
     }
@@ -222,7 +223,7 @@ pub(crate) fn iron(heading: f64) -> [f64; 4] {
     [s, c, s2, c2]
 }
 
-/// A block of pixels, two components each: of a marker on a target, or of a ground feature. `seen` gives where each is.
+/// A block of pixels, two components each: of a marker on a target, or of a ground feature. `seen` gives their places.
 pub(crate) fn pixels(
     instant: &Instant<'_>,
     linear: &Linear<'_>,
@@ -247,8 +248,8 @@ pub(crate) fn pixels(
     finish(rows, |a, b| linear.noise(a, b), &residual, factor, block)
 }
 
-/// Turns rows and residuals into a block of unit variance, `factor` on the variance of the noise; `false` where the
-/// noise is none.
+/// Converts rows and residuals to a block of unit variance, `factor` on the variance of the noise; `false` where the
+/// noise is not valid.
 pub(crate) fn finish(
     rows: &Rows,
     linear_noise: impl Fn(usize, usize) -> f64,

@@ -1,13 +1,13 @@
-//! How helicopter and targets move from one knot to the next.
+//! Motion of helicopter and targets from one knot to the next.
 //!
-//! Real motion is smooth. Each angle of the helicopter is a chain (angle, rate, acceleration) at whose end stands white noise;
-//! a target's way along its course, and its heading, are chains of four (way, speed, acceleration, jerk). The last links forget
-//! themselves: acceleration over some seconds (Singer 1970), a target's jerk over the time in which its drive and steering
-//! respond. With the chain's matrix A, over the interval h of two knots
+//! Real motion is smooth. Each angle of the helicopter is a chain (angle, rate, acceleration) that is driven by white
+//! noise; a target's distance along its course, and its heading, are chains of four (distance, speed, acceleration,
+//! jerk). The last elements have a finite correlation time: acceleration of some seconds (Singer 1970), a target's jerk
+//! of the response time of its drive and steering. With the chain's matrix A, over the interval h of two knots
 //!
 //! `x' = e^(A h) x + w`, `cov w = q ∫₀ʰ e^(A s) b bᵀ e^(Aᵀ s) ds`.
 //!
-//! The helicopter's place and velocity follow its acceleration a, the filter's own model of thrust, wind and drag:
+//! The helicopter's position and velocity follow its acceleration a, the filter's own model of thrust, wind and drag:
 //! `v' = v + h/2 (a + a')`, `p' = p + h/2 (v + v') − h²/12 (a' − a)`.
 
 use nalgebra::{Matrix3, Vector3};
@@ -19,18 +19,18 @@ use crate::front::Shape;
 use crate::unknowns::{Place, knot};
 use crate::values::Knot;
 
-/// Over how long the links of a chain remember, s: the helicopter's angle, rate, angular acceleration.
+/// Correlation times of the elements of a chain, s: the helicopter's angle, rate, angular acceleration.
 const SPIN: [f64; 3] = [f64::INFINITY, f64::INFINITY, 1.0];
-/// And a target's way or heading, its rate, acceleration and jerk.
+/// The same for a target's distance or heading, its rate, acceleration and jerk.
 const DRIVE: [f64; 4] = [f64::INFINITY, f64::INFINITY, 2.0, 0.4];
 /// Slow force of the wind, m/s² per √s.
 const WIND_WALK: f64 = 0.1;
-/// Least variance of a step, m² or rad²: what is stiffer drowns the knowledge of absolute place in rounding.
+/// Least variance of a step, m² or rad²: with a smaller one the absolute position is lost to rounding.
 const LEAST_VAR: f64 = 1e-13;
-/// Side slip of what does not move at all, m²/s.
+/// Side slip of a target that does not move, m²/s.
 const STILL_Q: f64 = 1e-12;
 
-/// Figures of processes that are not fitted.
+/// Constants of processes that are not fitted.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Processes {
     pub(crate) gust_tau_s: f64,
@@ -51,17 +51,17 @@ pub(crate) struct Link<'a> {
     pub(crate) to: &'a Knot,
     pub(crate) pushed: (&'a Pushed, &'a Pushed),
     pub(crate) h: f64,
-    /// First columns of the two.
+    /// InitialValues columns of the two.
     pub(crate) at: (usize, usize),
     pub(crate) shape: Shape,
     pub(crate) places: &'a [Place],
     pub(crate) noise: &'a Noise,
-    /// Window of time of the figures of motion.
+    /// Window of time for the factors of motion.
     pub(crate) window: usize,
     pub(crate) processes: &'a Processes,
 }
 
-/// A chain of links, each the derivative of the one before, over a step.
+/// A chain, in which each element is the derivative of the previous one, over a step.
 struct Chain<const N: usize> {
     /// `e^(A h)`.
     transition: [[f64; N]; N],
@@ -113,7 +113,7 @@ fn exponential<const N: usize>(s: f64, memories_s: &[f64; N]) -> [[f64; N]; N] {
 const TERMS: u32 = 14;
 
 impl Link<'_> {
-    /// Gives every block of the step.
+    /// Passes on every block of the step.
     pub(crate) fn blocks(&self, block: &mut Block, take: &mut dyn FnMut(Source, &Block)) {
         self.path(block, take);
         self.attitude(block, take);
@@ -138,7 +138,7 @@ impl Link<'_> {
         self.reverting(knot::GPS_BIAS, &grown, tau_s, Source::Known, block, take);
     }
 
-    /// Place and velocity of the helicopter.
+    /// Position and velocity of the helicopter.
     fn path(&self, block: &mut Block, take: &mut dyn FnMut(Source, &Block)) {
         let (h, (from, to)) = (self.h, (self.from, self.to));
         let (a, b) = (&self.pushed.0.0, &self.pushed.1.0);
@@ -184,7 +184,7 @@ impl Link<'_> {
         take(Source::Vibration, block);
     }
 
-    /// Where a column of the filter's stands, at either end; `None` where it is known.
+    /// Place of one of the filter's columns, at either end; `None` where it is known.
     fn column(&self, end: usize, column: usize) -> Option<usize> {
         let at = if end == 0 { self.at.0 } else { self.at.1 };
         match self.places[column] {
@@ -194,7 +194,7 @@ impl Link<'_> {
         }
     }
 
-    /// Attitude, rate and angular acceleration, an axis of the body after another.
+    /// Attitude, rate and angular acceleration, for one axis of the body after another.
     fn attitude(&self, block: &mut Block, take: &mut dyn FnMut(Source, &Block)) {
         let (from, to, chain) = (self.from, self.to, Chain::new(self.h, &SPIN));
         let turn = (from.attitude.inverse() * to.attitude).scaled_axis();
@@ -222,7 +222,7 @@ impl Link<'_> {
         }
     }
 
-    /// What reverts to zero over a time, or walks: each component apart.
+    /// A quantity that reverts to zero, or a random walk: each component separately.
     fn reverting(
         &self,
         first: usize,
@@ -298,7 +298,7 @@ impl Link<'_> {
         self.finish(block, &[self.processes.slip_q * self.h], Source::Known, take);
     }
 
-    /// A target that lies where it lies.
+    /// A target that does not move.
     fn still(
         &self,
         a: &[f64],
@@ -333,13 +333,14 @@ impl Link<'_> {
     }
 }
 
-/// A chain's state: its first link, and the others out of a target's part.
+/// A chain's state: its first element, and the others from a target's part.
 fn chained(first: f64, target: &[f64], links: [usize; 3]) -> [f64; 4] {
     [first, target[links[0]], target[links[1]], target[links[2]]]
 }
 
-/// Writes a chain's rows: derivatives by the links at either end, by the places of their columns (`None` where they are set
-/// elsewhere), and what is left over of the states. The first link counts from where it was at the first end.
+/// Writes a chain's rows: derivatives with respect to the elements at either end, by the places of their columns
+/// (`None` where they are set elsewhere), and the residuals of the states. The first element is relative to its value
+/// at the first end.
 fn set_chain<const N: usize>(
     block: &mut Block,
     from: &[Option<usize>; N],

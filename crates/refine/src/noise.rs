@@ -1,22 +1,22 @@
-//! Figures on noise and motion from the flight itself.
+//! Noise and motion factors from the flight itself.
 //!
-//! Of the blocks of a source the expected sum of squares is `Σ (m − tr(J P Jᵀ))`: what is left over of m rows once the unknowns
-//! have taken their part. The figure on its variance moves by the ratio of what is found to that (variance components: Förstner
-//! 1979; the same as the evidence of MacKay 1992).
+//! For the blocks of a source the expected sum of squares is `Σ (m − tr(J P Jᵀ))`: m rows less the part that the
+//! unknowns absorb. The factor on its variance changes by the ratio of the observed to the expected sum (variance
+//! components: Förstner 1979; equivalent to the evidence of MacKay 1992).
 
 use crate::block::{Block, Noise, Source};
 use crate::front::Back;
 
-/// Fewer rows that are free to tell something than this leave a figure as it is.
+/// With fewer degrees of freedom than this a factor is not changed.
 const FEWEST: f64 = 8.0;
-/// A figure of motion moves by no more than this at once.
+/// Largest change of a motion factor in one round.
 const AT_ONCE: f64 = 30.0;
-/// Limits of figures of motion.
+/// Limits of motion factors.
 const MOTION: (f64, f64) = (1e-6, 1e6);
 
-/// Windows of time to either side that a window's figure of motion is fitted over, the farther ones with less weight.
+/// Windows of time on either side over which a window's motion factor is fitted, the farther ones with less weight.
 const REACH: usize = 3;
-/// Rows that speak for the figure of the whole flight in each window.
+/// Weight of the whole flight's factor in each window, in rows.
 const OF_WHOLE: f64 = 4.0;
 
 /// Sums over the blocks of each source, in windows of time.
@@ -25,7 +25,7 @@ pub(crate) struct Components {
     sums: Vec<Vec<Sum>>,
 }
 
-/// Sum of squares over the figure, what was expected, and that sum of squares times the figure.
+/// Sum of squares divided by the factor, the expected sum, and the first times the factor.
 #[derive(Clone, Copy, Debug, Default)]
 struct Sum {
     found: f64,
@@ -46,7 +46,7 @@ impl Components {
         Self { sums: vec![vec![Sum::default(); windows]; Source::count(targets)] }
     }
 
-    /// Takes a block that is no outlier, whitened by this figure.
+    /// Adds a block that is not an outlier, whitened with this factor.
     pub(crate) fn take(&mut self, source: Source, window: usize, figure: f64, block: &Block, back: &Back) {
         let width = block.columns.len();
         let taken: f64 =
@@ -55,7 +55,7 @@ impl Components {
         self.sums[source.index()][window].add(&Sum { found, due, absolute: found * figure }, 1.0);
     }
 
-    /// Moves the figures; by how much the one that moved most did (its logarithm).
+    /// Updates the factors; returns the largest change (its logarithm).
     pub(crate) fn fit(&self, targets: usize, noise: &mut Noise) -> f64 {
         let mut most = 0.0f64;
         for source in fitted(targets) {
@@ -80,7 +80,7 @@ impl Components {
     }
 }
 
-/// The figure of motion in a window: what was found in it and about it, and a little of the whole flight.
+/// The motion factor in a window: from the blocks in and about it, with a small weight of the whole flight.
 fn in_window(windows: &[Sum], window: usize, whole: f64) -> f64 {
     let mut sum = Sum { due: OF_WHOLE, absolute: OF_WHOLE * whole, found: 0.0 };
     let near = window.saturating_sub(REACH)..(window + REACH + 1).min(windows.len());
@@ -91,7 +91,7 @@ fn in_window(windows: &[Sum], window: usize, whole: f64) -> f64 {
     sum.absolute / sum.due
 }
 
-/// The sources whose figures are fitted.
+/// The sources whose factors are fitted.
 fn fitted(targets: usize) -> impl Iterator<Item = Source> {
     use Source as S;
     let own = [
@@ -109,7 +109,7 @@ fn fitted(targets: usize) -> impl Iterator<Item = Source> {
     own.into_iter().chain((0..targets).flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t)]))
 }
 
-/// Limits of a figure: of measurements, factors on the variance configured.
+/// Limits of a factor; for measurements relative to the configured variance.
 fn limits(source: Source) -> (f64, f64) {
     match source {
         Source::GpsPosition | Source::GpsVelocity => (0.25, 25.0),
@@ -122,7 +122,7 @@ fn limits(source: Source) -> (f64, f64) {
     }
 }
 
-/// Figures to begin with: intensities of jerk and of what changes it, variances of gusts and of the thrust's excess.
+/// Initial factors: intensities of jerk and its changes, variances of gusts and of the excess thrust.
 pub(crate) fn first(targets: usize, gust_mps2: f64, thrust_mps2: f64) -> Noise {
     let mut noise = Noise::new(targets);
     noise.set(Source::TiltMotion, 3.0);

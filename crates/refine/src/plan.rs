@@ -1,27 +1,27 @@
-//! Where knots stand in time, which measurements belong to which, and how long a ground feature is open.
+//! Placement of knots in time, assignment of measurements to knots, and the lifetime of each ground feature.
 
 use std::collections::BTreeMap;
 
 use windhover_base::msg::MarkerId;
 use windhover_base::time::{MonoTime, Span};
 
-use crate::first::First;
+use crate::initial::InitialValues;
 use crate::recording::Recording;
 
-/// Farthest that two knots stand apart, s.
+/// Largest distance of two knots, s.
 const STEP_S: f64 = 0.1;
-/// Frames nearer to each other than this share a knot's time only if it is the same.
+/// Frames nearer to each other than this do not share a knot unless they have the same time.
 const NEAR: Span = Span::from_ns(1_000_000);
-/// Without a fix and without a compass reading for longer, what follows is a flight of its own, s.
+/// Without a fix and a compass reading for longer than this, a new trajectory begins, s.
 const BREAK_S: f64 = 10.0;
-/// Length of a window of time, s: a vehicle drives off, or turns in, within some of them.
+/// Length of a window of time, s: a vehicle starts or turns within some of them.
 const WINDOW_S: f64 = 1.0;
-/// Ground features that may be open at once.
+/// Most ground features that are open at once.
 pub(crate) const LANDMARKS: usize = 12;
-/// A feature seen in fewer frames says nothing.
+/// A feature detected in fewer frames is not used.
 const FEWEST_SIGHTINGS: usize = 4;
 
-/// A sighting of a ground feature: which landmark, in which place of the front, which of the frame's features.
+/// A detection of a ground feature: its landmark, its place in the front, its index among the frame's features.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FeatureSeen {
     pub(crate) landmark: usize,
@@ -29,15 +29,15 @@ pub(crate) struct FeatureSeen {
     pub(crate) index: usize,
 }
 
-/// A knot's time, and what was measured nearest to it.
+/// A knot's time, and the measurements nearest to it.
 #[derive(Clone, Debug)]
 pub(crate) struct Stop {
     pub(crate) t: MonoTime,
     /// Index of the recording.
     pub(crate) flight: usize,
-    /// Number of its window of time: figures of motion are the same in it.
+    /// Number of its window of time: motion factors are constant in it.
     pub(crate) window: usize,
-    /// Nothing ties it to the knot before.
+    /// Whether it is not connected to the previous knot.
     pub(crate) begins: bool,
     /// Index of the frame exposed at `t`.
     pub(crate) frame: Option<usize>,
@@ -45,9 +45,9 @@ pub(crate) struct Stop {
     pub(crate) readings: Vec<usize>,
     pub(crate) positions: Vec<usize>,
     pub(crate) features: Vec<FeatureSeen>,
-    /// Places of landmarks that are seen here for the last time, with the landmark.
+    /// Places of landmarks that are detected here for the last time, with the landmark.
     pub(crate) closes: Vec<(usize, usize)>,
-    /// Per target: whether it is estimated here, and whether that begins here.
+    /// For each target: whether it is estimated here, and whether that begins here.
     pub(crate) held: Vec<bool>,
     pub(crate) taken_up: Vec<bool>,
 }
@@ -65,12 +65,13 @@ pub(crate) struct Plan {
 }
 
 impl Plan {
-    /// Adds a flight; `find` tells which target a marker is on, `lost_after_s` over which gap a target is still followed.
+    /// Adds a flight; `find` returns the target of a marker, `lost_after_s` is the longest gap over which a target is
+    /// still estimated.
     pub(crate) fn add(
         &mut self,
         flight: usize,
         recording: &Recording,
-        first: &First,
+        first: &InitialValues,
         find: &dyn Fn(MarkerId) -> Option<usize>,
         targets: usize,
         lost_after_s: f64,
@@ -156,7 +157,7 @@ impl Plan {
         self.windows = window + 1;
     }
 
-    /// Takes out knots of long silences, and begins anew behind them.
+    /// Removes knots of long silences, and begins a new trajectory after them.
     fn break_at_silences(&mut self, begin: usize) {
         let tail = self.stops.split_off(begin);
         let measured = |stop: &Stop| !(stop.epochs.is_empty() && stop.readings.is_empty());
@@ -181,7 +182,7 @@ impl Plan {
         }
     }
 
-    /// Where each target is estimated: from a sighting to the next one that comes soon enough.
+    /// Where each target is estimated: from one detection to the next one that comes soon enough.
     fn follow_targets(
         &mut self,
         begin: usize,
@@ -214,7 +215,7 @@ impl Plan {
         }
     }
 
-    /// Gives each feature that is seen often enough a landmark, and a place of the front as long as it is open.
+    /// Assigns a landmark to each feature that is detected often enough, and a place of the front while it is open.
     fn follow_features(&mut self, begin: usize, recording: &Recording) {
         let stops = &mut self.stops[begin..];
         let mut tracks: BTreeMap<(usize, u64), Vec<(usize, usize)>> = BTreeMap::new();

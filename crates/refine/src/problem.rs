@@ -13,7 +13,7 @@ use crate::recording::Recording;
 use crate::unknowns::{Place, Prior, constant, knot, rig_offsets};
 use crate::values::{Knot, Values};
 
-/// What was measured, and what is known beforehand. Nothing here changes while it is solved.
+/// The measurements and priors. Nothing here changes during the solution.
 pub(crate) struct Problem<'a> {
     pub(crate) recordings: &'a [Recording],
     pub(crate) plan: Plan,
@@ -25,7 +25,7 @@ pub(crate) struct Problem<'a> {
     /// Whether each target moves.
     pub(crate) moves: Vec<bool>,
     pub(crate) processes: Processes,
-    /// Landmarks that turned out not to be ground.
+    /// Landmarks that were found not to be on the ground.
     pub(crate) dropped: Vec<bool>,
     /// Variance of the tilt readings' slow error that is not estimated, rad²: of attitude about north and east.
     pub(crate) considered_tilt_var: f64,
@@ -49,7 +49,7 @@ impl Problem<'_> {
     }
 }
 
-/// Which measurement a block is of.
+/// The measurement of a block.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(crate) struct Origin {
     pub(crate) source: Source,
@@ -63,7 +63,7 @@ impl Origin {
     }
 }
 
-/// Room for the arithmetic of one pass.
+/// Memory for the arithmetic of one pass.
 pub(crate) struct Pass<'a> {
     pub(crate) problem: &'a Problem<'a>,
     pub(crate) predictor: Predictor,
@@ -78,8 +78,8 @@ pub(crate) struct Pass<'a> {
 /// Weak knowledge of a trajectory's first knot, one sigma: position m, velocity m/s, attitude rad, rate rad/s, angular
 /// acceleration rad/s², wind m/s².
 const FIRST: [f64; 6] = [1e4, 100.0, 1.0, 2.0, 10.0, 1.5];
-/// Of a target where it is taken up: place m, heading rad, speed m/s, yaw rate rad/s, acceleration m/s², yaw acceleration
-/// rad/s², jerk m/s³, yaw jerk rad/s³.
+/// The same for a target at the start of its estimation: place m, heading rad, speed m/s, yaw rate rad/s, acceleration
+/// m/s², yaw acceleration rad/s², jerk m/s³, yaw jerk rad/s³.
 const TAKEN_UP: [f64; knot::TARGET] = [1e4, 1e4, 10.0, 30.0, 5.0, 3.0, 3.0, 5.0, 5.0];
 
 impl<'a> Pass<'a> {
@@ -114,7 +114,7 @@ impl<'a> Pass<'a> {
         }
     }
 
-    /// Adds what is known of the constants beforehand.
+    /// Adds the priors of the constants.
     pub(crate) fn constants(&self, values: &Values, front: &mut Front) -> f64 {
         let mut cost = 0.0;
         for (i, (prior, value)) in self.problem.priors.iter().zip(&values.constants).enumerate() {
@@ -130,7 +130,7 @@ impl<'a> Pass<'a> {
         cost
     }
 
-    /// Adds what is known of a knot without any measurement: where a trajectory begins, and what is not estimated there.
+    /// Adds the priors of a knot: where a trajectory begins, and for quantities that are not estimated there.
     pub(crate) fn beginnings(&self, k: usize, values: &Values, noise: &Noise, front: &mut Front) -> f64 {
         let (stop, state) = (&self.problem.plan.stops[k], &values.knots[k]);
         let (at, p) = (self.problem.shape.knot_at(k), &self.problem.processes);
@@ -171,7 +171,7 @@ impl<'a> Pass<'a> {
         cost
     }
 
-    /// Gives every block of knot `k`: its measurements, and the step to the next knot.
+    /// Passes on every block of knot `k`: its measurements, and the step to the next knot.
     pub(crate) fn blocks(
         &mut self,
         k: usize,

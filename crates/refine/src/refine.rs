@@ -9,16 +9,16 @@ use windhover_base::time::MonoTime;
 use windhover_estimate::Site;
 use windhover_estimate::batch::Predictor;
 
-use crate::first::{First, filtered};
+use crate::covariance_pass::{PassResult, look};
 use crate::front::Shape;
-use crate::look::{Looked, look};
+use crate::initial::{InitialValues, filtered};
 use crate::motion::Processes;
 use crate::noise::first as first_noise;
 use crate::plan::Plan;
 use crate::problem::{Pass, Problem};
 use crate::recording::Recording;
+use crate::result::Refined;
 use crate::solve::{Unsolved, solve};
-use crate::told::Refined;
 use crate::unknowns::{knot, outside_places, places, priors};
 use crate::values::{Knot, Values};
 
@@ -26,20 +26,20 @@ use crate::values::{Knot, Values};
 #[derive(Clone, Copy, PartialEq, Eq, Debug, thiserror::Error)]
 pub enum RefineError {
     /// There is no position.
-    #[error("the receiver never told a position: there is nothing to begin from")]
+    #[error("the receiver never had a position: there are no initial values")]
     NoFix,
     /// There is no heading.
-    #[error("there are no readings of a compass: heading and tilt have nothing to begin from")]
+    #[error("there are no compass readings: heading and tilt have no initial values")]
     NoCompass,
     /// The filter never started.
     #[error(
-        "positions and compass readings never came within three seconds of each other: the filter does not start"
+        "positions and compass readings are never within three seconds of each other: the filter does not start"
     )]
     NotStarted,
     /// The normal equations cannot be solved.
     #[error("the measurements do not determine the flight (the normal equations are singular)")]
     Singular,
-    /// Who waited does not want it any more.
+    /// The caller stopped it.
     #[error("stopped")]
     Stopped,
 }
@@ -53,29 +53,29 @@ impl From<Unsolved> for RefineError {
     }
 }
 
-/// Rounds of fitting noise and motion at most, and the change of a figure's logarithm that ends them.
+/// Most rounds of fitting noise and motion, and the change of a factor's logarithm that ends them.
 const ROUNDS: usize = 8;
 const SETTLED: f64 = 0.1;
-/// A step that promises less of the sum of squares than this changes nothing by a sigma; while figures still move, by so much a
-/// knot.
+/// A step with a smaller expected reduction of the sum of squares is negligible; while factors still change, the limit
+/// is this for each knot.
 const CONVERGED: f64 = 0.05;
 const NEARLY: f64 = 2e-3;
-/// A ground feature of whose sightings more than this share lies outside the gate is none.
+/// A ground feature with a larger share of detections outside the gate is dropped.
 const MOVING: f64 = 0.25;
-/// Chi-square values that good measurements stay below but for one in a thousand, by number of components.
+/// Chi-square values that good measurements exceed once in a thousand, by number of components.
 const GATES: [f64; 9] = [f64::INFINITY, 10.83, 13.82, 16.27, 18.47, 20.52, 22.46, 24.32, 26.12];
-/// A flight of whose knots fewer than this share have a target is blind.
+/// A flight in which a smaller share of knots has a target is blind.
 const BLIND: f64 = 0.2;
 /// The slow error of tilt readings where it is not estimated, rad.
 const HELD_TILT_ERROR: f64 = 1e-5;
-/// Outliers that are named.
+/// Most outliers that are listed.
 const NAMED: usize = 200;
 /// Correlation time of the thrust beyond the weight, s.
 const THRUST_TAU_S: f64 = 2.0;
 
 /// Estimates the trajectories of helicopter and targets over whole recordings at once, with the constants they share.
 ///
-/// `watch` is called often with the share that is done, about; `false` stops.
+/// `watch` is called often with the approximate completed share; `false` stops.
 ///
 /// # Errors
 /// The recordings do not determine a flight, or it was stopped.
@@ -86,7 +86,7 @@ pub fn refine(
     recordings: &[Recording],
     watch: &mut dyn FnMut(f64) -> bool,
 ) -> Result<Refined, RefineError> {
-    let firsts: Vec<First> =
+    let firsts: Vec<InitialValues> =
         recordings.iter().map(|recording| filtered(rig, estimator, site, recording)).collect();
     let felt = firsts.iter().find_map(|first| first.felt);
     let mut predictor = Predictor::new(rig, estimator, site);
@@ -138,7 +138,7 @@ fn why_not_started(recordings: &[Recording]) -> RefineError {
 pub(crate) fn planned(
     predictor: &Predictor,
     recordings: &[Recording],
-    firsts: &[First],
+    firsts: &[InitialValues],
     targets: usize,
     lost_after_s: f64,
 ) -> Plan {
@@ -183,7 +183,7 @@ pub(crate) fn stated<'a>(
         processes: Processes {
             gust_tau_s: estimator.force_tau_s,
             thrust_tau_s: THRUST_TAU_S,
-            // Own motion must not explain the reading's slow error either: it is considered, not estimated.
+            // Motion must not explain the reading's slow error either: it is considered, not estimated.
             tilt_error: if blind { (HELD_TILT_ERROR.powi(2), reading.1) } else { reading },
             gps_bias: predictor.gps_bias(best_fix.unwrap_or(FixKind::ThreeD)),
             slip_q: predictor.slip_q(),
@@ -196,7 +196,7 @@ pub(crate) fn stated<'a>(
 
 pub(crate) fn first_values(
     problem: &Problem<'_>,
-    firsts: &[First],
+    firsts: &[InitialValues],
     predictor: &Predictor,
     rig: &Rig,
     site: &Site,
@@ -210,7 +210,7 @@ pub(crate) fn first_values(
             let mean = target_at(&firsts[stop.flight].targets[target], stop.t, predictor.reference_m(target));
             match mean {
                 Some(mean) => knot.x[at..at + 5].copy_from_slice(&mean),
-                // Never settled: below the helicopter.
+                // Never tracked: below the helicopter.
                 None => knot.x.copy_within(0..2, at),
             }
         }
@@ -242,7 +242,7 @@ fn target_at(track: &[TargetEstimate], t: MonoTime, reference_m: f64) -> Option<
     Some(std::array::from_fn(|i| from[i] + (to[i] - from[i]) * share))
 }
 
-/// Landmarks where the sighting in the middle of their life shows them.
+/// Initial landmarks, from the detection in the middle of their life.
 fn place_landmarks(problem: &Problem<'_>, rig: &Rig, site: &Site, values: &mut Values) {
     let mut sightings: Vec<Vec<(usize, usize)>> = vec![Vec::new(); problem.plan.landmarks];
     for (k, stop) in problem.plan.stops.iter().enumerate() {
@@ -263,8 +263,8 @@ fn place_landmarks(problem: &Problem<'_>, rig: &Rig, site: &Site, values: &mut V
     }
 }
 
-/// Drops landmarks that are not where they were too often; how many.
-fn drop_movers(problem: &mut Problem<'_>, looked: &Looked) -> usize {
+/// Drops landmarks that were too often outside the gate; returns how many.
+fn drop_movers(problem: &mut Problem<'_>, looked: &PassResult) -> usize {
     let mut more = 0;
     for (dropped, (seen, outside)) in problem.dropped.iter_mut().zip(&looked.landmarks) {
         let moves = *outside as f64 > MOVING * *seen as f64;
@@ -275,7 +275,13 @@ fn drop_movers(problem: &mut Problem<'_>, looked: &Looked) -> usize {
 }
 
 impl Refined {
-    fn finish(&mut self, problem: &Problem<'_>, firsts: &[First], felt: Option<FeltTilt>, inflation: f64) {
+    fn finish(
+        &mut self,
+        problem: &Problem<'_>,
+        firsts: &[InitialValues],
+        felt: Option<FeltTilt>,
+        inflation: f64,
+    ) {
         for (constant, prior) in self.constants.iter_mut().zip(&problem.priors) {
             if prior.is_estimated() {
                 constant.sigma = (constant.sigma * inflation.sqrt()).min(constant.prior_sigma);

@@ -1,19 +1,19 @@
-//! The values that fit everything best: Gauss–Newton steps, raised (Marquardt 1963) where the model bends too much.
+//! The values with the best fit: Gauss–Newton steps, damped (Marquardt 1963) where the model is too nonlinear.
 
 use crate::block::{Block, Loss, Noise};
 use crate::front::{Back, Eliminated, Front, Singular};
 use crate::problem::{Origin, Pass};
 use crate::values::Values;
 
-/// Steps tried at most, and how the diagonal is raised where one made it worse.
+/// Most steps, and the increase of the diagonal after a step that made the fit worse.
 const STEPS: usize = 25;
 const RAISED: (f64, f64, f64) = (1e-4, 10.0, 1e6);
-/// Information about a landmark before it is seen, 1/m².
+/// Prior information about a landmark, 1/m².
 const LANDMARK: f64 = 1e-8;
 
-/// What was eliminated.
+/// The kind of eliminated unknowns.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(crate) enum What {
+pub(crate) enum EliminatedKind {
     Knot(usize),
     Landmark(usize),
     Constants,
@@ -21,7 +21,7 @@ pub(crate) enum What {
 
 /// The factorised normal equations at some values.
 pub(crate) struct Factors {
-    pub(crate) steps: Vec<(What, Eliminated)>,
+    pub(crate) steps: Vec<(EliminatedKind, Eliminated)>,
     pub(crate) cost: f64,
 }
 
@@ -31,7 +31,7 @@ impl Factors {
     }
 }
 
-/// Whoever waits: gets the share that is done; says whether to go on.
+/// The caller's callback: gets the completed share; returns whether to continue.
 pub(crate) type Watch<'a> = &'a mut dyn FnMut(usize) -> bool;
 
 /// Why there is no solution.
@@ -47,7 +47,7 @@ impl From<Singular> for Unsolved {
     }
 }
 
-/// Makes the normal equations at the values, and eliminates all unknowns.
+/// Forms the normal equations at the values, and eliminates all unknowns.
 pub(crate) fn factorise(
     pass: &mut Pass<'_>,
     values: &Values,
@@ -72,21 +72,21 @@ pub(crate) fn factorise(
             cost += loss.cost;
             front.add(&block.columns, &block.rows, &block.right, loss.weight);
         });
-        steps.push((What::Knot(k), front.eliminate(shape.knot_at(k), shape.knot, raised)?));
+        steps.push((EliminatedKind::Knot(k), front.eliminate(shape.knot_at(k), shape.knot, raised)?));
         for (place, landmark) in &stop.closes {
             let first = shape.landmark_at(*place);
             (0..2).for_each(|i| front.hold(first + i, LANDMARK));
-            steps.push((What::Landmark(*landmark), front.eliminate(first, 2, raised)?));
+            steps.push((EliminatedKind::Landmark(*landmark), front.eliminate(first, 2, raised)?));
         }
         if !watch(k) {
             return Err(Unsolved::Stopped);
         }
     }
-    steps.push((What::Constants, front.eliminate(shape.constants_at(), shape.constants, raised)?));
+    steps.push((EliminatedKind::Constants, front.eliminate(shape.constants_at(), shape.constants, raised)?));
     Ok(Factors { steps, cost })
 }
 
-/// Moves the values until they fit best: until a step promises less of the sum of squares than `enough`.
+/// Changes the values until they fit best: until a step's expected reduction of the sum of squares is below `enough`.
 pub(crate) fn solve(
     pass: &mut Pass<'_>,
     values: &mut Values,
@@ -118,7 +118,7 @@ pub(crate) fn solve(
     unreachable!("the loop ends by its steps")
 }
 
-/// Moves the values by the solution.
+/// Changes the values by the solution.
 fn apply(pass: &Pass<'_>, factors: &Factors, values: &mut Values) {
     let mut back = Back::new(pass.problem.shape);
     for (what, e) in factors.steps.iter().rev() {
@@ -128,11 +128,11 @@ fn apply(pass: &Pass<'_>, factors: &Factors, values: &mut Values) {
 }
 
 impl Values {
-    fn step(&mut self, what: What, dx: &[f64]) {
+    fn step(&mut self, what: EliminatedKind, dx: &[f64]) {
         match what {
-            What::Knot(k) => self.knots[k].step(dx),
-            What::Landmark(l) => self.landmarks[l].iter_mut().zip(dx).for_each(|(x, d)| *x += d),
-            What::Constants => self.constants.iter_mut().zip(dx).for_each(|(x, d)| *x += d),
+            EliminatedKind::Knot(k) => self.knots[k].step(dx),
+            EliminatedKind::Landmark(l) => self.landmarks[l].iter_mut().zip(dx).for_each(|(x, d)| *x += d),
+            EliminatedKind::Constants => self.constants.iter_mut().zip(dx).for_each(|(x, d)| *x += d),
         }
     }
 }

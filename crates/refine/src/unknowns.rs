@@ -1,4 +1,4 @@
-//! What is estimated: the unknowns of a knot, and the constants of the flight.
+//! The unknowns: those of a knot, and the constants of the flight.
 
 use nalgebra::Vector3;
 
@@ -53,7 +53,7 @@ pub enum ConstantKind {
     Trim(usize),
     /// Error of the compass's heading.
     HeadingBias,
-    /// Share of what it feels that the tilt sensor reads.
+    /// Share of the tilt (or force) that the tilt sensor reads.
     TiltShare,
     /// Error of the tilt reading: pitch, roll.
     TiltBias(usize),
@@ -67,13 +67,13 @@ pub enum ConstantKind {
     CompassDelay,
     /// How much older frames are than configured.
     CameraDelay,
-    /// From the first row's exposure to the last one's, beside its configuration.
+    /// Time from the first row's exposure to the last one's, minus the configured value.
     Readout,
-    /// Rotation of the camera on the body about forward, right, down, beside its configuration.
+    /// Rotation of the camera on the body about forward, right, down, relative to its configuration.
     Mount(usize),
-    /// Place of the camera beside its configuration: forward, right, down.
+    /// Position of the camera relative to its configuration: forward, right, down.
     CameraAt(usize),
-    /// Place of the antenna likewise.
+    /// Position of the antenna, likewise.
     AntennaAt(usize),
     /// Logarithm of the focal length over that configured.
     Focal,
@@ -107,19 +107,19 @@ pub(crate) mod constant {
     pub(crate) const TAGS: usize = 25;
 }
 
-/// What is known of a constant before the flight.
+/// The prior of a constant.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(crate) struct Prior {
     pub(crate) kind: ConstantKind,
     pub(crate) mean: f64,
     /// One sigma; zero where it is known.
     pub(crate) sigma: f64,
-    /// Whether it stays where it is: nothing in the flight may move it.
+    /// Whether it is fixed: the flight must not change it.
     pub(crate) held: bool,
 }
 
 impl Prior {
-    /// Whether the flight is asked for it.
+    /// Whether the flight estimates it.
     pub(crate) fn is_estimated(&self) -> bool {
         self.sigma > 0.0 && !self.held
     }
@@ -129,13 +129,13 @@ impl Prior {
 const TRIM: f64 = 0.06;
 /// Drag of small rotorcraft, 1/s: mean and sigma.
 const DRAG: (f64, f64) = (0.2, 0.1);
-/// Tilt zero of a compass that was mounted with care, rad.
+/// Tilt zero of a carefully mounted compass, rad.
 const TILT_BIAS: f64 = 0.007;
-/// Share of the tilt that is read, where that is what is felt: its error over it.
+/// Prior sigma of the share of the tilt that is read.
 const SHARE: f64 = 0.15;
 /// Iron of a compass that was calibrated once: one cycle and two, rad.
 const IRON: [f64; 2] = [0.026, 0.009];
-/// Delays beside what was configured, s.
+/// Delays in addition to the configured ones, s.
 const COMPASS_DELAY: f64 = 0.01;
 const CAMERA_DELAY: f64 = 0.005;
 const READOUT: f64 = 0.01;
@@ -143,15 +143,15 @@ const READOUT: f64 = 0.01;
 const MOUNT: f64 = 0.0175;
 const CAMERA_AT: f64 = 0.02;
 const ANTENNA_AT: f64 = 0.1;
-/// Focal length of a calibrated lens, focused anew: share.
+/// Focal length of a calibrated lens after refocusing: share.
 const FOCAL: f64 = 0.005;
 /// A tag as printed and glued on: share of its size, m, m, rad.
 const TAG: [f64; TAG_COLUMNS] = [0.005, 0.01, 0.01, 0.0175];
 
 /// Constants with their priors, in their places.
 ///
-/// Of a flight that is blind (hardly a marker in view) only the compass's heading is asked for: a rotorcraft answers gusts with
-/// tilt, so whatever else is left free takes up what the model of its own motion lacks.
+/// In a blind flight (hardly a marker in view) only the compass's heading is estimated: a rotorcraft responds to gusts
+/// with tilt, so any other free constant absorbs the errors of the motion model.
 pub(crate) fn priors(rig: &Rig, predictor: &Predictor, share: Option<f64>, blind: bool) -> Vec<Prior> {
     use ConstantKind as Kind;
     let prior = |kind, sigma| Prior { kind, mean: 0.0, sigma, held: false };
@@ -176,7 +176,7 @@ pub(crate) fn priors(rig: &Rig, predictor: &Predictor, share: Option<f64>, blind
     all.push(prior(Kind::Focal, FOCAL));
     let mut last = None;
     for (target, marker) in predictor.tags() {
-        // Place and turn of a target's first tag are what its frame is.
+        // Place and yaw of a target's first tag define the target's frame.
         let first = last.replace(target) != Some(target);
         all.extend((0..TAG_COLUMNS).map(|part| {
             let sigma = if first && part > 0 { 0.0 } else { TAG[part] };
@@ -187,7 +187,7 @@ pub(crate) fn priors(rig: &Rig, predictor: &Predictor, share: Option<f64>, blind
     all
 }
 
-/// Camera and antenna as constants have them.
+/// Deviations of camera and antenna, from the constants.
 pub(crate) fn rig_offsets(constants: &[f64]) -> RigOffsets {
     let three = |at: usize| Vector3::from_column_slice(&constants[at..at + 3]);
     RigOffsets {
@@ -199,7 +199,7 @@ pub(crate) fn rig_offsets(constants: &[f64]) -> RigOffsets {
     }
 }
 
-/// Where a column of the filter's error state stands among the unknowns.
+/// The unknown that corresponds to a column of the filter's error state.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(crate) enum Place {
     Knot(usize),
@@ -207,11 +207,11 @@ pub(crate) enum Place {
     Landmark(usize),
     /// A constant that is not estimated.
     Known(usize),
-    /// It is none of the unknowns.
+    /// No unknown.
     Nowhere,
 }
 
-/// The same for a position from outside, which has no part in the receiver's errors.
+/// The same for an external position, which is independent of the receiver's errors.
 pub(crate) fn outside_places(places: &[Place]) -> Vec<Place> {
     let mut places = places.to_vec();
     columns::GPS_BIAS.chain(columns::GPS_DELAY).for_each(|column| places[column] = Place::Nowhere);

@@ -1,4 +1,4 @@
-//! The present values of all unknowns, and a knot's state a moment before or after it.
+//! The present values of all unknowns, and a knot's state shortly before or after it.
 
 use nalgebra::{Rotation3, Vector3};
 
@@ -32,7 +32,7 @@ impl Knot {
         self.x[knot::ATTITUDE..knot::ATTITUDE + 3].fill(0.0);
     }
 
-    /// A moment later, while it accelerates so.
+    /// The state a time `dt` later, with this acceleration.
     pub(crate) fn after(&self, dt: f64, acceleration: &Vector3<f64>) -> Self {
         let mut next = self.clone();
         let (v, rate, spin) = (self.three(knot::VELOCITY), self.three(knot::RATE), self.three(knot::SPIN));
@@ -51,7 +51,7 @@ impl Knot {
         next
     }
 
-    /// How a target's north, east, heading, speed and yaw rate change.
+    /// Rates of change of a target's north, east, heading, speed and yaw rate.
     pub(crate) fn target_flow(&self, i: usize) -> [f64; 5] {
         let t = self.target(i);
         let (s, c) = t[knot::HEADING].sin_cos();
@@ -70,7 +70,7 @@ pub(crate) struct Values {
 }
 
 impl Values {
-    /// Puts a knot's state into the models, with a landmark.
+    /// Sets the models to a knot's state, with a landmark.
     pub(crate) fn put(
         &self,
         state: &Knot,

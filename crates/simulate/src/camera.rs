@@ -1,4 +1,4 @@
-//! The camera: when it exposes, where it is, and where markers and ground points truly project.
+//! The camera: its exposures, its pose, and the true projections of markers and ground points.
 
 use nalgebra::{Rotation3, Vector2, Vector3};
 
@@ -10,10 +10,11 @@ use windhover_base::geo::ned_from_body_321;
 use windhover_base::msg::{FrameEncoding, FramePayload, GrayImage};
 use windhover_base::time::{MonoTime, Span};
 
-/// Iterations that find the row in which a point is seen: each is closer by its motion over a row's share of a pixel.
+/// Iterations to find the row in which a point is seen; each reduces the error by the point's motion during the time of
+/// a row.
 const ROW_ITERATIONS: usize = 3;
 
-/// Where the camera is and where it looks.
+/// Pose of the camera.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct CameraPose {
     /// Optical centre, north, east, down, metres.
@@ -29,7 +30,7 @@ pub struct MarkerTruth {
     pub target: usize,
     /// Index of the marker in the target.
     pub marker: usize,
-    /// Whether all of it lies within the frame and nothing covers it.
+    /// Whether all of it is within the frame and nothing covers it.
     pub visible: bool,
     /// Its centre, pixels (also outside the frame).
     pub center_px: Vector2<f64>,
@@ -51,7 +52,7 @@ pub struct FrameTruth {
 }
 
 impl FrameTruth {
-    /// The frame as a camera without compression delivers it, of its picture.
+    /// The frame as a camera without compression delivers it.
     pub fn in_grey(&self, image: GrayImage) -> FramePayload {
         let width = image.width as u32;
         FramePayload {
@@ -79,7 +80,7 @@ impl Exposures {
         Self { stream: Stream::of(seed, Purpose::Exposure), attempt: 0, frame: 0 }
     }
 
-    /// When the next frame is exposed, but for its jitter, seconds into the flight.
+    /// Nominal exposure of the next frame, without its jitter, seconds into the flight.
     pub(super) fn due_s(&self, world: &World) -> f64 {
         (self.attempt as f64 + 0.5) / world.scenario().rig.camera.fps
     }
@@ -97,7 +98,7 @@ impl Exposures {
             let jitter = Span::from_ms(self.stream.normal() * sim.period_jitter_ms);
             let stamp_noise = Span::from_ms(self.stream.normal() * sim.stamp_noise_ms);
             let transfer_ms = sim.transfer_ms + self.stream.normal() * sim.transfer_jitter_ms;
-            // A stamp that is late because the exposure is over sooner than it says is not heard before it.
+            // A stamp later than the true exposure must not make the frame arrive before its stamp.
             let late = Span::from_ms(sim.stamp_late_ms.max(0.0));
             let lost = self.stream.chance(sim.dropped) || within(&sim.outages_s, nominal_s);
             if lost {
@@ -117,8 +118,7 @@ impl Exposures {
 }
 
 impl World {
-    /// Where the camera truly is and looks at host time `t`: the configured mount with the
-    /// scenario's mounting error.
+    /// True pose of the camera at host time `t`: the configured mount with the scenario's mounting error.
     pub fn camera_pose(&self, t: MonoTime) -> CameraPose {
         let own = self.ownship(t);
         let mount = &self.rig().camera.mount;
@@ -131,7 +131,7 @@ impl World {
         }
     }
 
-    /// When the row of a pixel is exposed in a frame whose middle row is exposed at host time `t`.
+    /// Exposure of a pixel's row in a frame whose middle row is exposed at host time `t`.
     pub(super) fn row_time(&self, t: MonoTime, v: f64) -> MonoTime {
         let rows = f64::from(self.rig().camera.height.max(2) - 1);
         t + Span::from_ms((v / rows - 0.5) * self.scenario().camera.readout_ms)
@@ -176,7 +176,7 @@ impl World {
         Some(MarkerTruth { target, marker, visible, center_px, corners_px })
     }
 
-    /// How much of a marker something lies on at host time `t`: 0 for none of it, 1 for all.
+    /// Covered share of a marker at host time `t`: 0 for none of it, 1 for all.
     pub(super) fn covered_share(&self, target: usize, marker: usize, t: MonoTime) -> f64 {
         let t_s = self.seconds(t);
         let hidden = self.scenario().camera.hidden.iter();

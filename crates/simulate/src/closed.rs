@@ -1,5 +1,5 @@
-//! A flight whose helicopter is flown while it lasts: sensors measure what has happened by then, and what they deliver
-//! comes in the order in which it is heard.
+//! A flight with a helicopter that is controlled during the flight: sensors measure the motion so far, and their events
+//! come in order of reception.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -17,10 +17,10 @@ use super::world::World;
 use windhover_base::msg::{Event, EventBody, GrayImage, Source};
 use windhover_base::time::{MonoTime, Span};
 
-/// A frame's exposure is jittered: it is taken this long after its nominal time has been flown, s.
+/// A frame's exposure is jittered: it is taken this long after its nominal time, s.
 const EXPOSED_BY_S: f64 = 0.01;
 
-/// How much later than the instruments' own delays what they deliver is heard, ms: uniform from 0, drawn for each.
+/// Additional lateness of the events, ms: uniform from 0, drawn for each.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct Lateness {
     /// Of frames.
@@ -40,19 +40,18 @@ pub struct ClosedFlight {
     exposures: Exposures,
     lateness: Lateness,
     late: Stream,
-    /// What is on its way, by when it is heard.
+    /// Events in transit, by reception.
     coming: VecDeque<(MonoTime, EventBody)>,
     compass_heard: MonoTime,
     flown: MonoTime,
-    /// Frames that were exposed and are drawn elsewhere.
+    /// Frames that were exposed and are rendered elsewhere.
     exposed: Vec<FrameTruth>,
     seq: u64,
 }
 
 impl ClosedFlight {
-    /// Sensors of a flown world ([`World::flown`]), drawing with this many threads; where that is none, frames
-    /// are only [`Self::exposed`]. Dropouts and outages of the scenario
-    /// are left out.
+    /// Sensors of a flown world ([`World::flown`]) that renders with this many threads; with none, frames are only
+    /// [`Self::exposed`]. Dropouts and outages of the scenario are ignored.
     pub fn new(world: Arc<World>, lateness: Lateness, threads: usize) -> Self {
         let rig = &world.scenario().rig;
         let stream = |purpose| Stream::of(world.seed(), purpose);
@@ -74,22 +73,22 @@ impl ClosedFlight {
         }
     }
 
-    /// The world flown through.
+    /// The simulated world.
     pub fn world(&self) -> &Arc<World> {
         &self.world
     }
 
-    /// How far it has been flown.
+    /// The time up to which it has been flown.
     pub fn now(&self) -> MonoTime {
         self.flown
     }
 
-    /// Frames exposed since this was last asked, where they are not drawn here.
+    /// Frames exposed since the last call, where they are not rendered here.
     pub fn exposed(&mut self) -> Vec<FrameTruth> {
         std::mem::take(&mut self.exposed)
     }
 
-    /// The helicopter was moved on by a step: appends what is heard by its end.
+    /// The helicopter was advanced by a step: appends the events received by its end.
     pub fn step(&mut self, out: &mut Vec<Event>) -> Result<(), FlightError> {
         self.flown += World::STEP;
         self.measure();
@@ -103,7 +102,7 @@ impl ClosedFlight {
         Ok(())
     }
 
-    /// What was true by now goes on its way.
+    /// Adds new measurements to those in transit.
     fn measure(&mut self) {
         let world = Arc::clone(&self.world);
         let (scenario, now_s) = (world.scenario(), world.seconds(self.flown));
@@ -129,7 +128,7 @@ impl ClosedFlight {
             self.put(t, EventBody::Bytes { source: Source::Gps, data });
         }
         while let Some((t, data)) = self.compass_line.pop() {
-            // A line keeps its order, however late it is looked at.
+            // A line keeps its order, however late it is read.
             let late = Span::from_ms(self.late.uniform(0.0, self.lateness.compass_ms.max(1e-9)));
             self.compass_heard = self.compass_heard.max(t + late);
             self.put(self.compass_heard, EventBody::Bytes { source: Source::Compass, data });

@@ -1,10 +1,10 @@
-//! What moves in view and is no target: people on foot, other vehicles, vehicles that carry the same markers.
+//! Other moving things in view: people on foot, other vehicles, vehicles with the same markers.
 
 use nalgebra::Vector3;
 
 use super::instant::VehicleTruth;
 use super::misfit::Company;
-use super::random::{Purpose, Stream, Wander};
+use super::random::{Purpose, SmoothNoise, Stream};
 use super::vehicle::VehicleMotion;
 use windhover_base::geo::wrap_angle;
 
@@ -17,46 +17,47 @@ const BEHIND_S: f64 = 1.5;
 /// Where they drive beside its path, metres ahead and right, one after the other.
 const BESIDE_M: [(f64, f64); 4] = [(-1.0, 2.8), (-1.0, -2.8), (3.5, 3.0), (3.5, -3.0)];
 
-/// What one of them looks like.
+/// The appearance of one of them.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(super) enum Looks {
+pub(super) enum Appearance {
     /// A person from above.
     Person,
     /// A vehicle with a painted roof.
     Painted,
-    /// The first target, markers and all.
+    /// The first target, including its markers.
     Double,
 }
 
 /// One of them.
 #[derive(Clone, Debug)]
 pub(super) struct Companion {
-    pub(super) looks: Looks,
+    pub(super) looks: Appearance,
     way: Way,
 }
 
 #[derive(Clone, Debug)]
 enum Way {
     /// Beside the first vehicle: offset from it, north and east, and how it strays.
-    Walks { offset_m: (f64, f64), stray: Box<[Wander; 2]> },
+    Walks { offset_m: (f64, f64), stray: Box<[SmoothNoise; 2]> },
     /// Along the first vehicle's path, this far ahead and right of it.
     Drives { beside_m: (f64, f64) },
 }
 
 impl Companion {
-    /// Everyone in view of a flight.
+    /// All companions of a flight.
     pub(super) fn all(company: &Company, seed: u64) -> Vec<Self> {
-        let people = (0..company.people).map(|k| Self { looks: Looks::Person, way: Way::on_foot(k, seed) });
-        let drives = |looks: Looks, k: usize| {
+        let people =
+            (0..company.people).map(|k| Self { looks: Appearance::Person, way: Way::on_foot(k, seed) });
+        let drives = |looks: Appearance, k: usize| {
             let beside_m = BESIDE_M[k % BESIDE_M.len()];
             Self { looks, way: Way::Drives { beside_m } }
         };
-        let convoy = (0..company.convoy).map(|k| drives(Looks::Painted, k));
-        let doubles = (0..company.doubles).map(|k| drives(Looks::Double, company.convoy + k));
+        let convoy = (0..company.convoy).map(|k| drives(Appearance::Painted, k));
+        let doubles = (0..company.doubles).map(|k| drives(Appearance::Double, company.convoy + k));
         people.chain(convoy).chain(doubles).collect()
     }
 
-    /// Where it is, where the first vehicle moves so.
+    /// Its state, given the first vehicle's motion.
     pub(super) fn at(&self, first: &VehicleMotion, t_s: f64) -> VehicleTruth {
         match &self.way {
             Way::Walks { offset_m, stray } => {
@@ -96,7 +97,7 @@ impl Way {
         let (s, c) = bearing.sin_cos();
         let far_m = stream.uniform(NEAR_M.0, NEAR_M.1);
         let (rms, short_s, long_s) = STRAY;
-        let stray = Box::new([(); 2].map(|()| Wander::new(rms, short_s, long_s, &mut stream)));
+        let stray = Box::new([(); 2].map(|()| SmoothNoise::new(rms, short_s, long_s, &mut stream)));
         Self::Walks { offset_m: (far_m * c, far_m * s), stray }
     }
 }

@@ -1,4 +1,4 @@
-//! The digital compass: heading with bias and noise, tilt as its convention and its gain have it.
+//! The digital compass: heading with bias and noise, tilt by its convention and its gain.
 
 use nalgebra::Vector3;
 
@@ -19,7 +19,7 @@ pub(super) struct CompassSample {
     pub(super) t_true: MonoTime,
     /// When its first byte arrives.
     pub(super) t_first_byte: MonoTime,
-    /// What the device says, radians.
+    /// The device's reading, radians.
     pub(super) sample: AttitudeSample,
 }
 
@@ -57,7 +57,7 @@ impl Compass {
         self.bias
     }
 
-    /// When the next reading is true, seconds into the flight.
+    /// Time of the next reading, seconds into the flight.
     pub(super) fn due_s(&self, world: &World) -> f64 {
         self.phase_s + self.count as f64 / world.scenario().compass.rate_hz
     }
@@ -82,7 +82,7 @@ impl Compass {
             let t_true = world.time(t_s);
             let mut sample = reading(world, t_true, self.bias, &noise, slow);
             if flagged {
-                // What a PNI device means by "inclinometer out of range": neither can be used.
+                // The meaning of a PNI device's "inclinometer out of range": neither value can be used.
                 sample.heading = None;
                 sample.tilt = None;
             }
@@ -116,7 +116,7 @@ impl SlowTilt {
     }
 }
 
-/// Pitch and roll that the sensor takes for the tilt: of the vertical or of specific force, through its lag.
+/// Pitch and roll that the sensor measures: of the vertical or of specific force, through its lag.
 fn felt_tilt(world: &World, t: MonoTime, own: &OwnshipTruth) -> (f64, f64) {
     let sim = &world.scenario().compass;
     if !sim.feels_force && sim.tilt_lag_s == 0.0 {
@@ -137,7 +137,7 @@ fn reading(world: &World, t: MonoTime, bias: f64, noise: &Vector3<f64>, slow: [f
     let (scenario, own) = (world.scenario(), world.ownship(t));
     let (sim, config) = (&scenario.compass, &scenario.rig.compass);
     let (pitch, roll) = felt_tilt(world, t, &own);
-    // What an accelerometer shows of the tilt, and what the device makes of that.
+    // The tilt as an accelerometer measures it, and the device's reading of it.
     let (seen_pitch, seen_roll) = (sim.tilt_gain * pitch, sim.tilt_gain * roll);
     let seen_level = ned_from_body_321(0.0, seen_pitch, seen_roll);
     let exact = config.angles.tilt_of(&(seen_level.inverse() * Vector3::z()));

@@ -26,13 +26,13 @@ pub(super) fn write_pni(heading: f64, pitch: f64, roll: f64, valid: bool, line: 
     line.extend_from_slice(&packet);
 }
 
-/// NAV-RELPOSNED with a true heading; where it is not valid, without its flags.
+/// NAV-RELPOSNED with a true heading; an invalid one has no flags.
 pub(super) fn write_ubx(heading: f64, valid: bool, line: &mut Vec<u8>) {
     let mut packet = vec![0xB5, 0x62, 0x01, 0x3C, 64, 0];
     packet.resize(6 + 64, 0);
     packet[6] = 1;
     packet[6 + 24..6 + 28].copy_from_slice(&((heading * 1e5).round() as i32).to_le_bytes());
-    // Fix, differential, relative position, whole cycles known, heading.
+    // Fix, differential, relative position, fixed ambiguities, heading.
     let flags: u32 = if valid { 0x117 } else { 0x003 };
     packet[6 + 60..].copy_from_slice(&flags.to_le_bytes());
     let sum = packet[2..].iter().fold([0u8; 2], |[a, b], byte| {

@@ -1,4 +1,4 @@
-//! Compass sentences and packets in every format that is understood.
+//! Compass sentences and packets in every supported format.
 
 use super::compass_binary::{write_pni, write_rvc, write_ubx, write_witmotion};
 use super::garmin::write_sentence;
@@ -6,18 +6,17 @@ use windhover_base::msg::AttitudeSample;
 use windhover_base::settings::CompassFormat;
 use windhover_base::time::UtcTime;
 
-/// What a format needs beside the reading.
+/// Data for a format in addition to the reading.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct WireContext {
     pub(super) format: CompassFormat,
-    /// Degrees, east positive: for formats that tell a true heading or the variation.
+    /// Degrees, east positive: for formats with a true heading or the variation.
     pub(super) declination_deg: f64,
     /// For formats with a time of day.
     pub(super) utc: UtcTime,
 }
 
-/// Appends one reading as the device sends it. A reading without a heading is one that the device
-/// flags as not valid.
+/// Appends one reading as the device sends it. A reading without a heading is marked as invalid.
 pub(super) fn write_reading(sample: &AttitudeSample, context: &WireContext, line: &mut Vec<u8>) {
     let valid = sample.heading.is_some() && sample.tilt.is_some();
     let heading = sample.heading.unwrap_or(0.0).to_degrees().rem_euclid(360.0);
@@ -46,7 +45,7 @@ pub(super) fn write_reading(sample: &AttitudeSample, context: &WireContext, line
             let quality = u8::from(valid);
             format!("PASHR,{time},{t:.2},T,{roll:+.2},{pitch:+.2},+0.00,0.300,0.300,0.500,{quality}")
         }
-        // A device without a heading tells no angles.
+        // A device without a heading sends no angles.
         CompassFormat::Vectornav if !valid => "VNYPR,,,".into(),
         CompassFormat::Vectornav => {
             let yaw = if heading > 180.0 { heading - 360.0 } else { heading };

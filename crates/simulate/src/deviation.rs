@@ -1,61 +1,61 @@
-//! The vocabulary of deviations: in what a flight may differ from what its configuration says, by name and figure.
+//! Deviations: how a flight may differ from its configuration, by name and amount.
 
 use super::deviations::{COMPOSED, DEVIATIONS};
 use super::scenario::Scenario;
 
-/// One thing that may be otherwise than the configuration says.
+/// One deviation from the configuration.
 #[derive(Clone, Copy, Debug)]
 pub struct Deviation {
     /// Its name.
     pub name: &'static str,
     /// Unit of its figure.
     pub unit: &'static str,
-    /// What it does, in a line.
+    /// Its effect, in one line.
     pub about: &'static str,
-    /// Least and greatest figure.
+    /// Smallest and largest amount.
     pub limits: (f64, f64),
-    /// The figure where none is given.
+    /// The default amount.
     pub usual: f64,
-    /// The scenario that shows it where it is asked for as one.
+    /// The scenario for a scenario of its name.
     pub shown_in: &'static str,
-    /// What a pipeline should make of it.
+    /// The expected reaction of a pipeline.
     pub effect: Effect,
     pub(super) apply: fn(&mut Scenario, f64),
 }
 
-/// What a pipeline should make of a deviation.
+/// The expected reaction of a pipeline to a deviation.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Effect {
-    /// The configuration is wrong in a way that harms: it should be told.
+    /// The configuration is wrong in a harmful way: a misfit should be reported.
     Misfit,
-    /// The configuration is wrong in a way that the filter's own states take up: nothing to tell.
+    /// The configuration is wrong in a way that the filter's own states absorb: nothing to report.
     Absorbed,
-    /// Nothing is wrong: other weather, another instrument of those that are configured for.
+    /// Nothing is wrong: other weather, or another instrument that is configured correctly.
     Condition,
 }
 
-/// Why a deviation cannot be had.
+/// Why a deviation is refused.
 #[derive(Clone, PartialEq, Debug, thiserror::Error)]
 pub enum DeviationError {
-    /// Nothing has this name.
-    #[error("no deviation is called {0:?}")]
+    /// The name does not exist.
+    #[error("unknown deviation {0:?}")]
     Unknown(String),
-    /// No scenario has this name.
-    #[error("no scenario is called {0:?}")]
+    /// The scenario does not exist.
+    #[error("unknown scenario {0:?}")]
     UnknownScenario(String),
-    /// What stands behind the equals sign is no number.
-    #[error("{0:?} is no figure")]
+    /// The text after the equals sign is not a number.
+    #[error("{0:?} is not a number")]
     NoFigure(String),
-    /// The figure lies outside the limits.
+    /// The amount is outside the limits.
     #[error("{name} = {value}: give {} to {} {unit}", limits.0, limits.1)]
     OutOfLimits {
-        /// Of what.
+        /// The deviation's name.
         name: &'static str,
-        /// The figure.
+        /// The amount.
         value: f64,
         /// Least and greatest.
         limits: (f64, f64),
-        /// In which unit.
+        /// Their unit.
         unit: &'static str,
     },
 }
@@ -93,10 +93,10 @@ impl Deviation {
 }
 
 impl Scenario {
-    /// Lets the flight differ from the configuration: by the figure that is usual where none is given.
+    /// Adds a deviation to the flight, of the default amount where none is given.
     ///
     /// # Errors
-    /// Where nothing is called `name`, or the figure lies outside its limits.
+    /// Where `name` does not exist, or the amount is outside its limits.
     pub fn deviate(&mut self, name: &str, value: Option<f64>) -> Result<(), DeviationError> {
         let deviation = Deviation::named(name).ok_or_else(|| DeviationError::Unknown(name.to_owned()))?;
         let value = value.unwrap_or(deviation.usual);
@@ -111,7 +111,7 @@ impl Scenario {
     /// The same from `NAME` or `NAME=FIGURE`.
     ///
     /// # Errors
-    /// As [`Self::deviate`], and where the figure is no number.
+    /// As [`Self::deviate`], and where the amount is not a number.
     pub fn deviate_as(&mut self, text: &str) -> Result<(), DeviationError> {
         let Some((name, figure)) = text.split_once('=') else { return self.deviate(text, None) };
         let value = figure.parse().map_err(|_| DeviationError::NoFigure(figure.to_owned()))?;
@@ -121,7 +121,7 @@ impl Scenario {
     /// A scenario with deviations, from `SCENARIO[+NAME[=FIGURE]]…`: `follow+people=3+wind=8`.
     ///
     /// # Errors
-    /// Where a name is not known or a figure not within its limits.
+    /// Where a name does not exist or an amount is outside its limits.
     pub fn described(text: &str) -> Result<Self, DeviationError> {
         let mut parts = text.split('+');
         let name = parts.next().unwrap_or_default();
@@ -131,13 +131,13 @@ impl Scenario {
         Ok(scenario)
     }
 
-    /// The scenarios that are made of another one and deviations: name and purpose. Each deviation is one too, under its
-    /// own name.
+    /// The scenarios composed of another one and deviations: name and purpose. Each deviation is also a scenario under
+    /// its own name.
     pub fn composed() -> impl Iterator<Item = (&'static str, &'static str)> {
         COMPOSED.iter().map(|c| (c.name, c.about))
     }
 
-    /// The scenario that this name means as a deviation or a composition.
+    /// The scenario of this name, which is a deviation or a composition.
     pub(super) fn deviating(name: &str) -> Option<Self> {
         let (about, base, deviations) = match COMPOSED.iter().find(|c| c.name == name) {
             Some(c) => (c.about, c.base, c.deviations.to_vec()),
@@ -148,7 +148,7 @@ impl Scenario {
         };
         let mut scenario = Self { name: name.to_owned(), about: about.to_owned(), ..Self::named(base)? };
         for (deviation, value) in deviations {
-            scenario.deviate(deviation, Some(value)).expect("the table's figures lie within its limits");
+            scenario.deviate(deviation, Some(value)).expect("the table's amounts are within its limits");
         }
         Some(scenario)
     }

@@ -5,7 +5,7 @@ use super::misfit::GroundMisfit;
 use super::scenario::{HelicopterPath, Route, Scenario, SpeedPlan};
 use super::sensor_errors::HiddenMarker;
 
-/// A row of the table: name = usual figure unit (limits), the scenario that shows it, what it does, how.
+/// A row of the table: name = default amount unit (limits), the scenario that shows it, its effect, its code.
 macro_rules! deviations {
     ($($effect:ident $name:literal = $usual:literal $unit:literal ($low:literal, $high:literal) in $shown_in:literal,
        $about:literal, $apply:expr;)*) => {
@@ -26,11 +26,11 @@ macro_rules! deviations {
 const PERCENT: f64 = 0.01;
 /// Metres in a centimetre.
 const CM: f64 = 0.01;
-/// Vehicles that are out of view now and then are so every so often, from this time on, seconds.
+/// When vehicles are out of view: period and first time, seconds.
 const GONE_S: (f64, f64) = (6.0, 8.0);
 /// And not after that, seconds.
 const GONE_UNTIL_S: f64 = 600.0;
-/// What a step of speed of a hurried driver is, m/s.
+/// A step of speed of a fast driver, m/s.
 const HURRY_MPS: f64 = 4.0;
 
 /// Every deviation.

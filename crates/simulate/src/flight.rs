@@ -14,7 +14,7 @@ use super::world::World;
 use windhover_base::msg::{Event, EventBody, FrameEncoding, FramePayload, GrayImage, Source};
 use windhover_base::time::{MonoTime, Span};
 
-/// Makes a JPEG picture of an image. The error says why it cannot.
+/// Encodes an image as JPEG. The error is the reason as text.
 pub type JpegEncoder = Arc<dyn Fn(&GrayImage) -> Result<Vec<u8>, String> + Send + Sync>;
 
 /// How frames are stored.
@@ -28,7 +28,7 @@ pub enum FrameStorage {
     None,
 }
 
-/// Why a flight could not go on.
+/// Why a flight could not continue.
 #[derive(Debug, thiserror::Error)]
 pub enum FlightError {
     /// A frame could not be compressed.
@@ -36,12 +36,12 @@ pub enum FlightError {
     Jpeg {
         /// Its number.
         frame: u32,
-        /// What the encoder said.
+        /// The encoder's error.
         reason: String,
     },
 }
 
-/// The events of a flight, in the order in which they are heard.
+/// The events of a flight, in order of reception.
 pub struct Flight {
     world: Arc<World>,
     renderer: Option<Renderer>,
@@ -58,7 +58,7 @@ pub struct Flight {
 }
 
 impl Flight {
-    /// A flight through `world`, drawing with this many threads.
+    /// A flight through `world` that renders with this many threads.
     pub fn new(world: Arc<World>, storage: FrameStorage, threads: usize) -> Self {
         let rig = &world.scenario().rig;
         let lines = Stream::of(world.seed(), Purpose::GnssLine);
@@ -84,7 +84,7 @@ impl Flight {
         }
     }
 
-    /// The world flown through.
+    /// The simulated world.
     pub fn world(&self) -> &Arc<World> {
         &self.world
     }
@@ -104,7 +104,7 @@ impl Flight {
         self.compass.latency_error(self.world.scenario())
     }
 
-    /// Sends what the receivers have to say until both lines hold something, or are done.
+    /// Sends the receivers' data until both lines hold something, or have ended.
     fn fill_lines(&mut self) {
         let scenario = self.world.scenario();
         let mut line = Vec::with_capacity(256);

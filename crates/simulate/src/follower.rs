@@ -1,17 +1,17 @@
-//! An autopilot that follows: it is told where a vehicle is and how it moves, and says what acceleration it wants.
+//! An autopilot that follows: it receives a vehicle's position and motion, and returns the acceleration that it wants.
 //!
-//! Standard control: the stamps told are put on its own clock by the least delay seen, what is told is carried on to now,
-//! a position error asks for a velocity, a velocity error for an acceleration; speed, acceleration and jerk are limited, and
-//! without anything told for three seconds it stops.
+//! Standard control: received stamps are mapped to its own clock by the least observed delay, the state is extrapolated
+//! to the present, a position error demands a velocity, a velocity error an acceleration; speed, acceleration and jerk
+//! are limited, and after three seconds without a message it stops.
 
 use nalgebra::Vector3;
 
 use windhover_base::time::{MonoTime, Span};
 
-/// What is told of a vehicle, in the follower's own position frame.
+/// A received state of a vehicle, in the follower's own position frame.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct FollowTarget {
-    /// Stamp of the one who tells, on a clock of his.
+    /// The sender's stamp, on its own clock.
     pub stamp: Span,
     /// North, east, down, metres.
     pub position_m: Vector3<f64>,
@@ -24,9 +24,9 @@ pub struct FollowTarget {
 /// Gains and limits.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct FollowerTuning {
-    /// Velocity asked for by a position error, 1/s.
+    /// Demanded velocity for a position error, 1/s.
     pub position_gain: f64,
-    /// Acceleration asked for by a velocity error, 1/s.
+    /// Demanded acceleration for a velocity error, 1/s.
     pub velocity_gain: f64,
     /// Highest speed, m/s.
     pub speed_mps: f64,
@@ -34,7 +34,7 @@ pub struct FollowerTuning {
     pub acceleration_mps2: f64,
     /// Largest change of it, m/s³.
     pub jerk_mps3: f64,
-    /// Without anything told for so long it stops.
+    /// It stops after this time without a message.
     pub timeout: Span,
     /// Height above the target, metres.
     pub height_m: f64,
@@ -59,25 +59,25 @@ impl Default for FollowerTuning {
 pub struct Follower {
     tuning: FollowerTuning,
     told: Option<(FollowTarget, MonoTime)>,
-    /// Least of arrival less stamp.
+    /// Least arrival minus stamp.
     least: Option<Span>,
-    /// Where it stays while it is told nothing.
+    /// Where it stays while there is no message.
     hold: Option<Vector3<f64>>,
     wanted: Vector3<f64>,
     last: Option<MonoTime>,
 }
 
 impl Follower {
-    /// One that was told nothing yet.
+    /// A follower without a message yet.
     pub fn new(tuning: FollowerTuning) -> Self {
         Self { tuning, told: None, least: None, hold: None, wanted: Vector3::zeros(), last: None }
     }
 
-    /// Takes what was told, heard at `t`.
+    /// Takes a message that was received at `t`.
     pub fn hear(&mut self, target: &FollowTarget, t: MonoTime) {
         let apart = (t - MonoTime::default()) - target.stamp;
         let least = match self.least {
-            // Clocks drift: the least delay is forgotten at a millisecond a second. A step begins anew.
+            // Clocks drift: the least delay increases by a millisecond a second. A step starts again.
             Some(least) if (apart - least).abs() < Span::from_ns(1_000_000_000) => {
                 apart.min(least + Span::from_ns(100_000))
             }
@@ -87,7 +87,7 @@ impl Follower {
         self.told = Some((*target, MonoTime::default() + target.stamp + least));
     }
 
-    /// The acceleration that it wants at `now`, being at `position_m` with `velocity_mps`; north, east, down.
+    /// The demanded acceleration at `now`, at `position_m` with `velocity_mps`; north, east, down.
     pub fn command(
         &mut self,
         now: MonoTime,
@@ -132,7 +132,7 @@ impl Follower {
 mod tests {
     use super::*;
 
-    /// Flies a point with this follower for `s` seconds; where it is at the end against where it should be.
+    /// Flies a point with this follower for `s` seconds; returns its final and its desired position.
     fn flown(s: f64, silent_from: f64) -> (Vector3<f64>, Vector3<f64>) {
         let mut follower = Follower::new(FollowerTuning::default());
         let (mut p, mut v) = (Vector3::new(0.0, 0.0, -12.0), Vector3::zeros());
@@ -142,7 +142,7 @@ mod tests {
             let t = f64::from(k) * 0.005;
             let now = MonoTime::default() + Span::from_s(100.0 + t);
             if k % 20 == 0 && t < silent_from {
-                // Told 50 ms late, by another clock.
+                // Received 50 ms late, from another clock.
                 let told = FollowTarget {
                     stamp: Span::from_s(7.0 + t),
                     position_m: at(t),

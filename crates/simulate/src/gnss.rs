@@ -9,14 +9,14 @@ use super::world::World;
 use windhover_base::msg::{FixKind, GnssEpoch};
 use windhover_base::time::{MonoTime, NS_PER_S, Span, UtcTime};
 
-/// One epoch as the receiver works it out.
+/// One epoch as the receiver computes it.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(super) struct GnssSample {
     /// When it was true, host time.
     pub(super) t_true: MonoTime,
     /// When its first byte arrives.
     pub(super) t_first_byte: MonoTime,
-    /// What the receiver says.
+    /// The receiver's report.
     pub(super) epoch: GnssEpoch,
 }
 
@@ -24,7 +24,7 @@ pub(super) struct GnssSample {
 #[derive(Clone, Debug)]
 pub(super) struct GnssReceiver {
     stream: Stream,
-    /// Apart, so that the same epochs come as values and as bytes.
+    /// A separate stream, so that the same epochs come as values and as bytes.
     stamps: Stream,
     latency: Span,
     bias_m: Vector3<f64>,
@@ -32,7 +32,7 @@ pub(super) struct GnssReceiver {
     step_ns: i64,
 }
 
-/// Horizontal and vertical error the receiver puts on its fixes, metres (as a WAAS receiver does).
+/// Horizontal and vertical errors that the receiver reports, metres (as a WAAS receiver does).
 const STATED_ERROR_M: (f64, f64) = (2.6, 4.1);
 
 impl GnssReceiver {
@@ -56,7 +56,7 @@ impl GnssReceiver {
         self.latency - Span::from_ms(scenario.rig.gps.latency_ms)
     }
 
-    /// When the next epoch is true, seconds into the flight.
+    /// Time of the next epoch, seconds into the flight.
     pub(super) fn due_s(&self, world: &World) -> f64 {
         world.seconds_at_utc(UtcTime::from_unix_ns(self.next_utc_ns))
     }
@@ -96,7 +96,7 @@ impl GnssReceiver {
         }
     }
 
-    /// What the fit of arrival times leaves in a stamp.
+    /// The error that the fit of arrival times leaves in a stamp.
     pub(super) fn stamp_noise(&mut self, scenario: &Scenario) -> Span {
         Span::from_ms(self.stamps.normal() * scenario.gps.stamp_noise_ms)
     }
@@ -117,7 +117,7 @@ fn no_fix(utc: UtcTime) -> GnssEpoch {
     }
 }
 
-/// `x` as a field with this many digits behind the point carries it.
+/// `x` in the precision of a field with this many decimals.
 fn rounded(x: f64, digits: u32) -> f64 {
     let scale = 10_f64.powi(digits as i32);
     (x * scale).round() / scale
@@ -143,7 +143,7 @@ fn fix(
     let velocity =
         filtered(scenario.gps.velocity_filter_s, t_true, |t| antenna_at(world, t).1) + velocity_error;
     let position = world.frame().geodetic(&(antenna + error_m));
-    // Five digits of a minute, as the 5 Hz units send it: 1.9 cm.
+    // Five digits of a minute, as the 5 Hz units send: 1.9 cm.
     let minutes = |degrees: f64| rounded(degrees * 60.0, 5) / 60.0;
     let vel = velocity.map(|x| rounded(x, scenario.gps.velocity_decimals));
     let speed_mps = vel.x.hypot(vel.y);

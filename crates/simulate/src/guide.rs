@@ -1,4 +1,4 @@
-//! A guide that nobody sees, which leads the helicopter.
+//! An invisible guide that leads the helicopter.
 
 use windhover_base::settings::TargetModel;
 

@@ -1,9 +1,8 @@
-//! How the helicopter moves: thrust along −z of the body, gravity and drag, so that attitude and
-//! acceleration agree; a controller that holds or follows; wind.
+//! Motion of the helicopter: thrust along −z of the body, gravity and drag, so that attitude and acceleration agree; a
+//! controller that holds or follows; wind.
 //!
-//! `a = g e_D + f + c_d (w − v)`, `f = −|f| z_body`: the thrust acceleration `f` follows the
-//! controller's command as a damped oscillator (the attitude loop), so attitude is continuous with
-//! its rate.
+//! `a = g e_D + f + c_d (w − v)`, `f = −|f| z_body`: the thrust acceleration `f` follows the controller's command as a
+//! damped oscillator (the attitude loop), so attitude is consistent with its rate.
 
 use std::sync::{Arc, PoisonError, RwLock};
 
@@ -11,7 +10,7 @@ use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use super::instant::{OwnshipTruth, STEP_S};
 use super::ode::{Table, rk4};
-use super::random::{Purpose, Stream, Wander};
+use super::random::{Purpose, SmoothNoise, Stream};
 use super::scenario::{Helicopter, HelicopterPath, Wind};
 use super::vehicle::VehicleMotion;
 use windhover_base::geo::{euler_321, ned_from_body_321, wrap_angle};
@@ -30,12 +29,12 @@ pub(super) struct HelicopterMotion {
     trace: Trace,
     air: Air,
     drag_per_s: f64,
-    heading: (f64, Wander),
-    /// Takes the body into the frame whose z axis is the rotor's, where they differ.
+    heading: (f64, SmoothNoise),
+    /// Rotates the body into the frame whose z axis is the rotor's, where they differ.
     rotor_from_body: Option<Rotation3<f64>>,
 }
 
-/// The motion as it is known: all of it, or as far as it was flown.
+/// The motion: all of it, or as far as it was flown.
 #[derive(Clone, Debug)]
 enum Trace {
     Whole(Table<STATES>),
@@ -45,14 +44,14 @@ enum Trace {
 #[derive(Clone, Debug)]
 struct Air {
     mean: Vector3<f64>,
-    gusts: [Wander; 3],
+    gusts: [SmoothNoise; 3],
 }
 
 struct Pilot<'a> {
     plan: &'a Helicopter,
     vehicles: &'a [VehicleMotion],
     air: Air,
-    agitation: [Wander; 3],
+    agitation: [SmoothNoise; 3],
     offset: Vector3<f64>,
     phase: f64,
 }
@@ -64,7 +63,7 @@ impl Air {
         let toward = wind.toward_deg.unwrap_or(random).to_radians();
         let mean = Vector3::new(toward.cos(), toward.sin(), 0.0) * wind.mean_mps;
         let gust = wind.gust_mps;
-        let gusts = [gust, gust, 0.4 * gust].map(|rms| Wander::new(rms, 1.5, 15.0, &mut stream));
+        let gusts = [gust, gust, 0.4 * gust].map(|rms| SmoothNoise::new(rms, 1.5, 15.0, &mut stream));
         Self { mean, gusts }
     }
 
@@ -84,13 +83,13 @@ impl HelicopterMotion {
         let mut stream = Stream::of(seed, Purpose::Flight);
         let random_heading = stream.uniform(-180.0, 180.0);
         let heading = plan.heading_deg.unwrap_or(random_heading).to_radians();
-        let wander = Wander::new(plan.heading_wander_deg.to_radians(), 5.0, 30.0, &mut stream);
+        let wander = SmoothNoise::new(plan.heading_wander_deg.to_radians(), 5.0, 30.0, &mut stream);
         let pilot = Pilot {
             plan,
             vehicles,
             air: Air::new(wind, seed),
             agitation: [1.0, 1.0, 0.6]
-                .map(|share| Wander::new(share * plan.agitation_mps2, 1.0, 6.0, &mut stream)),
+                .map(|share| SmoothNoise::new(share * plan.agitation_mps2, 1.0, 6.0, &mut stream)),
             offset: Vector3::new(stream.uniform(-0.7, 0.7), stream.uniform(-0.7, 0.7), 0.0),
             phase: stream.uniform(0.0, std::f64::consts::TAU),
         };
@@ -105,12 +104,12 @@ impl HelicopterMotion {
         }
     }
 
-    /// A helicopter that somebody else flies: it hangs still in the wind at `start` until [`Self::fly`] moves it on.
+    /// A helicopter under external control: it hovers in the wind at `start` until [`Self::fly`] advances it.
     pub(super) fn flown(plan: &Helicopter, wind: &Wind, start: Vector3<f64>, seed: u64) -> Self {
         let mut stream = Stream::of(seed, Purpose::Flight);
         let random_heading = stream.uniform(-180.0, 180.0);
         let heading = plan.heading_deg.unwrap_or(random_heading).to_radians();
-        let wander = Wander::new(plan.heading_wander_deg.to_radians(), 5.0, 30.0, &mut stream);
+        let wander = SmoothNoise::new(plan.heading_wander_deg.to_radians(), 5.0, 30.0, &mut stream);
         let air = Air::new(wind, seed);
         let thrust = -Vector3::z() * GRAVITY - air.mean * plan.drag_per_s;
         let y = [start.x, start.y, start.z, 0.0, 0.0, 0.0, thrust.x, thrust.y, thrust.z, 0.0, 0.0, 0.0];
@@ -124,8 +123,8 @@ impl HelicopterMotion {
         }
     }
 
-    /// Moves a flown helicopter on by a step of the grid while this acceleration, north, east, down, m/s², is asked of
-    /// it; what the mean wind does to it is known to who flies it. The attitude follows as `attitude_rate` has it.
+    /// Advances a flown helicopter by a step of the grid with this demanded acceleration, north, east, down, m/s²; the
+    /// controller knows the effect of the mean wind. The attitude follows with `attitude_rate`.
     pub(super) fn fly(&self, wanted: &Vector3<f64>, attitude_rate: f64) {
         let Trace::Flown(table) = &self.trace else { return };
         let mut table = table.write().unwrap_or_else(PoisonError::into_inner);
@@ -143,8 +142,8 @@ impl HelicopterMotion {
         table.push(next, derivative(t + STEP_S, &next));
     }
 
-    /// Puts a flown helicopter a step on to this place and velocity, with what carries its weight upright: somebody
-    /// else's simulator has it there.
+    /// Sets a flown helicopter, a step later, to this position and velocity, with the upward force that carries its
+    /// weight: these come from another simulator.
     pub(super) fn put(&self, place: &Vector3<f64>, velocity: &Vector3<f64>, acceleration: &Vector3<f64>) {
         let Trace::Flown(table) = &self.trace else { return };
         let mut table = table.write().unwrap_or_else(PoisonError::into_inner);
@@ -188,13 +187,13 @@ impl HelicopterMotion {
     }
 }
 
-/// A turn by `angle_deg` about an axis across the rotor's, drawn at random.
+/// A rotation by `angle_deg` about a random axis perpendicular to the rotor's.
 fn trim(angle_deg: f64, seed: u64) -> Rotation3<f64> {
     let (s, c) = Stream::of(seed, Purpose::Trim).uniform(0.0, std::f64::consts::TAU).sin_cos();
     Rotation3::new(Vector3::new(c, s, 0.0) * angle_deg.to_radians())
 }
 
-/// The attitude whose −z axis lies along the thrust and whose x axis has this azimuth.
+/// The attitude whose −z axis is along the thrust and whose x axis has this azimuth.
 fn attitude(thrust: &Vector3<f64>, heading: f64) -> Rotation3<f64> {
     let z_body = -thrust.normalize();
     let (s, c) = heading.sin_cos();
@@ -216,7 +215,7 @@ fn swing(axes: [(f64, f64, f64); 2], down: f64, t: f64) -> (Vector3<f64>, Vector
 }
 
 impl Pilot<'_> {
-    /// Where to be, and how fast.
+    /// Desired position and velocity.
     fn reference(&self, t: f64) -> (Vector3<f64>, Vector3<f64>, Vector3<f64>) {
         let down = -self.plan.height_m;
         let (p, v, a) = match self.plan.path {
@@ -255,7 +254,7 @@ impl Pilot<'_> {
         [p.x, p.y, p.z, v.x, v.y, v.z, thrust.x, thrust.y, thrust.z, 0.0, 0.0, 0.0]
     }
 
-    /// Thrust acceleration asked for: feedback on position and velocity, the mean wind's drag known.
+    /// Demanded thrust acceleration: feedback on position and velocity, with the mean wind's drag known.
     fn command(&self, t: f64, p: &Vector3<f64>, v: &Vector3<f64>) -> Vector3<f64> {
         let (p_ref, v_ref, a_ref) = self.reference(t);
         let restless = Vector3::from_fn(|i, _| self.agitation[i].at(t));

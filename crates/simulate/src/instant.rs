@@ -46,7 +46,7 @@ pub struct VehicleTruth {
 }
 
 impl VehicleTruth {
-    /// Whether its body is not as it stands at rest.
+    /// Whether its body deviates from its pose at rest.
     pub fn sways(&self) -> bool {
         self.pitch_rad != 0.0 || self.roll_rad != 0.0 || self.lift_m != 0.0
     }

@@ -1,13 +1,13 @@
-//! What a first-order filter makes of something that moves.
+//! Response of a first-order filter to a motion.
 
 use nalgebra::Vector3;
 use windhover_base::time::{MonoTime, Span};
 
-/// Moments of the past that stand for all of it.
+/// Number of past times that represent the whole past.
 const MOMENTS: u32 = 24;
 
-/// `∫ e^{−u/τ}/τ f(t − u) du` with time constant `tau_s`: the mean over the middles of equal shares of that weight. What it
-/// leaves of a change of period 2π τ is within some percent of the filter's. `f(t)` itself where `tau_s` is 0.
+/// `∫ e^{−u/τ}/τ f(t − u) du` with time constant `tau_s`: the mean over the middles of equal shares of that weight. Its
+/// gain at the period 2π τ is within some percent of the filter's. `f(t)` itself where `tau_s` is 0.
 pub(super) fn filtered(tau_s: f64, t: MonoTime, f: impl Fn(MonoTime) -> Vector3<f64>) -> Vector3<f64> {
     if tau_s == 0.0 {
         return f(t);

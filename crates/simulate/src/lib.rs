@@ -41,7 +41,7 @@ pub use follower::{FollowTarget, Follower, FollowerTuning};
 pub use instant::{OwnshipTruth, VehicleTruth};
 pub use markers::corners_in_vehicle;
 pub use misfit::{Company, Driving, GroundMisfit, MarkerMisfit, Misfit};
-pub use random::{Stream, Wander};
+pub use random::{SmoothNoise, Stream};
 pub use scenario::{Clock, Helicopter, HelicopterPath, Route, Scenario, Scene, SpeedPlan, VehiclePlan, Wind};
 pub use sensor_errors::{CameraSim, CompassSim, GpsSim, HiddenMarker};
 pub use suite::{Sample, SensorSuite};

@@ -1,4 +1,4 @@
-//! A serial line: bytes at the pace of its speed, and the reads in which they are picked up.
+//! A serial line: bytes at its speed, and the reads that receive them.
 
 use std::collections::VecDeque;
 

@@ -1,4 +1,4 @@
-//! Where a marker's corners are on its vehicle.
+//! The corners of a marker on its vehicle.
 
 use nalgebra::Vector3;
 

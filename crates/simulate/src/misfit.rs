@@ -1,10 +1,10 @@
-//! In what a flight differs from what its configuration says, as figures. With all of them at their defaults nothing does.
+//! How a flight differs from its configuration, as numbers. With all of them at their defaults it does not.
 
 use super::scenario::Scenario;
 use windhover_base::geo::ImageTop;
 use windhover_base::settings::{GroundConfig, GroundSource, MarkerConfig, Rig, TargetModel};
 
-/// Differences between `Scenario::rig`, which the pipeline is told, and what is flown.
+/// Differences between `Scenario::rig`, which the pipeline gets, and the simulated truth.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Misfit {
     /// The markers of the first target.
@@ -19,9 +19,9 @@ pub struct Misfit {
     pub image_top_turns: usize,
     /// How the vehicles drive.
     pub driving: Driving,
-    /// What is told of the ground's height.
+    /// The ground height that the pipeline gets.
     pub ground: GroundMisfit,
-    /// What else moves in view.
+    /// Other moving things in view.
     pub company: Company,
 }
 
@@ -57,16 +57,16 @@ pub struct Driving {
     pub drive_rate: Option<f64>,
 }
 
-/// What is told of the ground's height.
+/// The ground height that the pipeline gets.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum GroundMisfit {
-    /// Its height plus this, metres: the ground is that much lower than told.
+    /// Its height plus this, metres: the ground is lower than configured.
     Lower(f64),
-    /// To take the height of the first fixes, though the helicopter is in the air.
+    /// The height of the first fixes, although the helicopter is in the air.
     Takeoff,
 }
 
-/// Things in view that are no targets.
+/// Things in view that are not targets.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct Company {
     /// People who walk near the first vehicle.
@@ -84,7 +84,7 @@ impl Default for GroundMisfit {
 }
 
 impl Misfit {
-    /// The instruments and targets as they are, where this is what the pipeline is told.
+    /// The true instruments and targets, where the pipeline gets these.
     pub fn flown(&self, told: &Rig) -> Rig {
         let mut rig = told.clone();
         let lens = &mut rig.camera.intrinsics;
@@ -129,7 +129,7 @@ fn turned(top: ImageTop, turns: usize) -> ImageTop {
 }
 
 impl Scenario {
-    /// Height of the ground as told, metres down from where it is; `None` where it is to be found.
+    /// Height of the ground as configured, metres down from the truth; `None` where it is to be found.
     pub fn told_ground_down_m(&self) -> Option<f64> {
         match self.misfit.ground {
             GroundMisfit::Lower(by_m) => Some(-by_m),
@@ -137,7 +137,7 @@ impl Scenario {
         }
     }
 
-    /// The ground's section of a configuration: level, at the height of the origin, where the misfit has nothing else.
+    /// The ground's section of a configuration: level, at the height of the origin, unless the misfit changes it.
     pub fn ground(&self) -> GroundConfig {
         let told = |elevation_msl_m, source| GroundConfig { elevation_msl_m, source, terrain: None };
         match self.misfit.ground {

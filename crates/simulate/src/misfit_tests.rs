@@ -1,4 +1,4 @@
-//! Each deviation does what it says and nothing else, measured on what is delivered.
+//! Each deviation has its effect and no other, measured on the delivered data.
 
 use std::sync::Arc;
 
@@ -37,7 +37,7 @@ fn mean_and_rms(values: &[f64]) -> (f64, f64) {
     (mean, (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / n).sqrt())
 }
 
-/// Everything that is heard, as text.
+/// All events, as text.
 fn heard(world: &Arc<World>) -> Vec<String> {
     let mut suite = SensorSuite::new(Arc::clone(world));
     let mut all = Vec::new();

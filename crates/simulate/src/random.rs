@@ -67,17 +67,17 @@ impl Stream {
     }
 }
 
-/// Sines in one [`Wander`].
+/// Sines in one [`SmoothNoise`].
 const TERMS: usize = 7;
 
 /// A smooth random function of time: sines whose periods spread over a band, with random phases.
 #[derive(Clone, Debug)]
-pub struct Wander {
+pub struct SmoothNoise {
     amplitude: f64,
     terms: [(f64, f64); TERMS],
 }
 
-impl Wander {
+impl SmoothNoise {
     /// Root mean square `rms`, periods from `shortest_s` to `longest_s` (log-spaced, each moved at
     /// random within its share of the band).
     pub fn new(rms: f64, shortest_s: f64, longest_s: f64, stream: &mut Stream) -> Self {
@@ -118,7 +118,7 @@ mod tests {
 
     #[test]
     fn wander_has_its_rms_and_its_derivative() {
-        let wander = Wander::new(2.0, 3.0, 20.0, &mut Stream::new(1, 1));
+        let wander = SmoothNoise::new(2.0, 3.0, 20.0, &mut Stream::new(1, 1));
         let n = 200_000;
         let mean_square = (0..n).map(|i| wander.at(f64::from(i) * 0.05).powi(2)).sum::<f64>() / f64::from(n);
         assert!((mean_square.sqrt() - 2.0).abs() < 0.1, "{}", mean_square.sqrt());

@@ -2,7 +2,7 @@
 
 use super::instant::VehicleTruth;
 use super::misfit::Driving;
-use super::random::{Purpose, Stream, Wander};
+use super::random::{Purpose, SmoothNoise, Stream};
 
 /// Periods of the sway of a sprung body and of sliding, seconds.
 const SWAY_S: (f64, f64) = (0.5, 2.0);
@@ -12,8 +12,8 @@ const SLIP_S: (f64, f64) = (3.0, 12.0);
 #[derive(Clone, Debug)]
 pub(super) struct Rough {
     /// Pitch and roll, radians, and lift, metres.
-    sway: Option<[Wander; 3]>,
-    slip: Option<Wander>,
+    sway: Option<[SmoothNoise; 3]>,
+    slip: Option<SmoothNoise>,
 }
 
 impl Rough {
@@ -21,11 +21,11 @@ impl Rough {
         let mut stream = Stream::new(seed, Purpose::Rough as u64 + index as u64);
         // A sine that reaches `a` has an rms of a/√2.
         let mut wander = |reaches: f64| {
-            Wander::new(reaches * std::f64::consts::FRAC_1_SQRT_2, SWAY_S.0, SWAY_S.1, &mut stream)
+            SmoothNoise::new(reaches * std::f64::consts::FRAC_1_SQRT_2, SWAY_S.0, SWAY_S.1, &mut stream)
         };
         let angle = driving.sway_deg.to_radians();
         let sway = [wander(angle), wander(angle), wander(driving.bounce_m)];
-        let slip = Wander::new(driving.slip_deg.to_radians(), SLIP_S.0, SLIP_S.1, &mut stream);
+        let slip = SmoothNoise::new(driving.slip_deg.to_radians(), SLIP_S.0, SLIP_S.1, &mut stream);
         Self {
             sway: (driving.sway_deg != 0.0 || driving.bounce_m != 0.0).then_some(sway),
             slip: (driving.slip_deg != 0.0).then_some(slip),

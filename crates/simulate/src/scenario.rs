@@ -1,4 +1,4 @@
-//! Everything a simulated flight is made of, as figures.
+//! Everything in a simulated flight, as numbers.
 
 use nalgebra::Vector3;
 
@@ -8,15 +8,16 @@ use windhover_base::geo::Geodetic;
 use windhover_base::settings::Rig;
 use windhover_base::time::MonoTime;
 
-/// A flight to simulate. `rig` is what the pipeline is told and, but for `misfit`, how things are; the rest is what
-/// really happens.
+/// A flight to simulate. `rig` is what the pipeline gets and, except for `misfit`, the truth; the other fields are the
+/// truth.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Scenario {
     /// Its name on the command line.
     pub name: String,
-    /// What it is for, in a line.
+    /// Its purpose, in one line.
     pub about: String,
-    /// Length, seconds.
+    /// The instruments and targets in the pipeline's configuration. Latencies, mount, lever arms, markers and compass
+    /// format are true except for the errors below.
     pub duration_s: f64,
     /// The instruments and targets as the pipeline is told of them. Latencies, mount, lever arms,
     /// markers and compass format are true to it except for the errors below.
@@ -43,9 +44,9 @@ pub struct Scenario {
     pub compass: CompassSim,
     /// The camera's errors.
     pub camera: CameraSim,
-    /// What the frames look like.
+    /// Appearance of the frames.
     pub scene: Scene,
-    /// In what the flight differs from `rig`.
+    /// How the flight differs from `rig`.
     pub misfit: Misfit,
 }
 
@@ -62,13 +63,13 @@ pub struct Clock {
 /// drag, so attitude and motion agree.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Helicopter {
-    /// Where it is sent.
+    /// Its path.
     pub path: HelicopterPath,
     /// Height over the ground, metres.
     pub height_m: f64,
-    /// Where its nose points, degrees; drawn at random where absent.
+    /// Heading of the nose, degrees; random where absent.
     pub heading_deg: Option<f64>,
-    /// How far the nose wanders about it, degrees rms.
+    /// Variation of the heading, degrees rms.
     pub heading_wander_deg: f64,
     /// Position feedback, 1/s².
     pub position_gain: f64,
@@ -76,9 +77,9 @@ pub struct Helicopter {
     pub velocity_gain: f64,
     /// Natural frequency with which attitude follows its command, rad/s.
     pub attitude_rate: f64,
-    /// Restlessness of the pilot or controller, m/s² rms of commanded acceleration.
+    /// Unsteadiness of the pilot or controller, m/s² rms of commanded acceleration.
     pub agitation_mps2: f64,
-    /// Largest horizontal acceleration asked for, m/s².
+    /// Largest demanded horizontal acceleration, m/s².
     pub limit_mps2: f64,
     /// Drag, 1/s: acceleration per m/s of air speed.
     pub drag_per_s: f64,

@@ -1,4 +1,4 @@
-//! What is wrong with each sensor of a simulated flight, as figures.
+//! Errors of each sensor of a simulated flight, as numbers.
 
 /// Errors of the GPS receiver.
 #[derive(Clone, PartialEq, Debug)]
@@ -25,7 +25,8 @@ pub struct GpsSim {
     pub position_filter_s: f64,
     /// And on the velocity.
     pub velocity_filter_s: f64,
-    /// Jitter of the arrival, ms one-sigma.
+    /// Jitter that the fit of arrival times leaves in a stamp, ms one-sigma (values only: with bytes, the fit itself
+    /// does this).
     pub jitter_ms: f64,
     /// What the fit of arrival times leaves of the jitter in a stamp, ms one-sigma (values only:
     /// with bytes, the fit itself does this).
@@ -54,7 +55,8 @@ pub struct CompassSim {
     /// How much of the true tilt it reads: 1 is perfect, 0.15 what an accelerometer sees on a
     /// rotorcraft (geometry of thrust: see ARCHITECTURE).
     pub tilt_gain: f64,
-    /// Whether it takes the direction of specific force for the vertical, as a fluid or an accelerometer does.
+    /// Whether it measures the direction of specific force instead of the vertical, as a fluid or an accelerometer
+    /// does.
     pub feels_force: bool,
     /// Time constant of its tilt, seconds (first order; 0 for none).
     pub tilt_lag_s: f64,

@@ -1,11 +1,11 @@
-//! All sensors together, as values in the order in which they are heard.
+//! All sensors together, as values in order of reception.
 
 use std::sync::Arc;
 
 use nalgebra::{Matrix2, Vector2, Vector3};
 
 use super::camera::{Exposures, FrameTruth, MarkerTruth};
-use super::company::Looks;
+use super::company::Appearance;
 use super::compass::{Compass, CompassSample};
 use super::gnss::{GnssReceiver, GnssSample};
 use super::random::{Purpose, Stream};
@@ -19,8 +19,8 @@ use windhover_base::time::{MonoTime, Span};
 /// Bytes of one epoch's sentences (RMC, GGA, PGRME, PGRMV) and of one compass sentence on the wire.
 const WIRE_BYTES: (f64, f64) = (223.0, 20.0);
 
-/// One measurement with when it was really true. `t_valid` is what the configured latency makes of
-/// it: off by this flight's latency error and the remaining jitter.
+/// One measurement with its true time. `t_valid` is computed with the configured latency: it is off by this flight's
+/// latency error and the remaining jitter.
 #[derive(Clone, Copy, PartialEq, Debug)]
 #[expect(clippy::large_enum_variant, reason = "a value at a time, handed on")]
 pub enum Sample {
@@ -48,7 +48,7 @@ pub enum Sample {
 }
 
 impl Sample {
-    /// When it was heard.
+    /// Its reception.
     pub fn t_recv(&self) -> MonoTime {
         match self {
             Self::Gnss { stamped, .. } => stamped.t_recv,
@@ -181,7 +181,7 @@ impl SensorSuite {
         for mover in 0..world.movers() {
             let (target, looks) = match world.looks(mover).1 {
                 None => (mover, None),
-                Some(Looks::Double) => (0, Some(Looks::Double)),
+                Some(Appearance::Double) => (0, Some(Appearance::Double)),
                 Some(_) => continue,
             };
             for marker in 0..world.rig().target[target].marker.len() {
@@ -208,7 +208,7 @@ impl SensorSuite {
         let place = [self.riders.uniform(-1.0, 1.0), self.riders.uniform(-1.0, 1.0)];
         // On top of a person or on the roof.
         let (half, height) = match self.world.looks(on).1 {
-            Some(Looks::Person) => ((0.15, 0.2), 1.6),
+            Some(Appearance::Person) => ((0.15, 0.2), 1.6),
             _ => ((0.5, 0.3), 0.55),
         };
         let at_m = Vector3::new(half.0 * place[0], half.1 * place[1], -height);

@@ -1,4 +1,4 @@
-//! The simulated world obeys physics, and sensors see it as their figures say.
+//! The simulated world obeys physics, and sensors measure it with their configured errors.
 
 use std::sync::Arc;
 

@@ -3,7 +3,7 @@
 use super::instant::{STEP_S, VehicleTruth};
 use super::misfit::Driving;
 use super::ode::Table;
-use super::random::{Purpose, Stream, Wander};
+use super::random::{Purpose, SmoothNoise, Stream};
 use super::rough::Rough;
 use super::scenario::{Route, SpeedPlan, VehiclePlan};
 use windhover_base::geo::wrap_angle;
@@ -42,8 +42,8 @@ struct Driver {
     plan: VehiclePlan,
     model: TargetModel,
     wheelbase_m: f64,
-    speed: Wander,
-    wheel: Wander,
+    speed: SmoothNoise,
+    wheel: SmoothNoise,
     driving: Driving,
     rough: Rough,
 }
@@ -80,8 +80,8 @@ impl VehicleMotion {
             plan: *plan,
             model: target.model,
             wheelbase_m,
-            speed: Wander::new(wander_mps, 4.0, 20.0, &mut stream),
-            wheel: Wander::new(curvature, 4.0, 18.0, &mut stream),
+            speed: SmoothNoise::new(wander_mps, 4.0, 20.0, &mut stream),
+            wheel: SmoothNoise::new(curvature, 4.0, 18.0, &mut stream),
             driving: *driving,
             rough: rough.clone(),
         };

@@ -1,11 +1,11 @@
-//! The truth: where everything is at any time of the flight.
+//! The truth: the state of everything at any time of the flight.
 
 use nalgebra::Rotation3;
 
-use super::company::{Companion, Looks};
+use super::company::{Appearance, Companion};
 use super::helicopter::HelicopterMotion;
 use super::instant::{OwnshipTruth, VehicleTruth};
-use super::random::{Purpose, Stream, Wander};
+use super::random::{Purpose, SmoothNoise, Stream};
 use super::scenario::Scenario;
 use super::vehicle::VehicleMotion;
 use windhover_base::geo::{LocalFrame, ned_from_body_321};
@@ -30,7 +30,7 @@ pub struct World {
     companions: Vec<Companion>,
     helicopter: HelicopterMotion,
     /// Turns of the camera about its axes, radians.
-    vibration: Option<[Wander; 3]>,
+    vibration: Option<[SmoothNoise; 3]>,
 }
 
 impl World {
@@ -50,7 +50,7 @@ impl World {
         Self { scenario, rig, seed, frame, vehicles, companions, helicopter, vibration }
     }
 
-    /// The same with a helicopter that somebody else flies ([`Self::fly`]): it begins above the first vehicle.
+    /// The same with a helicopter under external control ([`Self::fly`]): it begins above the first vehicle.
     pub fn flown(scenario: Scenario, seed: u64) -> Self {
         let mut world = Self::new(scenario, seed);
         let plan = &world.scenario.helicopter;
@@ -60,12 +60,12 @@ impl World {
         world
     }
 
-    /// Moves a flown helicopter on by [`Self::STEP`] while this acceleration (north, east, down, m/s²) is asked of it.
+    /// Advances a flown helicopter by [`Self::STEP`] with this demanded acceleration (north, east, down, m/s²).
     pub fn fly(&self, wanted_ned_mps2: &nalgebra::Vector3<f64>) {
         self.helicopter.fly(wanted_ned_mps2, self.scenario.helicopter.attitude_rate);
     }
 
-    /// Puts a flown helicopter, a [`Self::STEP`] later, to this place, velocity and acceleration, north, east, down.
+    /// Sets a flown helicopter, a [`Self::STEP`] later, to this position, velocity and acceleration, north, east, down.
     pub fn put(
         &self,
         place_m: &nalgebra::Vector3<f64>,
@@ -78,27 +78,27 @@ impl World {
     /// A step of a flown helicopter.
     pub const STEP: Span = Span::from_ns(5_000_000);
 
-    /// What it was made of.
+    /// Its scenario.
     pub fn scenario(&self) -> &Scenario {
         &self.scenario
     }
 
-    /// The instruments and targets as they really are.
+    /// The true instruments and targets.
     pub fn rig(&self) -> &Rig {
         &self.rig
     }
 
-    /// The seed it was made with.
+    /// Its seed.
     pub fn seed(&self) -> u64 {
         self.seed
     }
 
-    /// The NED frame all positions are in.
+    /// The NED frame of all positions.
     pub fn frame(&self) -> &LocalFrame {
         &self.frame
     }
 
-    /// How many vehicles there are.
+    /// Number of vehicles.
     pub fn vehicles(&self) -> usize {
         self.vehicles.len()
     }
@@ -142,7 +142,7 @@ impl World {
         self.vehicles[target].at(self.seconds(t))
     }
 
-    /// How many vehicles and other things move in view.
+    /// Number of vehicles and other moving things.
     pub(super) fn movers(&self) -> usize {
         self.vehicles.len() + self.companions.len()
     }
@@ -156,7 +156,7 @@ impl World {
     }
 
     /// The target it is or, of a companion, what it looks like.
-    pub(super) fn looks(&self, index: usize) -> (&TargetConfig, Option<Looks>) {
+    pub(super) fn looks(&self, index: usize) -> (&TargetConfig, Option<Appearance>) {
         match index.checked_sub(self.vehicles.len()) {
             None => (&self.rig.target[index], None),
             Some(companion) => (&self.rig.target[0], Some(self.companions[companion].looks)),
@@ -171,8 +171,8 @@ impl World {
     }
 }
 
-fn vibration(rms_deg: f64, seed: u64) -> Option<[Wander; 3]> {
+fn vibration(rms_deg: f64, seed: u64) -> Option<[SmoothNoise; 3]> {
     let mut stream = Stream::of(seed, Purpose::Vibration);
-    let mut axis = || Wander::new(rms_deg.to_radians(), VIBRATION_S.0, VIBRATION_S.1, &mut stream);
+    let mut axis = || SmoothNoise::new(rms_deg.to_radians(), VIBRATION_S.0, VIBRATION_S.1, &mut stream);
     (rms_deg != 0.0).then(|| [axis(), axis(), axis()])
 }

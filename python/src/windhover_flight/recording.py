@@ -19,7 +19,7 @@ def segments(path):
         return [path]
     files = sorted(path.glob("*.mcap"))
     if not files:
-        raise FileNotFoundError(f"{path} holds no .mcap segment")
+        raise FileNotFoundError(f"{path} has no .mcap segment")
     return files
 
 

@@ -1,4 +1,4 @@
-//! CSV: one table a kind of output, columns as the contract of formats says.
+//! CSV: one table for each kind of output, with the columns of the format contract.
 
 use std::io::{BufWriter, Write as _};
 use std::path::{Path, PathBuf};
@@ -36,7 +36,7 @@ const OWNSHIP_COLUMNS: &str =
 
 const DATUM_COLUMNS: &str = "lat_deg,lon_deg,height_m";
 
-/// A file being written, remembered by name for errors.
+/// A file being written, with its name for errors.
 struct CsvTable {
     path: PathBuf,
     file: BufWriter<NewFile>,
@@ -87,7 +87,7 @@ pub(super) fn export(flight: &Path, mut reader: McapReader, out: &Path) -> Resul
         } else if name == topic::OWNSHIP {
             ownship_rows.extend(decoded::<Ownship>(&message, &mut damaged).map(|own| ownship_row(&own)));
         } else if name == topic::DATUM {
-            // One that moved holds.
+            // A datum that moved replaces the earlier one.
             datum = decoded::<Datum>(&message, &mut damaged).or(datum);
         } else if let Some(kind) = name.strip_prefix("/target/").and_then(|rest| rest.rsplit('/').next()) {
             let (table, covariance) = match kind {
@@ -102,7 +102,7 @@ pub(super) fn export(flight: &Path, mut reader: McapReader, out: &Path) -> Resul
             }
         }
     }
-    // A frame is looked at some time after its exposure, when later instants are in the flight already.
+    // A frame is evaluated some time after its exposure, when later instants are already in the flight.
     ownship_rows.sort_by_key(|(time, _)| *time);
     ownship_rows.iter().try_for_each(|(_, row)| ownship.row(row))?;
     let mut warnings = reader.take_warnings();
@@ -110,7 +110,7 @@ pub(super) fn export(flight: &Path, mut reader: McapReader, out: &Path) -> Resul
     warnings.extend(damaged);
     let mut exported = Exported { files: Vec::new(), warnings };
     let mut tables = vec![estimates, smoothed, paper, detections, ownship];
-    // Few flights are refined, and a table of nothing would look like one that was.
+    // Few flights are refined, and an empty table would look like a refined flight.
     if refined.rows > 0 {
         tables.push(refined);
     }
@@ -119,14 +119,14 @@ pub(super) fn export(flight: &Path, mut reader: McapReader, out: &Path) -> Resul
         table.row(&figures(&[(datum.lat_deg, 10), (datum.lon_deg, 10), (datum.height_m, 4)])[1..])?;
         tables.push(table);
     }
-    // Tables of nothing would look like a flight in which nothing was seen.
+    // Empty tables would look like a flight in which nothing was seen.
     if tables.iter().any(|table| table.rows > 0) {
         tables.into_iter().try_for_each(|table| table.close(&mut exported.files))?;
     }
     Ok(exported)
 }
 
-/// `,1.25,-3.000000`: figures with their decimals, empty where one is none.
+/// `,1.25,-3.000000`: values with their decimals, empty where a value is not finite.
 fn figures(figures: &[(f64, usize)]) -> String {
     let mut row = String::new();
     figures.iter().for_each(|(figure, decimals)| csv_figure(&mut row, *figure, *decimals));
@@ -184,7 +184,7 @@ fn detection_row(time: i64, frame: u32, m: &Marker) -> String {
     row
 }
 
-/// The row, and its time; without a number where it belongs to no frame.
+/// The row and its time; the frame number is empty where it belongs to no frame.
 fn ownship_row(o: &Ownship) -> (i64, String) {
     let time = host_time(o.timestamp.as_ref()).ns();
     let frame = if o.between_frames { String::new() } else { o.frame.to_string() };

@@ -1,4 +1,4 @@
-//! GeoJSON (RFC 7946): a line a track, and its positions once a second with what was known there.
+//! GeoJSON (RFC 7946): a line for each track, and its positions once a second with their properties.
 
 use std::path::Path;
 
@@ -11,10 +11,10 @@ use crate::io::new_file::NewFile;
 use crate::plot::MADE_BY;
 use windhover_base::time::{Span, UtcTime};
 
-/// Its file, and what that says near its begin.
+/// Its file, and the generator's name near the start of the file.
 pub(super) const FILE: (&str, &str) = ("flight.geojson", MADE_BY);
 
-/// Positions are written this far apart; the line has them all.
+/// Time between two positions; the line has all of them.
 const POINT_PERIOD: Span = Span::from_ns(1_000_000_000);
 
 pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, ExportError> {
@@ -35,7 +35,7 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
         return Ok(exported);
     }
     let path = out.join(FILE.0);
-    // Who made it stands first: other members may follow type and features (RFC 7946, 6.1).
+    // The generator comes first: other members may follow type and features (RFC 7946, 6.1).
     let features = Value::Array(features);
     let text = format!(
         "{{\n\"type\": \"FeatureCollection\",\n\"generator\": \"{MADE_BY}\",\n\"features\": {features:#}\n}}\n"
@@ -45,7 +45,7 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
     Ok(exported)
 }
 
-/// Decimals that hold a centimetre, not the noise below it.
+/// Rounds to decimals that hold a centimetre, not the noise below it.
 fn rounded(x: f64, decimals: i32) -> f64 {
     let scale = 10_f64.powi(decimals);
     (x * scale).round() / scale

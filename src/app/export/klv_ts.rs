@@ -11,7 +11,7 @@ use crate::io::mcap_read::McapReader;
 use crate::io::new_file::NewFile;
 use windhover_base::msg::EventBody;
 
-/// Its file, and what that says near its begin.
+/// Its file, and the generator's name near the start of the file.
 pub(super) const FILE: (&str, &str) = ("flight.ts", "windhover");
 
 pub(super) fn export(flight: &Path, mut reader: McapReader, out: &Path) -> Result<Exported, ExportError> {
@@ -22,7 +22,9 @@ pub(super) fn export(flight: &Path, mut reader: McapReader, out: &Path) -> Resul
     }
     let mut exported = Exported { files: Vec::new(), warnings: reader.take_warnings() };
     if known.utc_minus_host_ns.is_none() {
-        exported.warnings.push("the receiver never told the date: the packets' times are the host's".into());
+        exported
+            .warnings
+            .push("the receiver never reported the date: times of the packets are the host's".into());
     }
     let mission = flight.file_stem().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
     let mut film = Film::new(mission, config.map(|config| config.camera), None, known);
@@ -43,7 +45,7 @@ pub(super) fn export(flight: &Path, mut reader: McapReader, out: &Path) -> Resul
     if unusable > 0 {
         exported
             .warnings
-            .push(format!("{unusable} frames cannot be decoded, or are of another size: left out"));
+            .push(format!("{unusable} frames cannot be decoded or have another size: they are left out"));
     }
     let file = file.ok_or_else(|| ExportError::NoFrames { path: flight.to_owned() })?;
     let whole = file.into_inner().map_err(|error| error.into_error()).and_then(NewFile::finish);

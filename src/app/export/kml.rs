@@ -11,7 +11,7 @@ use crate::plot::MADE_BY;
 use crate::text::xml;
 use windhover_base::time::UtcTime;
 
-/// Its file, and what that says near its begin.
+/// Its file, and the generator's name near the start of the file.
 pub(super) const FILE: (&str, &str) = ("flight.kml", MADE_BY);
 
 pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, ExportError> {

@@ -42,14 +42,14 @@ pub enum ExportError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The video could not be encoded.
     #[error(transparent)]
     Video(#[from] VideoError),
     /// The recording holds no frames.
-    #[error("{} holds no frames that can be decoded: there is nothing to show", path.display())]
+    #[error("{} has no frames that can be decoded: there is nothing to export", path.display())]
     NoFrames {
         /// The recording.
         path: PathBuf,
@@ -62,17 +62,17 @@ pub enum ExportError {
     },
 }
 
-/// What an export wrote, and what of the flight was damaged.
+/// What an export wrote, and which parts of the flight were damaged.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Exported {
     /// Files written.
     pub files: Vec<PathBuf>,
-    /// Damage met in the flight.
+    /// Damage found in the flight.
     pub warnings: Vec<String>,
 }
 
 impl Format {
-    /// The files of a format, and what each says near its begin.
+    /// The files of a format, each with the text that identifies it near its start.
     pub const fn files(self) -> &'static [(&'static str, &'static str)] {
         match self {
             Self::Csv => &csv::TABLES,

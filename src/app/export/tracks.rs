@@ -25,14 +25,14 @@ pub(super) struct Point {
 }
 
 impl Point {
-    /// Whether it lies somewhere on the Earth, turned somewhere.
+    /// Whether it is a valid place and heading on the Earth.
     fn is_a_place(&self) -> bool {
         self.lat_deg.abs() <= 90.0 && self.lon_deg.abs() <= 180.0 && self.heading_deg.is_finite()
     }
 }
 
-/// Tracks by name: `target/NAME` and `helicopter`, in order of time; only what was tracked or predicted,
-/// and is a place on the Earth.
+/// Tracks by name: `target/NAME` and `helicopter`, in order of time; only states that were tracked or predicted and are
+/// valid places on the Earth.
 pub(super) fn read(reader: &mut McapReader) -> BTreeMap<String, Vec<Point>> {
     let mut tracks: BTreeMap<String, Vec<Point>> = BTreeMap::new();
     for message in reader.by_ref() {

@@ -1,4 +1,4 @@
-//! What the packets of a frame tell: the camera's pose, the ground it sees, the targets.
+//! The content of a frame's packets: the camera's pose, the ground in view, the targets.
 
 use nalgebra::{Rotation3, UnitQuaternion, Vector2, Vector3};
 
@@ -34,15 +34,16 @@ impl Pose<'_> {
         self.datum.geodetic(&point.ned_m)
     }
 
-    /// Where a place is in the image, if it is in front of the camera.
+    /// The pixel of a place, if it is in front of the camera.
     fn pixel(&self, ned: &Vector3<f64>) -> Option<(f64, f64)> {
         let seen = self.ned_from_camera.inverse() * (ned - self.at_ned);
         self.lens.project(&seen).map(|projection| (projection.px.x, projection.px.y))
     }
 }
 
-/// Azimuth, elevation and roll of a sensor whose axes are the optical one, image right, image down: the angles of
-/// Rz(azimuth) Ry(elevation) Rx(roll). Straight down, where azimuth and roll turn alike, all of it is azimuth.
+/// Azimuth, elevation and roll of a sensor whose axes are the optical axis, image right, image down: the angles of
+/// Rz(azimuth) Ry(elevation) Rx(roll). Straight down, where azimuth and roll are not separable, all of the rotation is
+/// azimuth.
 fn relative_deg(body_from_camera: &Rotation3<f64>) -> [f64; 3] {
     let axes = [Vector3::z(), Vector3::x(), Vector3::y()].map(|axis| body_from_camera * axis);
     let body_from_sensor = Rotation3::from_basis_unchecked(&axes);
@@ -69,7 +70,7 @@ fn field_deg(camera: &CameraConfig) -> Option<[f64; 2]> {
     Some([across, down])
 }
 
-/// What the packets of a frame tell.
+/// The content of a frame's packets.
 pub(super) fn view(
     frame: u32,
     t: MonoTime,
@@ -96,7 +97,7 @@ pub(super) fn view(
         let lever = camera.map_or(Vector3::zeros(), |camera| camera.mount.position());
         let at_ned = Vector3::new(own.north_m, own.east_m, own.down_m) + ned_from_body * lever;
         view.sensor = Some(datum.geodetic(&at_ned));
-        // Level ground at the height of a vehicle that is seen, else at the datum's.
+        // Level ground at the height of a visible vehicle, else at the datum's height.
         let down_m = targets.first().map_or(0.0, |target| datum.ned(place(target)).z);
         pose = camera.map(|camera| Pose {
             datum,
@@ -148,7 +149,7 @@ fn seen(s: &TargetState, id: u32, pose: Option<&Pose<'_>>) -> SeenTarget {
     SeenTarget { id, life, pixel, lat_deg, lon_deg, height_m, place_sigma, velocity_mps, velocity_sigma }
 }
 
-/// One-sigma of east and north, and their correlation, of two variances and a covariance.
+/// One sigma of east and north, and their correlation, from two variances and a covariance.
 fn sigmas(ee: f64, nn: f64, en: f64) -> (f64, f64, f64) {
     let (east, north) = (ee.max(0.0).sqrt(), nn.max(0.0).sqrt());
     let correlation = if east * north > 0.0 { (en / (east * north)).clamp(-1.0, 1.0) } else { 0.0 };

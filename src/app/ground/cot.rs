@@ -27,29 +27,29 @@ use crate::io::proto::host_time;
 use crate::text::xml;
 use windhover_base::time::{Span, UtcTime};
 
-/// A position report of each so often: what TAK's maps live on.
+/// Period of the position reports, as TAK's maps expect.
 const EVERY: Duration = Duration::from_secs(1);
-/// A report is no position of now any more after so long.
+/// A report older than this is not a current position.
 const STALE: Span = Span::from_ns(5_000_000_000);
-/// A server that takes nothing for so long is called again.
+/// A server that accepts nothing for this time is connected again.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Pauses before a server is called again: twice as long each time.
+/// Pauses before a server is connected again, shortest and longest; each is twice the one before.
 const PAUSES_S: (u64, u64) = (1, 30);
 /// Events that a server may be behind before it misses some.
 const QUEUE: usize = 256;
-/// Cursor on Target's word for an error that is not known.
+/// Cursor on Target's value for an unknown error.
 const UNKNOWN_M: &str = "9999999.0";
-/// A datagram reaches this many networks; more than the own one is for routers of multicast.
+/// How many networks a datagram crosses; more than the local one needs a multicast router.
 const HOPS: u32 = 1;
 
 /// Where reports go.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum CotTo {
-    /// A datagram an event: an address, or a multicast group.
+    /// One datagram for each event, to an address or a multicast group.
     Udp(SocketAddr),
-    /// A server that is called.
+    /// A TCP server.
     Tcp(String),
-    /// A server that is called, over TLS.
+    /// A TLS server.
     Tls(String),
 }
 
@@ -66,7 +66,7 @@ impl FromStr for CotTo {
             "udp" => place
                 .parse()
                 .map(Self::Udp)
-                .map_err(|_| format!("{place:?} is no address with a port; {advice}")),
+                .map_err(|_| format!("{place:?} is not an address with a port; {advice}")),
             "tcp" if has_port => Ok(Self::Tcp(place.into())),
             "tls" | "ssl" if has_port => Ok(Self::Tls(place.into())),
             _ => Err(advice.into()),
@@ -87,13 +87,13 @@ impl fmt::Display for CotTo {
 /// The files of TLS.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct CotKeys {
-    /// Certificate of the authority that signed the server's.
+    /// Certificate of the authority that signed the server's certificate.
     pub authority: Option<PathBuf>,
-    /// Own certificate, where the server wants one, and its key.
+    /// The client's certificate and its key, where the server requires one.
     pub own: Option<(PathBuf, PathBuf)>,
 }
 
-/// What a report says.
+/// The content of a report.
 struct Report<'a> {
     uid: String,
     kind: &'static str,
@@ -131,7 +131,7 @@ impl Report<'_> {
     }
 }
 
-/// When something of this age was true: by the receiver, else by this computer's clock.
+/// The UTC at which a state of this age was valid: by the receiver, else by this computer's clock.
 fn time_of(utc: Option<UtcTime>, age: Span, now: UtcTime) -> UtcTime {
     utc.unwrap_or_else(|| UtcTime::from_unix_ns(now.unix_ns().saturating_sub(age.ns())))
 }
@@ -142,7 +142,7 @@ fn circular_m(nn: f64, ne: f64, ee: f64) -> f64 {
     (mean + half).max(0.0).sqrt()
 }
 
-/// A vehicle's report; `None` where its state is no position of now.
+/// A vehicle's report; `None` where its state is not a current position.
 pub(super) fn of_vehicle(vehicle: &Vehicle, now: UtcTime) -> Option<String> {
     let s = &vehicle.state;
     if !vehicle.is_current() {
@@ -152,7 +152,7 @@ pub(super) fn of_vehicle(vehicle: &Vehicle, now: UtcTime) -> Option<String> {
         [nn, ne, _, _, _, ee, ..] => Some(circular_m(nn, ne, ee)),
         _ => None,
     };
-    // A vehicle that backs up moves against its heading.
+    // A vehicle that reverses moves against its heading.
     let back = if s.speed_mps < 0.0 { 180.0 } else { 0.0 };
     let report = Report {
         uid: format!("windhover.{}.{}", vehicle.payload, vehicle.target),
@@ -191,7 +191,7 @@ pub(super) fn of_helicopter(helicopter: &Helicopter, now: UtcTime) -> String {
     report.event(now)
 }
 
-/// Makes a report of everything that is known and new, and has it sent to every destination.
+/// Makes a report of every known and new state, and sends it to every destination.
 pub(super) async fn serve(
     to: Vec<CotTo>,
     tls: Option<TlsConnector>,
@@ -208,16 +208,16 @@ pub(super) async fn serve(
     loop {
         tick.tick().await;
         for event in reports(&view, &mut told) {
-            // Nobody may be there.
+            // There may be no receiver.
             let _ = events.send(event.into());
         }
     }
 }
 
-/// The reports of what is newer than what was told.
+/// The reports of all states that are newer than the last reports.
 fn reports(view: &Mutex<View>, told: &mut BTreeMap<String, i64>) -> Vec<String> {
     let now = Instant::now();
-    // What this computer takes for UTC: its clock may have been set since it started.
+    // UTC by this computer's clock, which may have been set since the program started.
     let utc = UtcTime::from_unix_ns(HostClock::start().now().ns());
     let (vehicles, helicopters) = {
         let view = lock(view);
@@ -240,7 +240,7 @@ fn reports(view: &Mutex<View>, told: &mut BTreeMap<String, i64>) -> Vec<String> 
     all
 }
 
-/// Sends events to one destination, for ever; what fails is told once and tried again.
+/// Sends events to one destination without end; a failure is reported once and the destination is tried again.
 async fn send(to: CotTo, tls: Option<TlsConnector>, events: broadcast::Sender<Arc<str>>) {
     let mut pause_s = PAUSES_S.0;
     let mut troubled = false;
@@ -265,11 +265,11 @@ async fn send(to: CotTo, tls: Option<TlsConnector>, events: broadcast::Sender<Ar
 
 fn is_up(to: &CotTo, troubled: &mut bool) {
     if std::mem::replace(troubled, false) {
-        OperatorEvent::LinkUp.emit("cot", format!("{to} takes reports again"));
+        OperatorEvent::LinkUp.emit("cot", format!("{to} accepts reports again"));
     }
 }
 
-/// A datagram an event, until the events end.
+/// Sends one datagram for each event, until the events end.
 async fn datagrams(
     address: SocketAddr,
     mut events: broadcast::Receiver<Arc<str>>,
@@ -288,7 +288,7 @@ async fn datagrams(
     Ok(())
 }
 
-/// One event after another over a connection, until the events end.
+/// Sends events over a connection, until the events end.
 async fn called(
     place: &str,
     tls: Option<&TlsConnector>,
@@ -323,7 +323,7 @@ async fn stream_events(
     let mut ignored = [0; 4096];
     loop {
         tokio::select! {
-            // What others report is not looked at.
+            // Reports of others are ignored.
             said = stream.read(&mut ignored) => if said? == 0 {
                 return Err(std::io::ErrorKind::ConnectionReset.into());
             },
@@ -343,7 +343,7 @@ async fn stream_events(
     }
 }
 
-/// The next event; `None` when there are no more. One that was missed is missed.
+/// The next event; `None` when there are no more. Missed events are skipped.
 async fn next(events: &mut broadcast::Receiver<Arc<str>>) -> Option<Arc<str>> {
     loop {
         match events.recv().await {
@@ -354,16 +354,16 @@ async fn next(events: &mut broadcast::Receiver<Arc<str>>) -> Option<Arc<str>> {
     }
 }
 
-/// What TLS is done with.
+/// The TLS configuration.
 ///
 /// # Errors
-/// A file that cannot be read, or is not what it should be; in words that name it.
+/// A file that cannot be read or has the wrong content; the message names it.
 pub(super) fn connector(keys: &CotKeys) -> Result<TlsConnector, String> {
     let words = |path: &PathBuf, error: &dyn fmt::Display| format!("{}: {error}", path.display());
     let authority = keys
         .authority
         .as_ref()
-        .ok_or("tls:// needs --cot-authority: the certificate that signed the server's")?;
+        .ok_or("tls:// needs --cot-authority: the certificate that signed the server's certificate")?;
     let mut roots = RootCertStore::empty();
     let certificate = CertificateDer::from_pem_file(authority).map_err(|e| words(authority, &e))?;
     roots.add(certificate).map_err(|e| words(authority, &e))?;

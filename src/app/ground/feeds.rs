@@ -6,7 +6,7 @@ use super::view::{Vehicle, nmea_time};
 use crate::io::proto::host_time;
 use crate::text::{finite, xml};
 
-/// Trail points in KML and GeoJSON; more only slow a viewer down.
+/// Trail points in KML and GeoJSON; more would only slow a viewer down.
 const POINTS: usize = 2_000;
 /// Knots in a metre a second.
 const KNOTS: f64 = 3_600.0 / 1_852.0;
@@ -36,7 +36,8 @@ pub fn geojson(vehicles: &[Vehicle]) -> String {
         let s = &vehicle.state;
         let (sigma_n, sigma_e) =
             sigmas_m(vehicle).map_or((Value::Null, Value::Null), |(n, e)| (json!(n), json!(e)));
-        // What is no position of now has none (RFC 7946, 3.2: an unlocated feature); the trail ends where it was.
+        // A state that is not current has no position (RFC 7946, 3.2: an unlocated feature); the trail ends at its last
+        // one.
         let here = json!({"type": "Point", "coordinates": [s.lon_deg, s.lat_deg]});
         let geometry = if vehicle.is_current() { here } else { Value::Null };
         features.push(json!({"type": "Feature", "id": format!("{}/{}", vehicle.payload, vehicle.target),
@@ -67,7 +68,7 @@ pub fn network_link(url: &str) -> String {
     )
 }
 
-/// Every vehicle as a placemark turned to its heading, and its trail.
+/// Every vehicle as a placemark that is turned to its heading, and its trail.
 pub fn kml(vehicles: &[Vehicle]) -> String {
     let mut out = String::from(
         "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<kml xmlns=\"http://www.opengis.net/kml/2.2\"><Document>\
@@ -89,7 +90,7 @@ pub fn kml(vehicles: &[Vehicle]) -> String {
     out + "</Document></kml>\n"
 }
 
-/// A vehicle where it is now, turned to its heading; one that is only predicted is orange.
+/// A vehicle's current position, turned to its heading; a predicted one is orange.
 fn placemark(vehicle: &Vehicle, name: &str) -> String {
     let (s, heading) = (&vehicle.state, heading_deg(vehicle));
     let colour = if vehicle.status == "tracking" { "ff0f48d9" } else { "ff00a5ff" };
@@ -106,7 +107,7 @@ fn placemark(vehicle: &Vehicle, name: &str) -> String {
     )
 }
 
-/// A vehicle that is lost: in the list with its age, and nowhere on the map; its trail ends where it was.
+/// A lost vehicle: in the list with its age, and not on the map; its trail ends at its last position.
 fn last_known(vehicle: &Vehicle, name: &str) -> String {
     format!(
         "<Placemark><name>{name}: {}, last known {:.0} s ago</name></Placemark>",
@@ -123,31 +124,31 @@ fn sentence(body: &str) -> String {
 
 /// `ddmm.mmmmmm,N`: degrees (of `width` digits), minutes, hemisphere.
 fn angle(degrees: f64, width: usize, hemispheres: [char; 2]) -> String {
-    // Rounded to the last digit first, so that minutes never read 60.
+    // The last digit is rounded first, so that minutes never read 60.
     let micro_minutes = (degrees.abs() * 60e6).round() as u64;
     let (whole, rest) = (micro_minutes / 60_000_000, micro_minutes % 60_000_000);
     let hemisphere = hemispheres[usize::from(degrees < 0.0)];
     format!("{whole:0width$}{:02}.{:06},{hemisphere}", rest / 1_000_000, rest % 1_000_000)
 }
 
-/// What NMEA 0183 calls a position: how RMC calls it valid, its mode, and GGA's quality.
+/// How NMEA 0183 qualifies a position: validity in RMC, mode, and quality in GGA.
 ///
-/// It is a fix (A, quality 1) where the vehicle is tracked and the helicopter's receiver, by which it is placed, has a
-/// three-dimensional fix. Everything else that is known is "estimated" (V, mode E, quality 6).
+/// It is a fix (A, quality 1) where the vehicle is tracked and the helicopter's receiver, from which the position
+/// derives, has a three-dimensional fix. Every other known position is "estimated" (V, mode E, quality 6).
 fn quality(vehicle: &Vehicle) -> (char, char, u8) {
     let placed = vehicle.receiver.is_some_and(|receiver| receiver.fix == 3);
     if placed && vehicle.status == "tracking" { ('A', 'A', 1) } else { ('V', 'E', 6) }
 }
 
-/// A figure with its decimals, or nothing.
+/// A value with its decimals, or nothing.
 fn maybe(figure: Option<f64>, decimals: usize) -> String {
     figure.and_then(finite).map_or(String::new(), |figure| format!("{figure:.decimals$}"))
 }
 
-/// RMC, GGA, GSA and GST of a vehicle. One that is lost has neither position nor time. Time and date stay empty where UTC
-/// is not known. Satellites and dilution are those of the helicopter's receiver; the altitude is that of the ground under
-/// the vehicle above mean sea level, by the receiver's geoid, and empty where the receiver does not tell that; one-sigmas
-/// (GST) are the vehicle's own.
+/// RMC, GGA, GSA and GST of a vehicle. A lost one has neither position nor time. Time and date stay empty where UTC is
+/// not known. Satellites and dilution are those of the helicopter's receiver; the altitude is that of the ground under
+/// the vehicle above mean sea level, by the receiver's geoid, and empty where the receiver does not report it;
+/// one-sigmas (GST) are the vehicle's own.
 pub fn nmea(vehicle: &Vehicle) -> String {
     let s = &vehicle.state;
     if !vehicle.is_current() {
@@ -157,7 +158,7 @@ pub fn nmea(vehicle: &Vehicle) -> String {
     }
     let (time, date) = nmea_time(vehicle.utc);
     let (lat, lon) = (angle(s.lat_deg, 2, ['N', 'S']), angle(s.lon_deg, 3, ['E', 'W']));
-    // Course over ground: of a vehicle that reverses, the way it goes.
+    // Course over ground: for a vehicle that reverses, its direction of motion.
     let course = if s.speed_mps < 0.0 { heading_deg(vehicle) + 180.0 } else { heading_deg(vehicle) } % 360.0;
     let knots = s.speed_mps.abs() * KNOTS;
     let (valid, mode, quality) = quality(vehicle);
@@ -174,7 +175,7 @@ pub fn nmea(vehicle: &Vehicle) -> String {
     let gga = sentence(&format!(
         "GPGGA,{time},{lat},{lon},{quality},{sats},{hdop},{alt_msl_m},M,{separation_m},M,,"
     ));
-    // Which satellites they are is not told on the link.
+    // The link does not carry which satellites they are.
     let gsa = sentence(&format!("GPGSA,A,{dimensions}{}{hdop},", ",".repeat(UNNAMED)));
     let gst = sigmas_m(vehicle).map_or(String::new(), |(n, e)| {
         sentence(&format!("GPGST,{time},,,,,{},{},", maybe(Some(n), 2), maybe(Some(e), 2)))
@@ -236,7 +237,7 @@ mod tests {
                 other => panic!("{other:?}"),
             }
         }
-        // A vehicle is no better placed than the helicopter's receiver places it.
+        // A vehicle's position is no better than the fix of the helicopter's receiver.
         let unsure = |receiver| nmea(&Vehicle { receiver, ..vehicle() });
         let said = vehicle().receiver;
         let two = unsure(said.map(|said| Receiver { fix: 2, ..said }));

@@ -1,9 +1,9 @@
-//! What arrives, for many stations, vehicles and other programs over Zenoh; and answers about the past.
+//! Received records for other stations, vehicles and programs over Zenoh, and answers to history queries.
 //!
 //! A topic of a payload's flight is the key expression `windhover/PAYLOAD/TOPIC`, for example
 //! `windhover/alpha/target/ugv/state`; values are the flight's protobuf messages, their encoding is
-//! `application/protobuf;SCHEMA`, their timestamp is when they were true. What arrives live is published;
-//! everything is there for queries: with `_time=[..]` all of that span, without it the latest of each key.
+//! `application/protobuf;SCHEMA`, their timestamp is their time of validity. Records that arrive live are published;
+//! all records answer queries: with `_time=[..]` all records of that span, without it the latest of each key.
 
 use std::collections::{BTreeMap, HashSet, VecDeque};
 use std::path::{Path, PathBuf};
@@ -21,19 +21,19 @@ use super::history;
 use crate::io::link::Arrival;
 use windhover_base::time::MonoTime;
 
-/// Where a station listens when told nothing else.
+/// Where a station listens by default.
 pub const LOOPBACK: &str = "tcp/127.0.0.1:7447";
-/// Records on their way to Zenoh; more are left out, as on any live line.
+/// Records on their way to Zenoh; beyond this number records are left out, as on every live channel.
 const QUEUE: usize = 1_024;
-/// Records of each key kept in memory until they are surely on the disk: far more than arrive between two
-/// of the disk's syncs.
+/// Records of each key that are kept in memory until they are certainly on the disk: far more than arrive between two
+/// syncs.
 const RECENT: usize = 256;
 /// Keys kept in memory.
 const KEYS: usize = 4_096;
 /// Queries answered at the same time; others wait.
 const ANSWERS: usize = 2;
 
-/// One record as Zenoh gets it.
+/// One record as Zenoh receives it.
 #[derive(Clone)]
 struct Sample {
     key: KeyExpr<'static>,
@@ -45,16 +45,16 @@ struct Sample {
     data: Arc<[u8]>,
 }
 
-/// The latest samples of each key, in the order in which they came.
+/// The latest samples of each key, in order of arrival.
 type Recent = Arc<Mutex<BTreeMap<String, VecDeque<Sample>>>>;
 
-/// The way to Zenoh.
+/// The connection to Zenoh.
 pub struct Fleet {
     recent: Recent,
     publish: mpsc::Sender<Sample>,
 }
 
-/// The key expression of a payload's topic; `None` where the names have characters that mean something.
+/// The key expression of a payload's topic; `None` where the names contain reserved characters.
 fn key(payload: &str, topic: &str) -> Option<KeyExpr<'static>> {
     let key = KeyExpr::try_from(format!("windhover/{payload}{topic}")).ok()?;
     (!key.is_wild()).then_some(key)
@@ -73,8 +73,8 @@ fn stamp(t: MonoTime, id: TimestampId) -> Timestamp {
     Timestamp::new(NTP64::from(since), id)
 }
 
-/// A configuration of Zenoh: a file of its own format, or an endpoint to call; the loopback is listened at.
-/// Nothing is searched for by multicast, and nothing opened beyond loopback, unless a file says so.
+/// A configuration of Zenoh: a file in its own format, or an endpoint to connect to; the station listens on loopback.
+/// There is no multicast discovery, and nothing listens beyond loopback, unless a file configures it.
 fn configuration(words: &str) -> zenoh::Result<zenoh::Config> {
     let is_endpoint = ["tcp/", "udp/"].iter().any(|scheme| words.starts_with(scheme));
     if !is_endpoint {
@@ -94,8 +94,7 @@ fn configuration(words: &str) -> zenoh::Result<zenoh::Config> {
 }
 
 impl Fleet {
-    /// Joins Zenoh as told (see `configuration`) and answers queries out of the files under `root`, until
-    /// the program ends.
+    /// Joins Zenoh (see `configuration`) and answers queries from the files under `root`, until the program ends.
     pub async fn open(words: &str, root: PathBuf) -> zenoh::Result<Self> {
         let session = zenoh::open(configuration(words)?).await?;
         let id = TimestampId::from(session.zid());
@@ -108,7 +107,7 @@ impl Fleet {
                 let Ok(turn) = Arc::clone(&turns).acquire_owned().await else { return };
                 let (held, root) = (Arc::clone(&held), Arc::clone(&root));
                 tokio::task::spawn_blocking(move || {
-                    // Whoever asked may be gone.
+                    // The client may be gone.
                     let _ = Answer { query: &query, id }.give(&held, &root);
                     drop(turn);
                 });
@@ -123,7 +122,7 @@ impl Fleet {
                     .timestamp(stamp(sample.t, id))
                     .congestion_control(CongestionControl::Drop)
                     .priority(Priority::RealTime);
-                // Nobody may be there.
+                // There may be no receiver.
                 let _ = put.await;
             }
         });
@@ -154,7 +153,7 @@ impl Fleet {
             }
         }
         if arrival.live {
-            // A queue that is full: Zenoh's engine is behind, and the next estimate is better than this.
+            // The queue is full: Zenoh's engine is behind, and the next estimate is of more use than this one.
             let _ = self.publish.try_send(sample);
         }
     }
@@ -191,7 +190,7 @@ impl Answer<'_> {
         latest.into_values().try_for_each(|s| self.reply(&s.key, &s.schema_name, s.t, &s.data))
     }
 
-    /// Everything of a span: out of the files, then what is in memory only.
+    /// All records of a span: from the files, then those that are only in memory.
     fn span(&self, span: &TimeRange<SystemTime>, held: &[Sample], root: &Path) -> zenoh::Result<()> {
         let mut given: HashSet<(Arc<str>, u32, u32)> = HashSet::new();
         let in_memory: HashSet<(&str, u32, u32)> =

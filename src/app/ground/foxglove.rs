@@ -1,10 +1,9 @@
-//! What arrives, for Foxglove over its WebSocket: every topic of every payload, with the flight's schemas.
+//! Received records for Foxglove over its WebSocket: every topic of every payload, with the flight's schemas.
 //!
-//! The protocol is `foxglove.sdk.v1` (and its older name `foxglove.websocket.v1`): the server tells its name
-//! and its channels as JSON, a client subscribes, messages come as binary frames. Topics are
-//! `/PAYLOAD/TOPIC`; besides the flight's there are `/PAYLOAD/target/NAME/location`, which a map panel
-//! draws, and `/PAYLOAD/camera/thumbnail`. What is sent again is left out where it also comes live: a
-//! viewer of the present takes the latest message for the newest.
+//! The protocol is `foxglove.sdk.v1` (and its older name `foxglove.websocket.v1`): the server sends its name and its
+//! channels as JSON, a client subscribes, messages are binary frames. Topics are `/PAYLOAD/TOPIC`; in addition to the
+//! flight's topics there are `/PAYLOAD/target/NAME/location`, which a map panel draws, and `/PAYLOAD/camera/thumbnail`.
+//! Back-filled records of live topics are left out: a live viewer takes the latest message for the newest.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -22,7 +21,7 @@ use prost::Message as _;
 use serde_json::{Value, json};
 use tokio::sync::broadcast;
 
-use super::door::Door;
+use super::listener::ClientListener;
 use super::web::{query_token, same};
 use crate::io::link::{Arrival, Class, downlink_class};
 use crate::io::proto::link::Thumbnail;
@@ -36,7 +35,7 @@ const PROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 const MESSAGE_DATA: u8 = 1;
 /// Messages a client may be behind before it misses some.
 const QUEUE: usize = 1_024;
-/// Channels told at most: a payload's topics are not believed without end.
+/// Most channels that are advertised: a payload cannot make an unlimited number of topics.
 const CHANNELS: usize = 4_096;
 /// Subscriptions of one client.
 const SUBSCRIPTIONS: usize = 4_096;
@@ -45,7 +44,7 @@ const CLIENT_LIMIT: usize = 256 << 10;
 
 /// One message of a channel.
 #[derive(Clone)]
-struct Said {
+struct ChannelMessage {
     channel: u64,
     time_ns: u64,
     data: Bytes,
@@ -55,7 +54,7 @@ struct FoxgloveChannel {
     topic: String,
     schema_name: String,
     schema: Arc<[u8]>,
-    last: Option<Said>,
+    last: Option<ChannelMessage>,
 }
 
 impl FoxgloveChannel {
@@ -69,7 +68,7 @@ impl FoxgloveChannel {
 #[derive(Clone)]
 enum News {
     Channel(u64),
-    Said(Said),
+    Message(ChannelMessage),
 }
 
 #[derive(Default)]
@@ -80,7 +79,7 @@ struct Channels {
     schemas: BTreeMap<String, Arc<[u8]>>,
 }
 
-/// What every client is told.
+/// What every client receives.
 #[derive(Clone)]
 pub struct Scope {
     channels: Arc<Mutex<Channels>>,
@@ -106,12 +105,12 @@ impl Scope {
             return;
         }
         let name = format!("/{}{}", arrival.payload, channel.topic);
-        self.say(&name, &channel.schema_name, &channel.schema, arrival.publish_time, &arrival.data);
+        self.publish(&name, &channel.schema_name, &channel.schema, arrival.publish_time, &arrival.data);
         let is_state = channel.schema_name == "windhover.TargetState" && topic::is_target_now(&channel.topic);
         let state = is_state.then(|| wh::TargetState::decode(&arrival.data[..]).ok()).flatten();
         if let Some(fix) = state.as_ref().and_then(location) {
             let target = name.rsplit_once('/').map_or(&*name, |(target, _)| target);
-            self.say(
+            self.publish(
                 &format!("{target}/location"),
                 "foxglove.LocationFix",
                 &[],
@@ -131,23 +130,23 @@ impl Scope {
             format: "jpeg".into(),
         };
         let topic = format!("/{payload}/camera/thumbnail");
-        self.say(&topic, "foxglove.CompressedImage", &[], t, &image.encode_to_vec());
+        self.publish(&topic, "foxglove.CompressedImage", &[], t, &image.encode_to_vec());
     }
 
-    /// A message of a topic; an empty schema is the program's own of this name.
-    fn say(&self, topic: &str, schema_name: &str, schema: &[u8], t: MonoTime, data: &[u8]) {
+    /// A message of a topic; an empty schema stands for the program's own schema of this name.
+    fn publish(&self, topic: &str, schema_name: &str, schema: &[u8], t: MonoTime, data: &[u8]) {
         let mut channels = self.channels();
         let Some(channel) = channels.number(topic, schema_name, schema, &self.news) else { return };
         let time_ns = u64::try_from(t.ns()).unwrap_or(0);
-        let said = Said { channel, time_ns, data: Bytes::copy_from_slice(data) };
+        let said = ChannelMessage { channel, time_ns, data: Bytes::copy_from_slice(data) };
         channels.all[channel as usize - 1].last = Some(said.clone());
-        // Nobody may be looking.
-        let _ = self.news.send(News::Said(said));
+        // There may be no client.
+        let _ = self.news.send(News::Message(said));
     }
 }
 
 impl Channels {
-    /// The number of a topic's channel, made and told where it is new; `None` where there are too many.
+    /// The number of a topic's channel, which is made and advertised where it is new; `None` where there are too many.
     fn number(
         &mut self,
         topic: &str,
@@ -182,12 +181,12 @@ impl Channels {
     }
 }
 
-/// Topics that tell something lasting: the latest counts however it came.
+/// Topics of lasting content: the latest message counts, live or back-filled.
 fn is_kept(topic: &str) -> bool {
     downlink_class(topic) == Some(Class::Event)
 }
 
-/// Where a vehicle is, as a map panel draws it; `None` while it is not known.
+/// A vehicle's place as a map panel draws it; `None` while it is not known.
 fn location(state: &wh::TargetState) -> Option<fox::LocationFix> {
     use fox::location_fix::PositionCovarianceType as Kind;
     // (north, east) in the state, (east, north, up) here.
@@ -206,17 +205,17 @@ fn location(state: &wh::TargetState) -> Option<fox::LocationFix> {
     })
 }
 
-/// What the server needs.
+/// The server's state.
 #[derive(Clone)]
 pub struct Server {
-    /// What is told.
+    /// What clients receive.
     pub scope: Scope,
-    /// What a client must know (`?token=` in its address); without one, only Foxglove and pages of this
-    /// computer may ask.
+    /// The token that a client must send (`?token=` in its address); without one, only Foxglove and pages of this
+    /// computer may connect.
     pub token: Option<Arc<str>>,
 }
 
-/// Whether the page that asks is Foxglove's, or of this computer; programs name none.
+/// Whether the requesting page is Foxglove's or of this computer; programs send no origin.
 fn is_welcome(headers: &HeaderMap) -> bool {
     let Some(origin) = headers.get(header::ORIGIN) else { return true };
     let Some((scheme, rest)) = origin.to_str().ok().and_then(|o| o.split_once("://")) else { return false };
@@ -240,10 +239,10 @@ async fn guard(State(server): State<Server>, request: Request, next: Next) -> Re
 async fn upgrade(State(server): State<Server>, upgrade: WebSocketUpgrade) -> Response {
     let upgrade = upgrade.protocols(PROTOCOLS).max_message_size(CLIENT_LIMIT);
     if upgrade.selected_protocol().is_none() {
-        return (StatusCode::BAD_REQUEST, "ask for foxglove.sdk.v1\n").into_response();
+        return (StatusCode::BAD_REQUEST, "request foxglove.sdk.v1\n").into_response();
     }
     upgrade.on_upgrade(move |socket| async move {
-        // The client is gone, whatever the reason.
+        // The client has left, whatever the reason.
         let _ = Client::new(socket).serve(&server.scope).await;
     })
 }
@@ -277,8 +276,8 @@ impl Client {
                         told = self.advertise(scope, told).await?;
                     }
                     Ok(News::Channel(_)) => {}
-                    Ok(News::Said(said)) => self.send(&said).await?,
-                    // It missed some; channels must not be among them.
+                    Ok(News::Message(said)) => self.send(&said).await?,
+                    // The client missed some messages; channels must not be among them.
                     Err(broadcast::error::RecvError::Lagged(_)) => told = self.advertise(scope, told).await?,
                     Err(broadcast::error::RecvError::Closed) => return Ok(()),
                 },
@@ -291,7 +290,7 @@ impl Client {
         }
     }
 
-    /// Tells of channels after number `told`; gives the last.
+    /// Advertises channels after number `told`; returns the last.
     async fn advertise(&mut self, scope: &Scope, told: u64) -> Result<u64, axum::Error> {
         let fresh: Vec<_> = {
             let channels = scope.channels();
@@ -309,7 +308,7 @@ impl Client {
         self.socket.send(Message::text(message.to_string())).await
     }
 
-    async fn send(&mut self, said: &Said) -> Result<(), axum::Error> {
+    async fn send(&mut self, said: &ChannelMessage) -> Result<(), axum::Error> {
         let wanted: Vec<u32> =
             self.subscriptions.iter().filter(|(_, c)| **c == said.channel).map(|(id, _)| *id).collect();
         for id in wanted {
@@ -318,12 +317,12 @@ impl Client {
         Ok(())
     }
 
-    /// Takes what a client asks for; what is no request of the protocol is passed over. A new subscription
-    /// gets the channel's latest message at once.
+    /// Handles a client's request; a message that is not a request of the protocol is ignored. A new subscription gets
+    /// the channel's latest message at once.
     async fn listen(&mut self, scope: &Scope, text: &str) -> Result<(), axum::Error> {
         for request in requests(text) {
             match request {
-                Asked::Subscribe { id, channel } if self.subscriptions.len() < SUBSCRIPTIONS => {
+                SignalRequest::Subscribe { id, channel } if self.subscriptions.len() < SUBSCRIPTIONS => {
                     self.subscriptions.insert(id, channel);
                     let at = usize::try_from(channel).ok().and_then(|n| n.checked_sub(1));
                     let last = at.and_then(|at| scope.channels().all.get(at)?.last.clone());
@@ -331,8 +330,8 @@ impl Client {
                         self.socket.send(Message::Binary(frame(id, &last))).await?;
                     }
                 }
-                Asked::Subscribe { .. } => {}
-                Asked::Unsubscribe { id } => {
+                SignalRequest::Subscribe { .. } => {}
+                SignalRequest::Unsubscribe { id } => {
                     self.subscriptions.remove(&id);
                 }
             }
@@ -342,23 +341,24 @@ impl Client {
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-enum Asked {
+enum SignalRequest {
     Subscribe { id: u32, channel: u64 },
     Unsubscribe { id: u32 },
 }
 
-fn requests(text: &str) -> Vec<Asked> {
+fn requests(text: &str) -> Vec<SignalRequest> {
     let Ok(message) = serde_json::from_str::<Value>(text) else { return Vec::new() };
     let id = |value: &Value| u32::try_from(value.as_u64()?).ok();
     let list = |name: &str| message[name].as_array().cloned().unwrap_or_default();
     match message["op"].as_str() {
         Some("subscribe") => {
-            let one =
-                |s: &Value| Some(Asked::Subscribe { id: id(&s["id"])?, channel: s["channelId"].as_u64()? });
+            let one = |s: &Value| {
+                Some(SignalRequest::Subscribe { id: id(&s["id"])?, channel: s["channelId"].as_u64()? })
+            };
             list("subscriptions").iter().filter_map(one).collect()
         }
         Some("unsubscribe") => {
-            let one = |s: &Value| Some(Asked::Unsubscribe { id: id(s)? });
+            let one = |s: &Value| Some(SignalRequest::Unsubscribe { id: id(s)? });
             list("subscriptionIds").iter().filter_map(one).collect()
         }
         _ => Vec::new(),
@@ -366,7 +366,7 @@ fn requests(text: &str) -> Vec<Asked> {
 }
 
 /// The binary frame of a message: kind, subscription, time, little-endian, then the message.
-fn frame(subscription: u32, said: &Said) -> Bytes {
+fn frame(subscription: u32, said: &ChannelMessage) -> Bytes {
     let mut bytes = BytesMut::with_capacity(13 + said.data.len());
     bytes.put_u8(MESSAGE_DATA);
     bytes.put_u32_le(subscription);
@@ -381,7 +381,7 @@ pub async fn serve(listener: tokio::net::TcpListener, server: Server) -> std::io
         .route("/", get(upgrade))
         .layer(axum::middleware::from_fn_with_state(server.clone(), guard))
         .with_state(server);
-    axum::serve(Door::new(listener, "foxglove"), router).await
+    axum::serve(ClientListener::new(listener, "foxglove"), router).await
 }
 
 #[cfg(test)]
@@ -420,10 +420,10 @@ mod tests {
     #[test]
     fn requests_are_read_and_everything_else_is_passed_over() {
         let two = r#"{"op":"subscribe","subscriptions":[{"id":7,"channelId":2},{"id":-1,"channelId":2}]}"#;
-        assert_eq!(requests(two), [Asked::Subscribe { id: 7, channel: 2 }]);
+        assert_eq!(requests(two), [SignalRequest::Subscribe { id: 7, channel: 2 }]);
         assert_eq!(
             requests(r#"{"op":"unsubscribe","subscriptionIds":[7,"x"]}"#),
-            [Asked::Unsubscribe { id: 7 }]
+            [SignalRequest::Unsubscribe { id: 7 }]
         );
         for other in ["", "[]", "{", "7", r#"{"op":"subscribe"}"#, r#"{"op":7}"#, r#"{"op":"advertise"}"#] {
             assert_eq!(requests(other), [], "{other}");

@@ -1,16 +1,16 @@
-//! What is of now and what is not: age and status of everything that the station shows.
+//! What is current and what is not: age and status of everything that the station shows.
 
 use tokio::time::Instant;
 
 use crate::io::proto::windhover::TrackStatus;
 use windhover_base::time::{MonoTime, Span, UtcTime};
 
-/// A state older than this is no longer one of a vehicle in sight: it was said to be there, and is now guessed.
+/// The state of a visible vehicle is at most this old; an older one is treated as a prediction.
 pub(super) const FRESH: Span = Span::from_ns(1_500_000_000);
-/// A state older than this is no position of now. It is the last place known, and is called so.
+/// A state older than this is not a current position. It is shown as the last known place.
 pub(super) const CURRENT: Span = Span::from_ns(3_000_000_000);
 
-/// The name of a status as it is at an age.
+/// The name of a status at an age.
 pub(super) fn status_at(status: TrackStatus, age: Span) -> &'static str {
     match status {
         TrackStatus::Lost => "lost",
@@ -22,8 +22,8 @@ pub(super) fn status_at(status: TrackStatus, age: Span) -> &'static str {
     }
 }
 
-/// A payload's clock as it is seen from here: the newest host time that came, and how long ago it came; and what UTC is
-/// beside it, by the payload's receiver.
+/// A payload's clock as seen from here: the newest host time received and when it was received; and the difference to
+/// UTC by the payload's receiver.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct PayloadClock {
     newest: Option<(MonoTime, Instant)>,
@@ -31,30 +31,30 @@ pub(super) struct PayloadClock {
 }
 
 impl PayloadClock {
-    /// Something of this host time came then.
+    /// Something of this host time was received at `came`.
     pub(super) fn heard(&mut self, t: MonoTime, came: Instant) {
         if self.newest.is_none_or(|(newest, _)| t > newest) {
             self.newest = Some((t, came));
         }
     }
 
-    /// The payload told what UTC is.
+    /// The payload reported UTC.
     pub(super) fn told_utc(&mut self, utc_minus_host: Span) {
         self.utc_minus_host = Some(utc_minus_host);
     }
 
-    /// The payload's host time now, as far as it can be known here: what is on its way makes it later.
+    /// The payload's host time now, as far as it can be known here: transmission makes it later.
     pub(super) fn at(&self, now: Instant) -> Option<MonoTime> {
         let (newest, came) = self.newest?;
         Some(newest + Span::from_s(now.saturating_duration_since(came).as_secs_f64()))
     }
 
-    /// How old something of this host time is now.
+    /// The present age of something of this host time.
     pub(super) fn age(&self, t: MonoTime, now: Instant) -> Span {
         self.at(now).map_or(Span::ZERO, |now| (now - t).max(Span::ZERO))
     }
 
-    /// UTC of a host time; `None` where the payload's receiver has not told it.
+    /// UTC of a host time; `None` where the payload's receiver has not reported it.
     pub(super) fn utc(&self, t: MonoTime) -> Option<UtcTime> {
         self.utc_minus_host.map(|ahead| UtcTime::from_unix_ns(t.ns().saturating_add(ahead.ns())))
     }

@@ -1,11 +1,11 @@
-//! What a station's files hold of the past, by payload and topic.
+//! What a station's files contain of the past, by payload and topic.
 
 use std::path::Path;
 
 use super::mirror::{RUN_FILE, messages};
 use windhover_base::time::MonoTime;
 
-/// A record out of the files.
+/// A record from the files.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Past<'a> {
     /// Name of the payload.
@@ -18,7 +18,7 @@ pub struct Past<'a> {
     pub run: u32,
     /// Number in the run.
     pub number: u32,
-    /// When it was true, the payload's host time.
+    /// Its time of validity, in the payload's host time.
     pub t: MonoTime,
     /// The protobuf message.
     pub data: &'a [u8],
@@ -34,8 +34,8 @@ fn subdirectories(dir: &Path) -> Vec<(String, std::path::PathBuf)> {
     found
 }
 
-/// Gives every record of the payloads that `wanted` names, as far as it is on the disk, in the order in which
-/// the files hold them, until `give` says that it is enough.
+/// Passes every record of the payloads that `wanted` selects, as far as it is on the disk, in the order of the files,
+/// to `give`, until that returns that it is enough.
 pub fn read(root: &Path, wanted: impl Fn(&str) -> bool, mut give: impl FnMut(&Past<'_>) -> bool) {
     for (payload, dir) in subdirectories(root).iter().filter(|(name, _)| wanted(name)) {
         for (_, flight) in subdirectories(dir) {

@@ -8,7 +8,7 @@
 //! ```
 
 mod cot;
-mod door;
+mod listener;
 mod feeds;
 #[cfg(feature = "zenoh")]
 pub mod fleet;
@@ -36,21 +36,21 @@ use crate::io::clock::HostClock;
 use crate::io::link::{
     Arrival, FromPayload, LinkError, LinkEvent, StationHandle, StationLink, StationSettings,
 };
-use door::Door;
 use foxglove::Scope;
+use listener::ClientListener;
 use mirror::{Mirror, MirrorError};
 use terminal::Terminal;
 use view::View;
 use web::Web;
 
-/// Messages a page may be behind before it misses some.
+/// Messages that a page may be behind before it misses some.
 const PAGE_QUEUE: usize = 4_096;
-/// Records on their way to the disk; more hold the link back, never lose anything.
+/// Records on their way to the disk; a full queue slows the link down and loses nothing.
 const DISK_QUEUE: usize = 16_384;
-/// What is received reaches the disk this often.
+/// How often received records are synced to the disk.
 const SYNC: Duration = Duration::from_secs(1);
 
-/// What a station is made of.
+/// The settings of a station.
 #[derive(Clone, Debug)]
 pub struct GroundSettings {
     /// The link.
@@ -59,22 +59,22 @@ pub struct GroundSettings {
     pub out: PathBuf,
     /// Where the web page is served.
     pub web: Option<SocketAddr>,
-    /// What visitors of the page, and Foxglove, must know; made up where a port of theirs is not on loopback
-    /// and none is given.
+    /// The token that visitors of the page, and Foxglove, must send; a random one where a port of theirs is not on
+    /// loopback and none is given.
     pub token: Option<String>,
     /// Folder with map tiles.
     pub tiles: Option<PathBuf>,
-    /// Where the station stands, latitude and longitude in degrees: distances on the page count from there.
+    /// Position of the station, latitude and longitude in degrees: distances on the page are measured from there.
     pub position: Option<[f64; 2]>,
     /// Where NMEA is served over TCP.
     pub nmea: Option<SocketAddr>,
     /// Where position reports are sent as Cursor on Target.
     pub cot: Vec<CotTo>,
-    /// With which files, over TLS.
+    /// The TLS files for them.
     pub cot_keys: CotKeys,
     /// Where Foxglove is served over its WebSocket.
     pub foxglove: Option<SocketAddr>,
-    /// How Zenoh is joined: an endpoint, or a file with Zenoh's own configuration.
+    /// How to join Zenoh: an endpoint, or a file with Zenoh's own configuration.
     #[cfg(feature = "zenoh")]
     pub zenoh: Option<String>,
     /// Whether lines are rewritten in place, as on a terminal.
@@ -95,16 +95,16 @@ pub enum GroundError {
     Listen {
         /// The address.
         address: SocketAddr,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// Zenoh.
     #[cfg(feature = "zenoh")]
     #[error("station: cannot join Zenoh as {words}: {source}")]
     Zenoh {
-        /// Endpoint or file as given.
+        /// The endpoint or file as given.
         words: String,
-        /// What Zenoh said.
+        /// Zenoh's error.
         source: zenoh::Error,
     },
     /// Cursor on Target over TLS.
@@ -123,11 +123,11 @@ async fn listen(address: SocketAddr) -> Result<tokio::net::TcpListener, GroundEr
     tokio::net::TcpListener::bind(address).await.map_err(|source| GroundError::Listen { address, source })
 }
 
-/// What visitors must know.
+/// The token that visitors must send, and whether it was given.
 struct Tokens(Option<Arc<str>>, bool);
 
 impl Tokens {
-    /// As given, or made up where a port is not on loopback.
+    /// The given token, or a random one where a port is not on loopback.
     fn of(settings: &GroundSettings) -> std::io::Result<Self> {
         let open = [settings.web, settings.foxglove].into_iter().flatten();
         let given = settings.token.as_deref().map(Arc::from);
@@ -138,7 +138,7 @@ impl Tokens {
         Ok(Self(Some(made.into()), false))
     }
 
-    /// The token asked for at this address: on loopback only one that was given.
+    /// The token required at this address: on loopback only one that was given.
     fn at(&self, address: SocketAddr) -> Option<Arc<str>> {
         self.0.clone().filter(|_| self.1 || !address.ip().is_loopback())
     }
@@ -157,7 +157,7 @@ fn random_token() -> Option<String> {
     Some(bytes.iter().map(|b| format!("{b:02x}")).collect())
 }
 
-/// Runs a station until `stop` says so.
+/// Runs a station until `stop` is set.
 pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Result<(), GroundError> {
     let shown = Terminal::start(settings.terminal);
     let terminal = shown.terminal();
@@ -167,7 +167,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
         Arc::new(move |payload: &str, flight: &str, run: u32| mirror::recall(&root, payload, flight, run));
     let (link, handle, records, events) = StationLink::open(&settings.link, recall)?;
     if settings.link.listen.is_some() {
-        terminal.line(format_args!("payloads may call {}", link.local_addr()?));
+        terminal.line(format_args!("payloads connect to {}", link.local_addr()?));
     }
     let view = Arc::new(Mutex::new(View::default()));
     let live = broadcast::Sender::new(PAGE_QUEUE);
@@ -191,7 +191,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     if let Some(address) = settings.nmea {
         let listener = listen(address).await?;
         terminal.line(format_args!("NMEA at tcp://{}", listener.local_addr()?));
-        tasks.spawn(nmea_port::serve(Door::new(listener, "nmea"), Arc::clone(&view)));
+        tasks.spawn(nmea_port::serve(ClientListener::new(listener, "nmea"), Arc::clone(&view)));
     }
     if !settings.cot.is_empty() {
         let over_tls = settings.cot.iter().any(|to| matches!(to, CotTo::Tls(_)));
@@ -229,7 +229,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     };
     let taken = tokio::spawn(intake(records, ended.subscribe(), outputs));
     let _ = linked.await;
-    // The link ended: what was received is handed on, the disk's channel closes, everything is kept.
+    // The link ended: received records are handed on, the channel to the disk closes, and everything is stored.
     ended.send_replace(true);
     let _ = tokio::time::timeout(Duration::from_secs(5), taken).await;
     let _ = tokio::task::spawn_blocking(move || disk.join()).await;
@@ -247,7 +247,7 @@ struct StationOutputs {
 }
 
 impl StationOutputs {
-    /// To everybody who looks; gives the message for the pages, where it makes one.
+    /// To all viewers; returns the message for the pages, where there is one.
     fn show(&self, arrival: &Arrival) -> Option<Arc<str>> {
         if let Some(scope) = &self.scope {
             scope.record(arrival);
@@ -259,7 +259,7 @@ impl StationOutputs {
         lock(&self.view).record(arrival)
     }
 
-    /// To the disk; `false` where that has ended. A full queue holds the link back.
+    /// To the disk; `false` where its thread has ended. A full queue slows the link down.
     async fn keep(&self, arrival: Arrival) -> bool {
         let mut arrival = arrival;
         loop {
@@ -273,7 +273,7 @@ impl StationOutputs {
     }
 }
 
-/// Hands records to the disk and to those who look, until the link has ended and nothing waits.
+/// Hands records to the disk and to the viewers, until the link has ended and none is waiting.
 async fn intake(
     mut records: mpsc::Receiver<FromPayload>,
     mut ended: watch::Receiver<bool>,
@@ -302,14 +302,14 @@ async fn intake(
             }
         };
         if let Some(news) = news {
-            // Nobody may be looking.
+            // There may be no viewer.
             let _ = outputs.live.send(news);
         }
     }
 }
 
-/// The disk's thread: writes, syncs once a second, acknowledges. A disk that fails is told and tried again, and nothing is
-/// acknowledged or asked for meanwhile; live estimates go on.
+/// The disk's thread: writes, syncs once a second, acknowledges. A failing disk is reported and tried again, and
+/// nothing is acknowledged or requested meanwhile; live estimates continue.
 fn keep(mut mirror: Mirror, records: &std::sync::mpsc::Receiver<Arrival>, handle: &StationHandle) {
     use std::sync::mpsc::RecvTimeoutError;
     let mut due = tokio::time::Instant::now() + SYNC;
@@ -330,26 +330,26 @@ fn keep(mut mirror: Mirror, records: &std::sync::mpsc::Receiver<Arrival>, handle
     }
 }
 
-/// Tells the link and the operator what became of what was given to the disk.
+/// Reports the disk's results to the link and to the operator.
 fn settle(kept: &mirror::Kept, handle: &StationHandle, troubled: &mut bool) {
     kept.done.iter().for_each(|d| handle.stored(&d.payload, d.run, &d.numbers));
     kept.lost.iter().for_each(|d| handle.forget(&d.payload, d.run, &d.numbers));
     for (payload, why) in &kept.excess {
         OperatorEvent::LinkFault.emit(payload, why);
-        handle.dismiss(payload, "more channels and schemas than are kept");
+        handle.dismiss(payload, "more channels and schemas than the limit");
     }
     handle.hold(kept.trouble.is_some());
     match &kept.trouble {
         Some(why) if !*troubled => {
             OperatorEvent::RecordingStopped.emit("disk", format!("{why}; tried again every second"))
         }
-        None if *troubled => OperatorEvent::RecordingResumed.emit("disk", "flights are kept again"),
+        None if *troubled => OperatorEvent::RecordingResumed.emit("disk", "flights are stored again"),
         _ => {}
     }
     *troubled = kept.trouble.is_some();
 }
 
-/// One line a second per payload, and how the link does for the pages.
+/// One line a second for each payload, and the link's state for the pages.
 async fn report(
     handle: StationHandle,
     view: Arc<Mutex<View>>,
@@ -374,7 +374,7 @@ async fn report(
     }
 }
 
-/// What the operator may want to know, in the log and on the pages.
+/// Events for the operator, in the log and on the pages.
 async fn tell(
     mut events: mpsc::Receiver<LinkEvent>,
     view: Arc<Mutex<View>>,
@@ -391,8 +391,10 @@ async fn tell(
                 let more = if *unreported > 0 { format!(" ({unreported} more)") } else { String::new() };
                 (LinkFault, "", format!("{address}: {why}{more}"))
             }
-            LinkEvent::KeysReloaded => (Reloaded, "", "keys read again".into()),
-            LinkEvent::KeysUnusable { why } => (LinkFault, "", format!("keys changed and not usable: {why}")),
+            LinkEvent::KeysReloaded => (Reloaded, "", "keys were read again".into()),
+            LinkEvent::KeysUnusable { why } => {
+                (LinkFault, "", format!("keys changed and cannot be used: {why}"))
+            }
             LinkEvent::Unresolved { address, why } => (LinkFault, "", format!("{address}: {why}")),
         };
         of.emit(peer, &text);

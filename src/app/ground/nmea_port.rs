@@ -1,4 +1,4 @@
-//! The port at which plotters hear of the vehicles: RMC and GGA over TCP.
+//! The port that sends the vehicles to plotters: RMC and GGA over TCP.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -8,23 +8,23 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::sync::broadcast;
 use tokio::time::Instant;
 
-use super::door::{Door, Visitor};
+use super::listener::{ClientListener, ClientStream};
 use super::view::View;
 use super::{feeds, lock};
 
-/// Sentences at most this often.
+/// Shortest time between two sentences.
 const EVERY: Duration = Duration::from_millis(200);
-/// A plotter that takes nothing for this long is let go.
+/// A plotter that accepts nothing for this long is disconnected.
 const PATIENCE: Duration = Duration::from_secs(10);
 /// Sentences that a plotter may be behind before it misses some.
 const QUEUE: usize = 64;
 
 /// Sends sentences of every vehicle whose state is new, and once a second of one that is lost, to every plotter.
-pub(super) async fn serve(mut door: Door, view: Arc<Mutex<View>>) -> std::io::Result<()> {
+pub(super) async fn serve(mut listener: ClientListener, view: Arc<Mutex<View>>) -> std::io::Result<()> {
     let sentences = broadcast::Sender::<Arc<str>>::new(QUEUE);
     let accept = async {
         loop {
-            let (mut plotter, _) = door.next().await;
+            let (mut plotter, _) = listener.next().await;
             plotter.listens();
             tokio::spawn(attend(plotter, sentences.subscribe()));
         }
@@ -41,19 +41,19 @@ async fn produce(sentences: &broadcast::Sender<Arc<str>>, view: &Mutex<View>) {
         tokio::time::sleep(EVERY).await;
         for vehicle in lock(view).vehicles(Instant::now()) {
             let key = (vehicle.payload.clone(), vehicle.target.clone());
-            // A lost one's age in whole seconds tells when it is due again.
+            // A lost vehicle is due again when its age in whole seconds changes.
             let lost = (!vehicle.is_current()).then(|| vehicle.age.s() as u64);
             let now = (vehicle.state.timestamp, lost);
             if told.insert(key, now) != Some(now) {
-                // Nobody may listen.
+                // There may be no receiver.
                 let _ = sentences.send(feeds::nmea(&vehicle).into());
             }
         }
     }
 }
 
-/// Attends to one plotter until it goes, or takes nothing any more. What it says is not looked at.
-async fn attend(mut plotter: Visitor, mut news: broadcast::Receiver<Arc<str>>) {
+/// Serves one plotter until it leaves or stops reading. What it sends is ignored.
+async fn attend(mut plotter: ClientStream, mut news: broadcast::Receiver<Arc<str>>) {
     let mut ignored = [0; 256];
     loop {
         tokio::select! {

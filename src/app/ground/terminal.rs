@@ -1,5 +1,5 @@
-//! The station's terminal: lines that stay, and those of the payloads, which a terminal shows in place of the ones
-//! before. It has a queue of its own: one that is stopped, or a pipe that nobody reads, holds nothing up.
+//! The station's terminal: lines that stay, and status lines of the payloads, which a terminal rewrites in place. It
+//! has its own queue: a stopped terminal, or a pipe that nobody reads, blocks nothing.
 
 use std::fmt::Display;
 use std::io::{self, Write};
@@ -9,16 +9,16 @@ use crate::io::clock::HostClock;
 use crate::text::one_line;
 use windhover_base::time::Span;
 
-/// Begins a message whose lines stand for those of the last that began so.
+/// First byte of a status message, which replaces the previous status.
 const STATUS: u8 = b'\r';
-/// Longest that is waited at the end for what waits to be shown.
+/// Longest wait at the end for lines that are still queued.
 const ENDING: Span = Span::from_ns(400_000_000);
 
-/// Standard output. Copies are the same.
+/// Standard output. Copies share the same queue.
 #[derive(Clone)]
 pub(super) struct Terminal(Queue);
 
-/// Ends the terminal when dropped: what waits is shown first, unless the terminal is stuck.
+/// Ends the terminal when dropped: queued lines are shown first, unless the terminal is stuck.
 pub(super) struct TerminalEnd {
     terminal: Terminal,
     /// Dropped after the wait.
@@ -26,18 +26,18 @@ pub(super) struct TerminalEnd {
 }
 
 impl Terminal {
-    /// Begins; `rewrites` where lines are rewritten in place, as on a terminal.
+    /// Starts the terminal; `rewrites` where lines are rewritten in place.
     pub(super) fn start(rewrites: bool) -> TerminalEnd {
         let (queue, end) = queue("stdout", Screen { out: Stream::Out, rewrites, shown: 0 });
         TerminalEnd { terminal: Self(queue), _end: end }
     }
 
-    /// Shows a line that stays. Nothing in it steers the terminal, whoever said it.
+    /// Shows a line that stays. Control sequences in it are escaped, whatever its source.
     pub(super) fn line(&self, text: impl Display) {
         self.0.put(format!("{}\n", one_line(&text.to_string())).as_bytes());
     }
 
-    /// Shows these lines in the same way, a line for each payload, in place of the last of their kind.
+    /// Shows the status, one line for each payload, in place of the previous status.
     pub(super) fn status(&self, lines: &[String]) {
         let mut message = vec![STATUS];
         for line in lines {
@@ -49,7 +49,7 @@ impl Terminal {
 }
 
 impl TerminalEnd {
-    /// The terminal, for those who show something.
+    /// The terminal, for code that shows something.
     pub(super) fn terminal(&self) -> &Terminal {
         &self.terminal
     }
@@ -62,7 +62,7 @@ impl Drop for TerminalEnd {
     }
 }
 
-/// The far end of the queue: what was shown last is known here, whatever was dropped before.
+/// The far end of the queue: it knows what was shown last, whatever was dropped before.
 struct Screen<W> {
     out: W,
     rewrites: bool,

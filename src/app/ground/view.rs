@@ -1,4 +1,4 @@
-//! What the station knows of each payload, and the messages its web page lives on.
+//! The station's state of each payload, and the messages for its web page.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -7,7 +7,7 @@ use prost::Message as _;
 use serde_json::{Value, json};
 use tokio::time::Instant;
 
-use crate::app::openmetrics::{self, Told};
+use crate::app::openmetrics::{self, PayloadMetrics};
 use crate::io::link::{Arrival, PayloadStatus};
 use crate::io::proto::{foxglove, host_time, link::Thumbnail, windhover as wh};
 use crate::io::records::topic;
@@ -17,14 +17,14 @@ use windhover_base::time::{MonoTime, NS_PER_S, Span, UtcTime};
 
 use super::freshness::{CURRENT, PayloadClock, status_at};
 
-/// Estimates kept for pages opened later: ten minutes at 15 Hz.
+/// Estimates kept for pages that are opened later: ten minutes at 15 Hz.
 const TRAIL: usize = 9_000;
-/// Targets of a payload that are shown; the flight keeps all.
+/// Targets of a payload that are shown; the recorded flight has all of them.
 const TARGETS: usize = 64;
-/// Notices kept for pages opened later.
+/// Notices kept for pages that are opened later.
 const NOTICES: usize = 60;
 
-/// What the payload's receiver says of its fix.
+/// What the payload's receiver reports about its fix.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Receiver {
     /// 0 none, 2 two-dimensional, 3 three-dimensional.
@@ -37,7 +37,7 @@ pub struct Receiver {
     pub geoid_m: Option<f64>,
 }
 
-/// A vehicle as last known.
+/// The last known state of a vehicle.
 #[derive(Clone, Debug)]
 pub struct Vehicle {
     /// Name of the payload.
@@ -46,35 +46,36 @@ pub struct Vehicle {
     pub target: String,
     /// Its latest known state.
     pub state: wh::TargetState,
-    /// What the payload holds of it now.
+    /// Its status at present.
     pub status: &'static str,
-    /// How old that state is.
+    /// Age of that state.
     pub age: Span,
-    /// UTC of that state, where the payload's receiver told it.
+    /// UTC of that state, where the payload's receiver reported UTC.
     pub utc: Option<UtcTime>,
-    /// What the payload's receiver says now; `None` where it has not said anything for seconds.
+    /// The present report of the payload's receiver; `None` where it has reported nothing for seconds.
     pub receiver: Option<Receiver>,
     /// Latitude and longitude over time, oldest first.
     pub trail: Vec<(MonoTime, f64, f64)>,
 }
 
 impl Vehicle {
-    /// Whether its state is a position of now; else it is the last place known, and says nothing of where it is.
+    /// Whether its state is a current position; else it is the last known place and does not state where the vehicle
+    /// is.
     pub fn is_current(&self) -> bool {
         self.status != "lost"
     }
 }
 
-/// A helicopter as last known.
+/// The last known state of a helicopter.
 #[derive(Clone, Debug)]
 pub struct Helicopter {
     /// Name of the payload.
     pub payload: String,
     /// Its own state.
     pub state: wh::Ownship,
-    /// How old that state is.
+    /// Age of that state.
     pub age: Span,
-    /// UTC of that state, where the payload's receiver told it.
+    /// UTC of that state, where the payload's receiver reported UTC.
     pub utc: Option<UtcTime>,
 }
 
@@ -104,11 +105,11 @@ struct Payload {
     kbps: f64,
 }
 
-/// Everything pages are told, by payload.
+/// Everything that pages show, by payload.
 #[derive(Default)]
 pub struct View {
     payloads: BTreeMap<String, Payload>,
-    /// How the link did when that was last told.
+    /// The link's state when it was last sent.
     link: Option<Arc<str>>,
 }
 
@@ -130,14 +131,14 @@ fn covariance(p: &[f64]) -> Value {
 }
 
 impl View {
-    /// Takes a record; gives the message for the pages, where it makes one.
+    /// Takes a record; returns the message for the pages, where there is one.
     pub fn record(&mut self, arrival: &Arrival) -> Option<Arc<str>> {
         let name = arrival.payload.to_string();
         let payload = self.payloads.entry(name.clone()).or_default();
         payload.clock.heard(arrival.publish_time, arrival.arrived);
         let data = &arrival.data[..];
         match arrival.channel.schema_name.as_str() {
-            // The smoother's and the paper's states have schemas of the same name and other topics.
+            // The smoother's and the paper's states have schemas of the same name on other topics.
             "windhover.TargetState" if topic::is_target_now(&arrival.channel.topic) => {
                 let state = wh::TargetState::decode(data).ok().filter(wh::TargetState::is_sound)?;
                 payload.estimate(&name, state, arrival.live)
@@ -157,7 +158,7 @@ impl View {
         }
     }
 
-    /// Takes a thumbnail; gives the message for the pages.
+    /// Takes a thumbnail; returns the message for the pages.
     pub fn thumbnail(&mut self, name: &str, thumbnail: Thumbnail) -> Arc<str> {
         let found = wh::Detections::decode(&thumbnail.detections[..]).unwrap_or_default();
         let is_sound = |m: &&wh::Marker| {
@@ -188,7 +189,7 @@ impl View {
         self.payloads.get(payload)?.thumbnail.as_ref().map(|(_, jpeg)| Arc::clone(jpeg))
     }
 
-    /// Takes how the link does; gives the message for the pages. `passed_s` is the time since the last call.
+    /// Takes the link's state; returns the message for the pages. `passed_s` is the time since the last call.
     pub fn link(&mut self, status: &[PayloadStatus], passed_s: f64, now: Instant) -> Arc<str> {
         let payloads: Vec<Value> = status
             .iter()
@@ -213,12 +214,12 @@ impl View {
         text
     }
 
-    /// Takes something the station itself has to tell about a payload.
+    /// Takes a notice of the station itself about a payload.
     pub fn remark(&mut self, name: &str, t: MonoTime, level: u32, text: &str) -> Arc<str> {
         self.payloads.entry(name.to_owned()).or_default().remark(name, t, level, text)
     }
 
-    /// Everything a page that has just been opened needs.
+    /// Everything that a newly opened page needs.
     pub fn history(&self) -> Vec<Arc<str>> {
         let mut all = Vec::new();
         for payload in self.payloads.values() {
@@ -231,12 +232,12 @@ impl View {
             all.extend(payload.notices.iter().cloned());
             all.extend(payload.thumbnail.iter().map(|(text, _)| Arc::clone(text)));
         }
-        // Last: it tells how old all the rest is.
+        // Last: it gives the age of everything before it.
         all.extend(self.link.clone());
         all
     }
 
-    /// Every vehicle whose position was ever known, as it is now.
+    /// Every vehicle that ever had a known position, in its present state.
     pub fn vehicles(&self, now: Instant) -> Vec<Vehicle> {
         let of = |(payload, p): (&String, &Payload)| -> Vec<Vehicle> {
             let receiver = p.receiver.filter(|(t, _)| p.clock.age(*t, now) <= CURRENT).map(|(_, said)| said);
@@ -260,7 +261,7 @@ impl View {
         self.payloads.iter().flat_map(of).collect()
     }
 
-    /// Every helicopter whose place is one of now.
+    /// Every helicopter with a current position.
     pub fn helicopters(&self, now: Instant) -> Vec<Helicopter> {
         let of = |(name, p): (&String, &Payload)| {
             let state = p.own_state.clone()?;
@@ -276,12 +277,12 @@ impl View {
         let told = self.payloads.iter().filter_map(|(payload, p)| {
             let health = p.health_told.as_ref()?;
             let age_s = Some(p.clock.age(host_time(health.timestamp.as_ref()), now).s());
-            Some(Told { payload, health, age_s, link: p.linked })
+            Some(PayloadMetrics { payload, health, age_s, link: p.linked })
         });
         openmetrics::render(&told.collect::<Vec<_>>())
     }
 
-    /// One line a payload, for a terminal.
+    /// One line for each payload, for a terminal.
     pub fn line(&self, status: &PayloadStatus, now: Instant) -> String {
         let payload = self.payloads.get(&status.name);
         let link = match (status.connected, status.silent.as_secs_f64()) {
@@ -313,7 +314,7 @@ impl View {
         let (live_hz, kbps) = payload.map_or((0.0, 0.0), |p| (p.live_hz, p.kbps));
         let progress = status.progress;
         line += &format!(
-            " | {live_hz:.0}/s live, {kbps:.0} kbit/s, rtt {:.1} ms | {} kept, {} missing",
+            " | {live_hz:.0}/s live, {kbps:.0} kbit/s, rtt {:.1} ms | {} stored, {} missing",
             status.rtt_ms, progress.received, progress.overdue
         );
         if progress.gone > 0 {
@@ -389,7 +390,7 @@ impl Payload {
             .sources
             .iter()
             .map(|s| {
-                // What is no number is nothing from it.
+                // Values that are not finite are shown as zero.
                 let (rate_hz, age_ms) = (finite(s.rate_hz).unwrap_or(0.0), finite(s.age_ms).unwrap_or(-1.0));
                 json!({"name": s.name, "rate_hz": rate_hz, "age_ms": age_ms, "refused": s.refused,
                     "dropped": s.dropped})
@@ -519,14 +520,14 @@ mod tests {
         let line = view.line(&status(), came);
         assert!(line.contains("ugv tracking N 0.00"), "{line}");
         assert!(view.vehicles(came)[0].is_current());
-        // When nothing comes any more, whatever the payload's clock says.
+        // When nothing is received any more, whatever the payload's clock shows.
         let now = came + Duration::from_secs(35);
         let line = view.line(&status(), now);
         assert!(line.contains("ugv lost, last known 35 s ago"), "{line}");
         assert!(!line.contains("N 0.00"), "{line}");
         let vehicle = &view.vehicles(now)[0];
         assert_eq!((vehicle.status, vehicle.is_current(), vehicle.age.s().round()), ("lost", false, 35.0));
-        // A page that is opened then is told how old all of it is.
+        // A page that is opened then gets the age of everything.
         let told: Value = serde_json::from_str(&view.link(&[status()], 1.0, now)).expect("JSON");
         assert_eq!(told["payloads"][0]["now"].as_f64().map(f64::round), Some(135_000.0));
         assert_eq!(view.history().last().map(|text| text.contains("\"k\":\"link\"")), Some(true));

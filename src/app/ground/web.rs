@@ -1,8 +1,8 @@
 //! The station's web server: the page, its live messages, GeoJSON, KML, thumbnails, map tiles.
 //!
-//! On loopback anybody on this computer may look; elsewhere a token is asked for, once, and then kept in a
-//! cookie. Names other than addresses and `localhost` are refused on loopback, so that no page of the
-//! Internet can point its own name here.
+//! On loopback every user of this computer has access; elsewhere a token is required once and then kept in a cookie. On
+//! loopback, host names other than addresses and `localhost` are refused, so that an Internet page cannot point its own
+//! name here (DNS rebinding).
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -18,8 +18,8 @@ use axum::routing::get;
 use tokio::sync::broadcast;
 use tokio::time::Instant;
 
-use super::door::Door;
 use super::feeds;
+use super::listener::ClientListener;
 use super::view::View;
 use crate::app::openmetrics;
 
@@ -30,22 +30,22 @@ const ALARM: &str = include_str!("page/alarm.js");
 const APP: &str = include_str!("page/app.js");
 /// Name of the cookie that holds the token.
 const COOKIE: &str = "windhover";
-/// Nothing is loaded from elsewhere, and nobody may frame the page.
+/// Nothing is loaded from other sites, and no other page may frame this one.
 const POLICY: &str = "default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-inline'; \
                       frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
 
-/// What the server needs.
+/// The server's state.
 #[derive(Clone)]
 pub struct Web {
-    /// What is known.
+    /// What is shown.
     pub view: Arc<Mutex<View>>,
     /// Messages for the pages.
     pub live: broadcast::Sender<Arc<str>>,
     /// Folder with map tiles `Z/X/Y.png`.
     pub tiles: Option<PathBuf>,
-    /// Where the station stands, latitude and longitude in degrees.
+    /// Position of the station, latitude and longitude in degrees.
     pub position: Option<[f64; 2]>,
-    /// What a visitor must know; `None` on loopback.
+    /// The token that a visitor must send; `None` on loopback.
     pub token: Option<Arc<str>>,
 }
 
@@ -78,7 +78,7 @@ fn text(kind: &'static str, body: impl Into<Body>) -> Response {
     ([(header::CONTENT_TYPE, kind), (header::CACHE_CONTROL, "no-cache")], body.into()).into_response()
 }
 
-/// Equal, compared in a time that tells nothing of where they differ.
+/// Compares in a time that does not depend on where they differ.
 pub(super) fn same(a: &str, b: &str) -> bool {
     a.len() == b.len() && a.bytes().zip(b.bytes()).fold(0, |sum, (a, b)| sum | (a ^ b)) == 0
 }
@@ -94,7 +94,7 @@ pub(super) fn query_token(request: &Request) -> Option<String> {
     query.split('&').find_map(|pair| Some(pair.strip_prefix("token=")?.to_owned()))
 }
 
-/// Whether a `Host` header names this computer by address or as localhost.
+/// Whether a `Host` header names this computer, by address or as localhost.
 fn is_local_name(host: &str) -> bool {
     let name = match host.strip_prefix('[') {
         Some(rest) => rest.split(']').next().unwrap_or_default(),
@@ -103,7 +103,7 @@ fn is_local_name(host: &str) -> bool {
     name == "localhost" || name.parse::<std::net::IpAddr>().is_ok_and(|ip| ip.is_loopback())
 }
 
-/// Whether a page of another origin asks.
+/// Whether a page of another origin sent the request.
 fn is_foreign(headers: &HeaderMap) -> bool {
     let text = |name| headers.get(name).and_then(|value: &HeaderValue| value.to_str().ok());
     match (text(header::ORIGIN), text(header::HOST)) {
@@ -117,7 +117,7 @@ fn is_foreign(headers: &HeaderMap) -> bool {
 
 async fn guard(State(web): State<Web>, request: Request, next: Next) -> Response {
     if is_foreign(request.headers()) {
-        return (StatusCode::FORBIDDEN, "another site asks\n").into_response();
+        return (StatusCode::FORBIDDEN, "request of another site refused\n").into_response();
     }
     let mut set_cookie = None;
     match &web.token {
@@ -131,7 +131,7 @@ async fn guard(State(web): State<Web>, request: Request, next: Next) -> Response
             let asked = query_token(&request);
             let given = asked.as_deref().is_some_and(|given| same(given, token));
             if !given && !cookie(request.headers()).is_some_and(|given| same(given, token)) {
-                let words = "this station asks for its token: open /?token=TOKEN as it was printed\n";
+                let words = "this station requires its token: open /?token=TOKEN as it was printed\n";
                 return (StatusCode::UNAUTHORIZED, words).into_response();
             }
             if given {
@@ -156,7 +156,7 @@ async fn live(State(web): State<Web>, upgrade: WebSocketUpgrade) -> Response {
     upgrade.max_message_size(4 << 10).on_upgrade(move |socket| feed(web, socket))
 }
 
-/// Sends what is known, then everything new. A page that cannot keep up misses the oldest.
+/// Sends the known state, then all changes. A page that cannot keep up misses the oldest.
 async fn feed(web: Web, mut socket: WebSocket) {
     let mut news = web.live.subscribe();
     let tiles = web.tiles.as_deref().map(deepest_tiles);
@@ -178,7 +178,7 @@ async fn feed(web: Web, mut socket: WebSocket) {
                 Err(broadcast::error::RecvError::Lagged(_)) => {}
                 Err(broadcast::error::RecvError::Closed) => return,
             },
-            // Pages have nothing to say; their end shows here.
+            // Pages send nothing; their end shows here.
             said = socket.recv() => if !matches!(said, Some(Ok(_))) { return },
         }
     }
@@ -211,7 +211,7 @@ struct Token {
 
 async fn network_link(Query(query): Query<Token>, headers: HeaderMap) -> Response {
     let host = headers.get(header::HOST).and_then(|h| h.to_str().ok()).unwrap_or("localhost");
-    // A viewer keeps no cookies: the token it came with goes into its link.
+    // A KML viewer keeps no cookies: the token of its request goes into its link.
     let token = query.token.map_or_else(String::new, |token| format!("?token={token}"));
     let url = format!("http://{host}/vehicles.kml{token}");
     text("application/vnd.google-earth.kml+xml", feeds::network_link(&url))
@@ -230,7 +230,7 @@ async fn tile(State(web): State<Web>, Path((z, x, y)): Path<(u32, u32, u32)>) ->
     }
 }
 
-/// The deepest zoom of a folder of tiles.
+/// The deepest zoom level in a folder of tiles.
 fn deepest_tiles(dir: &std::path::Path) -> u32 {
     let entries = std::fs::read_dir(dir).into_iter().flatten().flatten();
     entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok()).max().unwrap_or(0)
@@ -238,7 +238,7 @@ fn deepest_tiles(dir: &std::path::Path) -> u32 {
 
 /// Serves until the program ends.
 pub async fn serve(listener: tokio::net::TcpListener, web: Web) -> std::io::Result<()> {
-    axum::serve(Door::new(listener, "page"), web.router()).await
+    axum::serve(ClientListener::new(listener, "page"), web.router()).await
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! The helicopter's autopilot in simulation: what it says over MAVLink, and what it hears.
+//! The helicopter's autopilot in simulation: what it sends over MAVLink, and what it receives.
 
 use mavlink::dialects::development::*;
 use nalgebra::{UnitQuaternion, Vector3};
@@ -11,27 +11,27 @@ use windhover_simulate::{FollowTarget, World};
 
 /// System and component id.
 const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
-/// It was started so long before the flight.
+/// How long before the flight it was started.
 const STARTED_BEFORE: Span = Span::from_ns(100_000_000_000);
 /// Standard gravity, m/s².
 const GRAVITY: f64 = 9.806_65;
 
-/// An autopilot on board of a flown world.
+/// An autopilot on board of a simulated flight.
 #[derive(Clone, Debug)]
 pub struct SimulatedAutopilot {
-    /// What its receiver errs by, north, east, down, metres.
+    /// Error of its receiver, north, east, down, metres.
     receiver_m: Vector3<f64>,
     sequence: u8,
     steps: u64,
 }
 
 impl SimulatedAutopilot {
-    /// One whose receiver errs by so much.
+    /// An autopilot whose receiver has this error.
     pub fn new(receiver_m: Vector3<f64>) -> Self {
         Self { receiver_m, sequence: 0, steps: 0 }
     }
 
-    /// Where it takes the helicopter to be, north, east, down of the world's origin, metres; velocity, m/s.
+    /// The helicopter's position in its estimate, north, east, down of the world's origin, metres; velocity, m/s.
     pub fn position(&self, world: &World, t: MonoTime) -> (Vector3<f64>, Vector3<f64>) {
         let own = world.ownship(t);
         (own.position_ned_m + self.receiver_m, own.velocity_ned_mps)
@@ -42,7 +42,7 @@ impl SimulatedAutopilot {
         (t - world.time(0.0)) + STARTED_BEFORE
     }
 
-    /// What it says in a step of [`World::STEP`] that ends at `t`: attitude at 25 Hz, rates and forces at 50 Hz, its
+    /// What it sends in a step of [`World::STEP`] that ends at `t`: attitude at 25 Hz, rates and forces at 50 Hz, its
     /// position at 10 Hz, its receiver's fixes at 5 Hz.
     pub fn says(&mut self, world: &World, t: MonoTime, out: &mut Vec<u8>) {
         let step = self.steps;
@@ -110,7 +110,7 @@ impl SimulatedAutopilot {
         })
     }
 
-    /// The fix that was true the configured latency ago: `time_usec` is when it came.
+    /// The fix that was valid the configured latency ago: `time_usec` is its arrival.
     fn fix(&self, world: &World, t: MonoTime) -> MavMessage {
         let then = t - Span::from_ms(world.rig().gps.latency_ms);
         let (position, velocity) = self.position(world, then);
@@ -134,7 +134,7 @@ impl SimulatedAutopilot {
         })
     }
 
-    /// Answers a question for the time.
+    /// Answers a time synchronisation request.
     pub fn hears(&mut self, world: &World, frame: &MavlinkFrame, t: MonoTime, out: &mut Vec<u8>) {
         if let MavMessage::TIMESYNC(sync) = &frame.message
             && sync.tc1 == 0
@@ -163,8 +163,8 @@ fn heartbeat() -> MavMessage {
     })
 }
 
-/// What a frame tells of the vehicle of this system, in north, east, down of `frame` whose origin is `origin_msl_m`
-/// above mean sea level.
+/// The vehicle's state in a frame of this system, in north, east, down of `frame` whose origin is `origin_msl_m` above
+/// mean sea level.
 pub fn follow_target(
     bytes: &[u8],
     system: u8,

@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 
 use super::autopilot::{SimulatedAutopilot, follow_target};
 use crate::config::Config;
-use crate::io::mavlink::Teller;
+use crate::io::mavlink::MavlinkEncoder;
 use crate::io::mavlink::companion::Companion;
 use crate::pipeline::{Pipeline, PipelineSettings};
 use windhover_base::msg::{Event, EventBody, Source};
@@ -17,25 +17,25 @@ use windhover_simulate::{
     VehicleTruth, World,
 };
 
-/// What the autopilot says is heard so much later.
+/// Delay of the autopilot's messages.
 const LINK: Span = Span::from_ns(4_000_000);
 
-/// What a flight is flown with.
+/// The settings of a flight.
 #[derive(Clone, Debug, Default)]
 pub struct LoopSettings {
-    /// How much later than usual frames and compass are heard.
+    /// Additional delay of frames and compass.
     pub lateness: Lateness,
-    /// What the autopilot's receiver errs by, north, east, down, metres.
+    /// Error of the autopilot's receiver, north, east, down, metres.
     pub receiver_m: Vector3<f64>,
-    /// The follower is told the truth instead.
+    /// The follower gets the truth instead of the estimates.
     pub truth: bool,
-    /// From this time on no frame comes, seconds.
+    /// No frame comes after this time, seconds.
     pub camera_dies_s: Option<f64>,
-    /// Threads that draw.
+    /// Threads that render.
     pub threads: usize,
 }
 
-/// How things stand after a step.
+/// The situation after a step.
 #[derive(Clone, Copy, Debug)]
 pub struct Moment {
     /// Seconds into the flight.
@@ -44,15 +44,15 @@ pub struct Moment {
     pub own: OwnshipTruth,
     /// The vehicle.
     pub vehicle: VehicleTruth,
-    /// What the follower was told in this step, if anything, north, east, down of the world's origin.
+    /// The message that the follower received in this step, if any, north, east, down of the world's origin.
     pub told: Option<FollowTarget>,
 }
 
-/// A flight whose helicopter follows what is told of the vehicle.
+/// A flight whose helicopter follows the estimates of the vehicle.
 pub struct ClosedLoop {
     flight: ClosedFlight,
     pipeline: Pipeline,
-    teller: Teller,
+    encoder: MavlinkEncoder,
     companion: Companion,
     autopilot: SimulatedAutopilot,
     follower: Follower,
@@ -62,12 +62,12 @@ pub struct ClosedLoop {
     next_tell: MonoTime,
     next_second: MonoTime,
     seq: u64,
-    /// The autopilot's bytes on their way.
+    /// The autopilot's bytes in transit.
     coming: Vec<(MonoTime, Vec<u8>)>,
 }
 
 impl ClosedLoop {
-    /// A flight of this scenario with the configuration that `configure` makes of the scenario's own.
+    /// A flight of this scenario with the configuration that `configure` makes from the scenario's own.
     pub fn new(
         scenario: Scenario,
         seed: u64,
@@ -80,14 +80,20 @@ impl ClosedLoop {
         let world = Arc::new(World::flown(scenario, seed));
         let begin = world.time(0.0);
         Self {
-            // Who is told the truth needs no pictures.
+            // A follower that gets the truth needs no pictures.
             flight: ClosedFlight::new(
                 world,
                 settings.lateness,
                 if settings.truth { 0 } else { settings.threads.max(1) },
             ),
             pipeline: Pipeline::new(PipelineSettings::from(&config)),
-            teller: Teller::new(&config.mavlink, &config.target, &config.ground, &config.camera, None),
+            encoder: MavlinkEncoder::new(
+                &config.mavlink,
+                &config.target,
+                &config.ground,
+                &config.camera,
+                None,
+            ),
             companion: Companion::new(None, true),
             autopilot: SimulatedAutopilot::new(settings.receiver_m),
             follower: Follower::new(tuning),
@@ -101,12 +107,12 @@ impl ClosedLoop {
         }
     }
 
-    /// The world flown through.
+    /// The simulated world.
     pub fn world(&self) -> &Arc<World> {
         self.flight.world()
     }
 
-    /// Goes on by [`World::STEP`].
+    /// Advances by [`World::STEP`].
     pub fn step(&mut self) -> Result<Moment, FlightError> {
         let world = Arc::clone(self.flight.world());
         let now = self.flight.now();
@@ -128,7 +134,7 @@ impl ClosedLoop {
         Ok(Moment { t_s, own: world.ownship(t), vehicle: world.vehicle(0, t), told })
     }
 
-    /// What the autopilot says joins what is heard, where it is heard.
+    /// Merges the autopilot's messages into the events, at their arrival.
     fn hear_autopilot(&mut self, world: &World, t: MonoTime, events: &mut Vec<Event>) {
         let mut bytes = Vec::new();
         self.autopilot.says(world, t, &mut bytes);
@@ -158,7 +164,7 @@ impl ClosedLoop {
         events.sort_by_key(|event| event.t_recv);
     }
 
-    /// Through the pipeline, and out as MAVLink.
+    /// Runs events through the pipeline and sends the outputs as MAVLink.
     fn tell(&mut self, world: &World, t: MonoTime, events: &mut Vec<Event>) -> Option<FollowTarget> {
         let dead = self.settings.camera_dies_s.is_some_and(|from| world.seconds(t) >= from);
         events.retain(|event| !(dead && matches!(event.body, EventBody::Frame(_))));
@@ -171,24 +177,24 @@ impl ClosedLoop {
             self.seq += 1;
             self.pipeline.handle(event, &mut outputs);
         }
-        outputs.iter().for_each(|output| self.teller.output(&output.output));
+        outputs.iter().for_each(|output| self.encoder.output(&output.output));
         if t < self.next_tell {
             return None;
         }
-        self.next_tell += self.teller.every();
+        self.next_tell += self.encoder.every();
         let mut frames = Vec::new();
-        self.teller.tell(t, &mut frames);
+        self.encoder.tell(t, &mut frames);
         let scenario = world.scenario();
         let origin_msl_m = scenario.origin.height_m - scenario.geoid_m;
         frames.iter().find_map(|frame| follow_target(frame, self.system_id, world.frame(), origin_msl_m))
     }
 
-    /// The truth, as often and as exactly; where its receiver takes it to be.
+    /// Sends the truth at the same rate and resolution, relative to the place that the receiver reports.
     fn tell_truth(&mut self, world: &World, t: MonoTime) -> Option<FollowTarget> {
         if t < self.next_tell {
             return None;
         }
-        self.next_tell += self.teller.every();
+        self.next_tell += self.encoder.every();
         let velocity = |t: MonoTime| {
             let vehicle = world.vehicle(0, t);
             let (s, c) = vehicle.heading_rad.sin_cos();

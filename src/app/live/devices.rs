@@ -20,7 +20,7 @@ use windhover_base::time::Span;
 use windhover_simulate::render::Renderer;
 use windhover_simulate::{FrameTruth, World};
 
-/// A daemon that takes no frame for so long is gone.
+/// A daemon that takes no frame for this time is gone.
 const TAKES_BY: Duration = Duration::from_millis(500);
 
 /// A serial line whose near end a daemon opens by the name of a link.
@@ -28,7 +28,7 @@ const TAKES_BY: Duration = Duration::from_millis(500);
 pub struct PtyLine {
     link: PathBuf,
     far: File,
-    /// The near end is kept open too: what is written while no daemon has it is no error.
+    /// The near end stays open here too: writing while no daemon has it open is then no error.
     _near: File,
 }
 
@@ -50,12 +50,12 @@ impl PtyLine {
         Ok(Self { link, far: File::from(far), _near: near })
     }
 
-    /// Sends bytes; those for a line that nobody reads are lost, as on a real one.
+    /// Sends bytes; bytes for a line that nobody reads are lost, as on a real one.
     pub fn send(&mut self, bytes: &[u8]) {
         let _ = self.far.write_all(bytes);
     }
 
-    /// What came from the near end.
+    /// Bytes from the near end.
     pub fn receive(&mut self) -> Vec<u8> {
         let (mut all, mut buffer) = (Vec::new(), [0; 4096]);
         while let Ok(count @ 1..) = self.far.read(&mut buffer) {
@@ -71,7 +71,7 @@ impl Drop for PtyLine {
     }
 }
 
-/// Frames for whoever connects to a socket.
+/// Frames for the client of a socket.
 #[derive(Debug)]
 pub struct FrameSocket {
     path: PathBuf,
@@ -90,7 +90,7 @@ impl FrameSocket {
         Ok(Self { path: path.to_owned(), listener, daemon: None, less_monotonic })
     }
 
-    /// Sends a grey frame to who is connected.
+    /// Sends a grey frame to the connected client.
     pub fn send(&mut self, frame: &FramePayload) {
         match self.listener.accept() {
             Ok((daemon, _)) => {
@@ -111,17 +111,18 @@ impl FrameSocket {
     }
 }
 
-/// Frames are drawn and sent by a thread of their own: lines keep their pace however long a frame takes.
+/// Renders and sends frames in its own thread: lines keep their timing however long a frame takes.
 #[derive(Debug)]
-pub struct Darkroom {
+pub struct FrameRenderer {
     exposed: SyncSender<FrameTruth>,
 }
 
-/// Frames that wait to be drawn; one that finds as many before it is lost, as by a driver that is not asked in time.
+/// Frames that wait to be rendered; a frame that finds this many before it is lost, as by a driver that is read too
+/// late.
 const WAITING: usize = 2;
 
-impl Darkroom {
-    /// Draws frames of a world for whoever is at a socket.
+impl FrameRenderer {
+    /// Renders frames of a world for the client of a socket.
     pub fn open(
         world: Arc<World>,
         mut socket: FrameSocket,

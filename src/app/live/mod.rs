@@ -1,6 +1,7 @@
-//! The loop closed: a simulated helicopter that follows what the real pipeline tells it over MAVLink.
+//! The closed loop: a simulated helicopter that follows the MAVLink messages of the real pipeline.
 //!
-//! [`LiveFlight`] goes in real time, with a daemon of its own process. [`ClosedLoop`] goes in lock-step on simulated time, so the same scenario and seed give the same flight.
+//! [`LiveFlight`] runs in real time, with a daemon in its own process. [`ClosedLoop`] runs in lock-step on simulated
+//! time, so the same scenario and seed give the same flight.
 
 mod autopilot;
 mod closed_loop;

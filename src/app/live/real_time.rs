@@ -1,5 +1,5 @@
-//! A live simulation in real time: a daemon of its own process on pseudo-terminals and a socket, and the helicopter flown
-//! by a follower that hears it over MAVLink, or by another program.
+//! A live simulation in real time: a daemon in its own process on pseudo-terminals and a socket, and a helicopter that
+//! is flown by a follower over MAVLink or by another program.
 
 use std::net::UdpSocket;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use std::time::Duration;
 use nalgebra::Vector3;
 
 use super::autopilot::{SimulatedAutopilot, follow_target};
-use super::devices::{Darkroom, FrameSocket, PtyLine};
+use super::devices::{FrameRenderer, FrameSocket, PtyLine};
 use super::score::Score;
 use super::{Moment, closed_loop::LoopSettings};
 use crate::config::{AUTOPILOT, Config};
@@ -20,20 +20,20 @@ use windhover_base::time::MonoTime;
 use windhover_decode::MavlinkFrames;
 use windhover_simulate::{ClosedFlight, FlightError, Follower, FollowerTuning, Scenario, World};
 
-/// Between two looks at the clock.
+/// Time between two looks at the clock.
 const NAP: Duration = Duration::from_millis(2);
-/// Said of how it goes so often.
+/// Period of the progress messages.
 const SAID_EVERY_S: f64 = 5.0;
 
-/// Why a live simulation ends before its time.
+/// Why a live simulation ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum LiveError {
     /// A line, socket or file cannot be made.
     #[error("{what}: {error}")]
     Io {
-        /// What.
+        /// What could not be made.
         what: String,
-        /// Why.
+        /// The error.
         error: std::io::Error,
     },
     /// The flight cannot go on.
@@ -78,10 +78,10 @@ impl LiveFolder {
     }
 }
 
-/// Who flies.
+/// Who flies the helicopter.
 enum Flown {
     Follower(Box<Follower>),
-    /// Another program, by datagrams of nine figures: place, velocity, acceleration; north, east, down.
+    /// Another program, by datagrams of nine numbers: position, velocity, acceleration; north, east, down.
     Driver(UdpSocket),
 }
 
@@ -96,14 +96,14 @@ pub struct LiveFlight {
     compass: PtyLine,
     to_daemon: PtyLine,
     heard: MavlinkFrames,
-    camera: Darkroom,
+    camera: FrameRenderer,
     system_id: u8,
     moments: Vec<Moment>,
 }
 
 impl LiveFlight {
     /// Opens lines and socket in `folder`. The flight begins now. With `driver` another program flies, by UDP datagrams
-    /// at that address.
+    /// to that address.
     pub fn open(
         folder: &LiveFolder,
         mut scenario: Scenario,
@@ -133,7 +133,8 @@ impl LiveFlight {
         let socket = folder.at("camera.sock");
         let frames = FrameSocket::open(&socket, clock.less_monotonic()).map_err(io(&socket))?;
         let drawing = Arc::clone(&world);
-        let camera = Darkroom::open(drawing, frames, clock, settings.threads.max(1)).map_err(io(&socket))?;
+        let camera =
+            FrameRenderer::open(drawing, frames, clock, settings.threads.max(1)).map_err(io(&socket))?;
         Ok(Self {
             flight: ClosedFlight::new(Arc::clone(&world), settings.lateness, 0),
             autopilot: SimulatedAutopilot::new(settings.receiver_m),
@@ -150,7 +151,7 @@ impl LiveFlight {
         })
     }
 
-    /// Flies for the scenario's length, saying now and then how it goes.
+    /// Flies for the scenario's length, with progress messages to `say`.
     pub fn run(mut self, mut say: impl FnMut(String)) -> Result<Score, LiveError> {
         let end = self.world.time(self.world.scenario().duration_s);
         let mut next_s = SAID_EVERY_S;
@@ -176,7 +177,7 @@ impl LiveFlight {
         let behind_ms = (self.clock.now() - self.flight.now()).ms();
         let v = last.vehicle.speed_mps;
         format!(
-            "{now_s:.0} s: {away:.2} m from the vehicle, which drives {v:.2} m/s; told {told} times in 5 s; simulation {behind_ms:.0} ms behind"
+            "{now_s:.0} s: {away:.2} m from the vehicle, which drives {v:.2} m/s; {told} messages received in 5 s; simulation {behind_ms:.0} ms behind"
         )
     }
 
@@ -220,7 +221,7 @@ impl LiveFlight {
         }
     }
 
-    /// What the daemon says to the autopilot: questions for the time are answered, the vehicle is followed.
+    /// Handles the daemon's messages to the autopilot: time requests are answered, the vehicle is followed.
     fn hear(&mut self, now: MonoTime, said: &mut Vec<u8>) -> Option<windhover_simulate::FollowTarget> {
         let mut frames = Vec::new();
         self.heard.push(&self.to_daemon.receive(), &mut frames);
@@ -239,7 +240,7 @@ impl LiveFlight {
     }
 }
 
-/// The latest that another program said of where the helicopter is: place (m), velocity (m/s), acceleration (m/s²).
+/// The latest state that the other program sent for the helicopter: position (m), velocity (m/s), acceleration (m/s²).
 fn driven(socket: &UdpSocket) -> Option<[Vector3<f64>; 3]> {
     let (mut buffer, mut latest) = ([0; 512], None);
     while let Ok(count) = socket.recv(&mut buffer) {

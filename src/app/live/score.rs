@@ -1,10 +1,10 @@
-//! How a closed-loop flight went: what a follower's pilot asks of it.
+//! Scores of a closed-loop flight for the pilot of a follower.
 
 use nalgebra::{Vector2, Vector3};
 
 use super::closed_loop::Moment;
 
-/// Figures of a flight, from some time on.
+/// Scores of a flight from a given time on.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct Score {
     /// Horizontal distance of the helicopter from the vehicle, rms, metres.
@@ -17,13 +17,14 @@ pub struct Score {
     pub tilt_max_deg: f64,
     /// Height over the vehicle, mean, metres.
     pub height_m: f64,
-    /// Velocity told less the true one, rms of its length, m/s.
+    /// Velocity in the messages less the true one, rms of its length, m/s.
     pub velocity_rms_mps: f64,
-    /// Correlation of that with the helicopter's own acceleration through its tilt, the larger of north and east by size.
+    /// Correlation of that error with the helicopter's own acceleration through its tilt; the larger of north and east
+    /// by size.
     pub correlation: f64,
     /// Highest speed of the helicopter, m/s.
     pub speed_max_mps: f64,
-    /// How often something was told.
+    /// Number of messages.
     pub told: usize,
 }
 

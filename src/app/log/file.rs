@@ -1,5 +1,5 @@
-//! A log file that is put aside when it is large. `tracing-appender` puts files aside by the clock only and does not
-//! open them anew when something else has moved them.
+//! A log file that is rotated when it is large. `tracing-appender` rotates by the clock only and does not reopen a file
+//! that something else has moved.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::app::events::OperatorEvent;
 
-/// A log file with those put aside as `NAME.1` (the newest), `NAME.2`, ….
+/// A log file with the rotated ones `NAME.1` (the newest), `NAME.2`, ….
 pub(super) struct RotatingFile {
     path: PathBuf,
     limit_bytes: u64,
@@ -20,7 +20,7 @@ pub(super) struct RotatingFile {
 }
 
 impl RotatingFile {
-    /// Opened with its first line; opened anew with the next line after `reopen` was set.
+    /// Opened with its first line; reopened with the next line after `reopen` was set.
     pub(super) fn new(path: &Path, limit_bytes: u64, kept: u32, reopen: Arc<AtomicBool>) -> Self {
         Self { path: path.to_owned(), limit_bytes, kept, current: None, reopen, failed: false }
     }

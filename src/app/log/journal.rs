@@ -11,15 +11,15 @@ use crate::config::LogLevel;
 
 /// The journal's socket for its native protocol.
 const SOCKET: &str = "/run/systemd/journal/socket";
-/// The socket standard error is connected to where the service manager put it into the journal.
+/// The socket that standard error is connected to where the service manager sends it to the journal.
 const STREAM: &[u8] = b"/run/systemd/journal/stdout";
 
-/// A way to the journal.
+/// A connection to the journal.
 pub(super) struct Journal(UnixDatagram);
 
 impl Journal {
-    /// Asks with an empty datagram, which the journal discards; an error where there is no journal. One that does not
-    /// take it now is one.
+    /// Probes with an empty datagram, which the journal discards; an error where there is no journal. A journal that
+    /// does not accept it now exists.
     pub(super) fn open() -> io::Result<Self> {
         let socket = UnixDatagram::unbound()?;
         socket.set_nonblocking(true)?;
@@ -30,7 +30,7 @@ impl Journal {
         Ok(Self(socket))
     }
 
-    /// Sends one entry; waits while the journal does not take it.
+    /// Sends one entry; waits while the journal does not accept it.
     pub(super) fn send(&self, datagram: &[u8]) -> io::Result<()> {
         self.0.send_to(datagram, SOCKET).map(drop)
     }

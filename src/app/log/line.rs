@@ -1,4 +1,4 @@
-//! One line of the operator's log, made of a `tracing` event, and how it looks as logfmt and as JSON.
+//! One line of the operator's log, made from a `tracing` event, and its forms as logfmt and as JSON.
 
 use std::fmt::Debug;
 
@@ -16,33 +16,33 @@ use crate::io::clock::HostClock;
 use crate::text;
 use windhover_base::time::{MonoTime, UtcTime};
 
-/// The event's name of what libraries emit.
+/// The event name for messages of libraries.
 const LIBRARY: &str = "library";
 
 /// A value of a field.
 #[derive(Clone, PartialEq, Debug)]
 pub(super) enum Value {
-    /// Words.
+    /// Text.
     Text(String),
     /// A whole number.
     Count(i64),
-    /// A figure.
+    /// A number with a fraction.
     Figure(f64),
 }
 
 /// A field by its name.
 pub(super) type NamedValue = (&'static str, Value);
 
-/// One line: when, how grave, the event's fixed name, words for people, and fields.
+/// One line: time, severity, the event's fixed name, a message, and fields.
 #[derive(Clone, PartialEq, Debug)]
 pub(super) struct Line {
-    /// When, host time; shown as UTC.
+    /// Its host time; shown as UTC.
     pub(super) t: MonoTime,
     /// Its severity.
     pub(super) level: LogLevel,
     /// Fixed name of the event.
     pub(super) event: &'static str,
-    /// Words for people; may be empty.
+    /// The message; may be empty.
     pub(super) message: String,
     /// Fields in the order they are shown.
     pub(super) fields: Vec<NamedValue>,
@@ -51,7 +51,7 @@ pub(super) struct Line {
 }
 
 impl Line {
-    /// What an event says, in its context.
+    /// The content of an event, in its context.
     pub(super) fn of<S>(event: &Event<'_>, context: &Context<'_, S>, clock: HostClock) -> Self
     where
         S: Subscriber + for<'span> LookupSpan<'span>,
@@ -70,7 +70,7 @@ impl Line {
                 line.fields.push(("more_like_it", count(held)));
             }
         } else {
-            // What comes through the `log` crate carries its own target.
+            // Messages from the `log` crate carry their own target.
             let normal = event.normalized_metadata();
             let metadata = normal.as_ref().unwrap_or_else(|| event.metadata());
             line.level = level(metadata, metadata.target().starts_with(TARGET));
@@ -85,7 +85,7 @@ impl Line {
         line
     }
 
-    /// A line without words and fields.
+    /// A line without message and fields.
     pub(super) const fn new(t: MonoTime, level: LogLevel, event: &'static str) -> Self {
         Self { t, level, event, message: String::new(), fields: Vec::new(), context: Vec::new() }
     }
@@ -95,7 +95,7 @@ impl Line {
         format!("time={} level={} event={}", self.utc(), self.level.name(), self.logfmt())
     }
 
-    /// The event's name, words and fields in logfmt; time and severity are left to the journal. A figure and its
+    /// The event's name, message and fields in logfmt; the journal has its own time and severity. A value and its
     /// one-sigma are one word: `12.34±0.05`.
     pub(super) fn logfmt(&self) -> String {
         let mut out = self.event.to_owned();
@@ -119,7 +119,7 @@ impl Line {
         out
     }
 
-    /// For people at a terminal: what it is about, and the words.
+    /// For a terminal: the subject and the message.
     pub(super) fn plain(&self) -> String {
         let about = self.fields.iter().find(|(name, _)| *name == "about");
         let about = about.map(|(name, value)| shown(name, value) + ": ").unwrap_or_default();
@@ -146,7 +146,7 @@ impl Line {
     }
 }
 
-/// Libraries talk more than operators want to read: their information is our debugging.
+/// The level of an event. Libraries write more than operators want to read: their information is our debug level.
 fn level(metadata: &Metadata<'_>, ours: bool) -> LogLevel {
     use tracing::Level;
     match *metadata.level() {
@@ -159,14 +159,14 @@ fn level(metadata: &Metadata<'_>, ours: bool) -> LogLevel {
     }
 }
 
-/// The fields of an event or a span as they come.
+/// The fields of an event or a span as they are visited.
 #[derive(Default)]
 pub(super) struct Fields {
-    /// The words.
+    /// The message.
     pub(super) message: String,
-    /// A time of its own.
+    /// The event's own time.
     pub(super) t: Option<MonoTime>,
-    /// Everything else.
+    /// All other fields.
     pub(super) values: Vec<NamedValue>,
 }
 
@@ -175,7 +175,7 @@ impl Fields {
         match (field.name(), value) {
             ("message", Value::Text(words)) => self.message = words,
             ("t_ns", Value::Count(ns)) => self.t = Some(MonoTime::from_ns(ns)),
-            // Where in its source a message of the `log` crate comes from.
+            // The place in the source of a message of the `log` crate.
             (name, _) if name.starts_with("log.") => {}
             (name, value) => self.values.push((name, value)),
         }
@@ -208,7 +208,7 @@ impl Visit for Fields {
     }
 }
 
-/// A value as text, a figure with its field's decimals.
+/// A value as text, a number with its field's decimals.
 pub(super) fn shown(name: &str, value: &Value) -> String {
     match value {
         Value::Text(text) => text.clone(),
@@ -220,7 +220,7 @@ pub(super) fn shown(name: &str, value: &Value) -> String {
     }
 }
 
-/// A value in JSON; null where a figure is not finite.
+/// A value in JSON; null where a number is not finite.
 fn plain_value(name: &str, value: &Value) -> serde_json::Value {
     match value {
         Value::Text(text) => text.clone().into(),
@@ -231,7 +231,7 @@ fn plain_value(name: &str, value: &Value) -> serde_json::Value {
     }
 }
 
-/// A logfmt word: bare where it can be, else quoted with `"` and `\` escaped and line ends as `\n`.
+/// A logfmt value: unquoted where possible, else quoted with `"` and `\` escaped and line ends as `\n`.
 fn put_word(out: &mut String, word: &str) {
     let bare = !word.is_empty()
         && text::is_one_line(word)

@@ -5,8 +5,8 @@
 //!                                                           └─► queue ─► file
 //! ```
 //!
-//! Each sink is a layer with a queue and a thread of its own. A sink that is stuck loses its own lines, counted, and
-//! holds up neither the others nor the end of the program.
+//! Each sink is a layer with its own queue and thread. A stuck sink loses its own lines, which are counted; it delays
+//! neither the other sinks nor the end of the program.
 
 mod file;
 mod journal;
@@ -34,7 +34,7 @@ use tracing_subscriber::{Registry, reload};
 
 use self::file::RotatingFile;
 use self::journal::Journal;
-use self::sink::{Format, JournalWriter, Sink, Way};
+use self::sink::{Destination, Format, JournalWriter, Sink};
 use self::span::KeepSpanFields;
 use self::throttle::Throttle;
 use super::events::{self, TARGET};
@@ -42,14 +42,14 @@ use crate::config::{LogConfig, LogFormat, LogLevel};
 use crate::io::clock::HostClock;
 use windhover_base::time::Span;
 
-/// Longest that the sinks get, twice, at the end to write what waits; one that takes longer is left behind. Together
-/// less than what tasks and card leave of the unit's `TimeoutStopSec`.
+/// Longest time that the sinks get, twice, at the end to write queued lines; a slower sink is abandoned. Together with
+/// tasks and card this stays below the unit's `TimeoutStopSec`.
 const ENDING: Span = Span::from_ns(400_000_000);
 
-/// What is shown, to be changed.
+/// The changeable level.
 type Level = reload::Handle<Targets, Registry>;
 
-/// A handle on the log. Copies are the same.
+/// A handle on the log. Copies share the same log.
 #[derive(Clone)]
 pub struct Log {
     level: Level,
@@ -58,7 +58,7 @@ pub struct Log {
     clock: HostClock,
 }
 
-/// Ends the log when dropped: what is not stuck is written first.
+/// Ends the log when dropped: sinks that are not stuck write their queued lines first.
 pub struct LogEnd {
     log: Log,
     /// Dropped after the wait.
@@ -78,29 +78,33 @@ pub fn start(config: &LogConfig, clock: HostClock) -> (Log, LogEnd) {
         queues.push((format, queue));
         ends.push(end);
     }
-    let sink =
-        |(format, queue): &(Format, Queue)| Sink { format: *format, way: Way::Queue(queue.clone()), clock };
+    let sink = |(format, queue): &(Format, Queue)| Sink {
+        format: *format,
+        way: Destination::Queue(queue.clone()),
+        clock,
+    };
     let level = install(queues.iter().map(sink).collect(), config.level, Some(Throttle::new(clock)));
     let queues = queues.into_iter().map(|(_, queue)| queue).collect();
     let log = Log { level, reopen, queues, clock };
     (log.clone(), LogEnd { log, _ends: ends })
 }
 
-/// Starts the log of a command for people: words alone, on standard error, and throttled: strangers make some of them.
+/// Starts the log of a command: messages alone, on standard error, and throttled, because other machines cause some of
+/// them.
 pub fn start_plain(clock: HostClock) -> LogEnd {
     let (queue, end) = queue("stderr", Stream::Error);
-    let sink = Sink { format: Format::Plain, way: Way::Queue(queue.clone()), clock };
+    let sink = Sink { format: Format::Plain, way: Destination::Queue(queue.clone()), clock };
     let level = install(vec![sink], LogLevel::Info, Some(Throttle::new(clock)));
     LogEnd { log: Log { level, reopen: Arc::default(), queues: vec![queue], clock }, _ends: vec![end] }
 }
 
-/// Starts the log of a command that prints lines as it goes, and waits for who reads them.
+/// Starts the log of a command that prints lines while it runs and waits for its reader.
 pub fn start_direct(writer: impl Write + Send + 'static, clock: HostClock) {
-    let sink = Sink { format: Format::Text, way: Way::Direct(Mutex::new(Box::new(writer))), clock };
+    let sink = Sink { format: Format::Text, way: Destination::Direct(Mutex::new(Box::new(writer))), clock };
     install(vec![sink], LogLevel::Info, None);
 }
 
-/// The sink that standard error stands for.
+/// The sink for standard error.
 fn screen(format: LogFormat) -> ((Format, Queue), QueueEnd) {
     let wanted = match format {
         LogFormat::Journal => true,
@@ -119,13 +123,13 @@ fn screen(format: LogFormat) -> ((Format, Queue), QueueEnd) {
 fn install(sinks: Vec<Sink>, level: LogLevel, throttle: Option<Throttle>) -> Level {
     let (layers, handle) = layers(sinks, level, throttle);
     let _ = tracing::subscriber::set_global_default(layers);
-    // Libraries that speak through the `log` crate.
+    // Libraries that use the `log` crate.
     let _ = tracing_log::LogTracer::init();
     tracing_log::log::set_max_level(shown(level).1.as_log());
     handle
 }
 
-/// The throttle before the level: a row that ends another does so where it is not shown, too.
+/// The throttle comes before the level: a row that ends another does so even where it is not shown.
 fn layers(
     sinks: Vec<Sink>,
     level: LogLevel,
@@ -140,8 +144,8 @@ fn layers(
     (layers, handle)
 }
 
-/// What is shown at a level: of ours that severity and graver, of libraries one step less, and nothing of theirs where
-/// only errors are asked for.
+/// The levels that are shown: for our events this severity and higher, for libraries one step less, and no event of
+/// theirs where only errors are shown.
 const fn shown(level: LogLevel) -> (LevelFilter, LevelFilter) {
     match level {
         LogLevel::Error => (LevelFilter::ERROR, LevelFilter::OFF),
@@ -158,19 +162,19 @@ fn targets(level: LogLevel) -> Targets {
 }
 
 impl Log {
-    /// From now on shows lines of this severity and graver.
+    /// From now on shows lines of this severity and higher.
     pub fn set_level(&self, level: LogLevel) {
         // The subscriber lives as long as the process.
         let _ = self.level.reload(targets(level));
         tracing_log::log::set_max_level(shown(level).1.as_log());
     }
 
-    /// Opens the log file anew with its next line.
+    /// Reopens the log file with its next line.
     pub fn reopen(&self) {
         self.reopen.store(true, Ordering::Release);
     }
 
-    /// Emits how many lines each sink lost since this was last called, where any were.
+    /// Emits how many lines each sink has lost since the last call, where any were lost.
     pub fn report_losses(&self) {
         for queue in &self.queues {
             match queue.newly_lost() {
@@ -180,7 +184,7 @@ impl Log {
         }
     }
 
-    /// Waits a moment for what waits to be written, and emits what sinks that are stuck are short of.
+    /// Waits a moment for queued lines to be written, and emits how many lines stuck sinks have lost.
     pub fn settle(&self) {
         let limit = self.clock.now() + ENDING;
         let waiting: Vec<u64> = self.queues.iter().map(|queue| queue.drain(self.clock, limit)).collect();
@@ -230,7 +234,7 @@ pub(super) mod tests {
     }
 
     fn sink(format: Format, text: &Text, clock: HostClock) -> Sink {
-        Sink { format, way: Way::Direct(Mutex::new(Box::new(text.clone()))), clock }
+        Sink { format, way: Destination::Direct(Mutex::new(Box::new(text.clone()))), clock }
     }
 
     /// The lines of logfmt that `emit` makes, without a throttle.

@@ -1,5 +1,5 @@
-//! A sink's queue: bounded, and nobody waits for it. `tracing-appender` gives queue and thread; here is counted what
-//! became of each line, and the end does not wait for a writer that is stuck.
+//! A sink's queue: bounded, and nothing waits for it. `tracing-appender` provides queue and thread; this module counts
+//! the lines, and does not wait at the end for a stuck writer.
 
 use std::io::{self, Write};
 use std::sync::Arc;
@@ -11,10 +11,10 @@ use tracing_appender::non_blocking::{NonBlocking, NonBlockingBuilder, WorkerGuar
 use crate::io::clock::HostClock;
 use windhover_base::time::MonoTime;
 
-/// Lines that wait to be written; one more is dropped and counted.
+/// Most lines that wait to be written; further lines are dropped and counted.
 const WAITING: usize = 512;
 
-/// A sink's queue. Copies are the same queue.
+/// A sink's queue. Copies share the same queue.
 #[derive(Clone)]
 pub struct Queue {
     name: &'static str,
@@ -28,17 +28,17 @@ pub struct QueueEnd {
     guard: Option<WorkerGuard>,
 }
 
-/// What became of the lines.
+/// Counts of lines by result.
 #[derive(Default)]
 struct Counts {
     put: AtomicU64,
     written: AtomicU64,
     refused: AtomicU64,
-    /// Lost lines that were reported.
+    /// Lost lines that were already reported.
     reported: AtomicU64,
 }
 
-/// A queue before a writer, which takes one whole line a call.
+/// A queue before a writer, which takes one whole line at each call.
 pub fn queue(name: &'static str, writer: impl Write + Send + 'static) -> (Queue, QueueEnd) {
     let counts = Arc::new(Counts::default());
     let writer = Counted { writer, counts: counts.clone() };
@@ -61,25 +61,25 @@ impl Queue {
         let _ = self.queue.clone().write_all(line);
     }
 
-    /// Lines dropped, or refused by what writes them.
+    /// Lines dropped, or refused by the writer.
     fn lost(&self) -> u64 {
         let dropped = self.queue.error_counter().dropped_lines() as u64;
         dropped + self.counts.refused.load(Ordering::Acquire)
     }
 
-    /// Lines in the queue and in the writer's hands.
+    /// Lines in the queue and in the writer.
     pub fn waiting(&self) -> u64 {
         let done = self.counts.written.load(Ordering::Acquire) + self.lost();
         self.counts.put.load(Ordering::Acquire).saturating_sub(done)
     }
 
-    /// Lines lost since this was last asked.
+    /// Lines lost since the last call.
     pub fn newly_lost(&self) -> u64 {
         let lost = self.lost();
         lost - self.counts.reported.swap(lost, Ordering::AcqRel).min(lost)
     }
 
-    /// Waits until everything is written or `limit` is over; how many lines are not.
+    /// Waits until everything is written or `limit` is over; returns how many lines are not written.
     pub fn drain(&self, clock: HostClock, limit: MonoTime) -> u64 {
         while self.waiting() > 0 && clock.now() < limit {
             std::thread::sleep(Duration::from_millis(2));
@@ -92,7 +92,7 @@ impl Drop for QueueEnd {
     fn drop(&mut self) {
         let guard = self.guard.take();
         if self.queue.waiting() > 0 {
-            // The guard would wait for the writer, and speak of it on standard output.
+            // The guard would wait for the writer, and print about it on standard output.
             std::mem::forget(guard);
         }
     }
@@ -109,12 +109,12 @@ impl<W: Write> Write for Counted<W> {
         let written = self.writer.write_all(line);
         let count = if written.is_ok() { &self.counts.written } else { &self.counts.refused };
         count.fetch_add(1, Ordering::Release);
-        // The next line is another try.
+        // The next line tries again.
         Ok(line.len())
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        // A failure showed when the line was written.
+        // A failure has shown when the line was written.
         let _ = self.writer.flush();
         Ok(())
     }
@@ -138,7 +138,7 @@ mod tests {
         let lost = queue.newly_lost();
         assert_eq!(queue.newly_lost(), 0, "each loss is reported once");
         drop(end);
-        assert!(clock.now() - before < Span::from_s(30.0), "nothing here waits for the pipe");
+        assert!(clock.now() - before < Span::from_s(30.0), "nothing waits for the pipe");
         assert_eq!(lost + waiting + 64, 1_000);
         drop(reader);
     }

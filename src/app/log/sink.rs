@@ -1,4 +1,4 @@
-//! A sink: the layer that renders events as lines and hands them to a queue of its own, or to a writer.
+//! A sink: the layer that renders events as lines and passes them to its own queue or to a writer.
 
 use std::io::Write;
 use std::sync::{Mutex, PoisonError};
@@ -13,7 +13,7 @@ use super::queue::Queue;
 use super::stream::Stream;
 use crate::io::clock::HostClock;
 
-/// How a line looks.
+/// The form of a line.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) enum Format {
     /// logfmt.
@@ -22,7 +22,7 @@ pub(super) enum Format {
     Json,
     /// A datagram for the journal.
     Journal,
-    /// Words for people at a terminal.
+    /// Text for a terminal.
     Plain,
 }
 
@@ -39,17 +39,17 @@ impl Format {
 }
 
 /// Where lines go.
-pub(super) enum Way {
-    /// Nobody waits for it; lines may be lost there.
+pub(super) enum Destination {
+    /// A queue: nothing waits for it, and lines may be lost.
     Queue(Queue),
-    /// The command waits for it, as for all that it prints.
+    /// A writer: the command waits for it, as for all that it prints.
     Direct(Mutex<Box<dyn Write + Send>>),
 }
 
 /// The layer.
 pub(super) struct Sink {
     pub(super) format: Format,
-    pub(super) way: Way,
+    pub(super) way: Destination,
     pub(super) clock: HostClock,
 }
 
@@ -60,17 +60,17 @@ where
     fn on_event(&self, event: &Event<'_>, context: Context<'_, S>) {
         let line = self.format.render(&Line::of(event, &context, self.clock));
         match &self.way {
-            Way::Queue(queue) => queue.put(&line),
-            Way::Direct(writer) => {
+            Destination::Queue(queue) => queue.put(&line),
+            Destination::Direct(writer) => {
                 let mut writer = writer.lock().unwrap_or_else(PoisonError::into_inner);
-                // What cannot be printed is lost, as with everything that a command prints.
+                // A line that cannot be printed is lost, as with everything that a command prints.
                 let _ = writer.write_all(&line);
             }
         }
     }
 }
 
-/// Writes datagrams to the journal; what it does not take goes to standard error, without its fields.
+/// Writes datagrams to the journal; those that it refuses go to standard error, without fields.
 pub(super) struct JournalWriter(pub(super) Journal);
 
 impl Write for JournalWriter {

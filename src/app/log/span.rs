@@ -1,4 +1,4 @@
-//! What the lines of a run have in common: the layer that keeps the fields of spans for them.
+//! Context that the lines of a run share: the layer that keeps the fields of spans for them.
 
 use tracing::Subscriber;
 use tracing::span::{Attributes, Id, Record};

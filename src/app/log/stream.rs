@@ -1,5 +1,5 @@
-//! Standard output and standard error as sinks write them: straight to the descriptor. The library's handles have a
-//! lock, and a writer that is stuck with it would hold up whoever writes next.
+//! Standard output and standard error for sinks: written directly to the descriptor. The library's handles have a lock,
+//! and a stuck writer that holds it would block the next one.
 
 use std::io::{self, Write};
 use std::time::Duration;
@@ -30,7 +30,7 @@ impl Write for Stream {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         loop {
             match rustix::io::write(self.descriptor(), bytes) {
-                // Somebody made the descriptor non-blocking: waiting is ours.
+                // The descriptor was made non-blocking: the waiting is done here.
                 Err(Errno::AGAIN) => {
                     let descriptor = self.descriptor();
                     let _ = poll(&mut [PollFd::new(&descriptor, PollFlags::OUT)], None);
@@ -46,10 +46,10 @@ impl Write for Stream {
     }
 }
 
-/// Longest that a program's last words are waited for.
+/// Longest wait for the program's final message.
 const LAST_WORDS: Duration = Duration::from_millis(300);
 
-/// Writes a program's last words on standard error; where nobody takes them, they are lost.
+/// Writes the program's final message on standard error; it is lost where nothing reads it.
 pub fn last_words(words: &str) {
     let text = format!("{words}\n");
     let (written, waiting) = std::sync::mpsc::sync_channel(1);

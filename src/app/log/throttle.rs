@@ -1,4 +1,4 @@
-//! The layer that holds back lines that come too often about the same thing.
+//! The layer that suppresses lines that come too often about the same subject.
 
 use std::cell::Cell;
 use std::collections::HashMap;
@@ -13,48 +13,48 @@ use crate::app::events::OperatorEvent;
 use crate::io::clock::HostClock;
 use windhover_base::time::{MonoTime, Span};
 
-/// What is throttled together: the same event about the same thing, for the same cause.
+/// What is throttled together: the same event about the same subject, with the same cause.
 #[derive(Clone, PartialEq, Eq, Hash, Debug)]
 struct Key {
     event: OperatorEvent,
-    /// Source, target, task or peer; empty where it is about the daemon.
+    /// Source, target, task or peer; empty where the subject is the daemon.
     about: String,
     /// Kind of a device's fault; empty elsewhere.
     fault: String,
 }
 
-/// How an event passed.
+/// An event that passed.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Passed {
-    /// When, the same for every sink.
+    /// Its time, the same for every sink.
     pub(super) t: MonoTime,
-    /// How many like it were held back since the last that passed.
+    /// How many similar events were suppressed since the last that passed.
     pub(super) held: u64,
 }
 
 thread_local! {
-    /// The operator event that this thread is emitting: sinks are asked after the throttle, on the same thread.
+    /// The operator event that this thread is emitting: sinks are called after the throttle, on the same thread.
     static PASSED: Cell<Option<Passed>> = const { Cell::new(None) };
 }
 
-/// How the operator event that this thread is emitting passed; `None` where nothing is throttled.
+/// The operator event that this thread is emitting; `None` where nothing is throttled.
 pub(super) fn passed() -> Option<Passed> {
     PASSED.get()
 }
 
-/// Holds back events by their rows' throttles.
+/// Suppresses events by the throttles of their rows.
 pub(super) struct Throttle {
     clock: HostClock,
     gates: Mutex<HashMap<Key, Gate>>,
 }
 
 impl Throttle {
-    /// Nothing has passed yet.
+    /// A throttle that has passed nothing yet.
     pub(super) fn new(clock: HostClock) -> Self {
         Self { clock, gates: Mutex::default() }
     }
 
-    /// How an event passes at `t`; `None` where it is held back.
+    /// Decides at `t` about an event; `None` where it is suppressed.
     fn judge(&self, key: Key, t: MonoTime) -> Option<Passed> {
         let mut gates = self.gates.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(over) = key.event.ends() {
@@ -81,7 +81,7 @@ impl<S: Subscriber> Layer<S> for Throttle {
     }
 }
 
-/// What an event is about.
+/// The subject of an event.
 #[derive(Default)]
 struct Subject {
     t: Option<MonoTime>,
@@ -107,7 +107,7 @@ impl Visit for Subject {
     fn record_debug(&mut self, _: &Field, _: &dyn Debug) {}
 }
 
-/// When the last line passed, and how many were held back since.
+/// When the last line passed, and how many were suppressed since.
 #[derive(Clone, Copy, Debug, Default)]
 struct Gate {
     last: Option<MonoTime>,
@@ -115,8 +115,8 @@ struct Gate {
 }
 
 impl Gate {
-    /// Whether a line may pass at `t`: how many were held back since the last that did; `None` where
-    /// this one is held back too.
+    /// Whether a line may pass at `t`: returns how many were suppressed since the last that did; `None` where this one
+    /// is suppressed too.
     fn pass(&mut self, t: MonoTime, every: Span) -> Option<u64> {
         if self.last.is_some_and(|last| t - last < every) {
             self.held += 1;
@@ -162,6 +162,6 @@ mod tests {
         assert!(!down("gps", "missing", 3.0) && !down("gps", "busy", 4.0));
         assert!(throttle.judge(key(OperatorEvent::DeviceUp, "gps", ""), at(5.0)).is_some());
         assert!(down("gps", "missing", 6.0) && down("gps", "busy", 7.0));
-        assert!(!down("gps2", "missing", 8.0), "another device's fault goes on");
+        assert!(!down("gps2", "missing", 8.0), "the fault of another device continues");
     }
 }

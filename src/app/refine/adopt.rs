@@ -1,4 +1,4 @@
-//! What a refined flight has settled, as configuration to paste.
+//! Constants that a refined flight determined, as TOML for the configuration.
 
 use std::fmt::Write as _;
 
@@ -9,9 +9,9 @@ use windhover_base::geo::{euler_321, ned_from_body_321};
 use windhover_base::settings::MarkerConfig;
 use windhover_refine::{Constant, ConstantKind, Refined};
 
-/// The settled constants as TOML; empty where the flight settles none that the configuration has a key for.
+/// The determined constants as TOML; empty where the flight determines none that the configuration has a key for.
 ///
-/// Settled is what the flight tells, beyond three sigmas, to be other than configured.
+/// A constant is determined where it differs from the configured value by more than three sigmas.
 pub fn adopted(refined: &Refined, config: &Config) -> String {
     let found = Found(&refined.constants);
     let sections = [
@@ -40,7 +40,7 @@ impl Found<'_> {
         self.0.iter().find(|constant| constant.kind == kind).map_or(0.0, |constant| constant.value)
     }
 
-    /// A vector of which a component is settled.
+    /// A vector of which at least one component is determined.
     fn vector(&self, of: fn(usize) -> ConstantKind) -> Option<Vector3<f64>> {
         let any = (0..3).any(|i| self.settled(of(i)).is_some());
         any.then(|| Vector3::from_fn(|i, _| self.value(of(i))))
@@ -125,7 +125,7 @@ fn mount(found: &Found<'_>, config: &Config) -> String {
     text
 }
 
-/// Markers that are otherwise than configured, whole: a block each in place of the one there.
+/// Markers that differ from the configuration, as whole blocks that replace the configured ones.
 fn markers(found: &Found<'_>, config: &Config) -> String {
     let mut text = String::new();
     for (target, of) in config.target.iter().enumerate() {
@@ -143,7 +143,7 @@ fn markers(found: &Found<'_>, config: &Config) -> String {
                 let block = toml::to_string(&adopted).unwrap_or_default();
                 let _ = write!(
                     text,
-                    "\n# of {}, in place of the marker there\n[[target.marker]]\n{block}",
+                    "\n# of {}, replaces the configured marker\n[[target.marker]]\n{block}",
                     of.name
                 );
             }

@@ -1,4 +1,4 @@
-//! The flight afterwards: a recorded flight refined as a whole, and written beside it.
+//! Refinement after the flight: a recorded flight is estimated as a whole, and the result is written beside it.
 
 mod adopt;
 mod beside;
@@ -32,14 +32,14 @@ pub enum RefineFlightError {
     /// Its configuration is missing or wrong.
     #[error(transparent)]
     Config(#[from] ReplayError),
-    /// It holds no measurements that were looked at.
-    #[error("{} is a capture: nothing in it was looked at yet; make a flight of it with `windhover replay {0} --out FLIGHT.mcap`", path.display())]
+    /// It has no processed measurements.
+    #[error("{} is a capture: its measurements are not processed yet; make a flight of it with `windhover replay {0} --out FLIGHT.mcap`", path.display())]
     Bare {
         /// The recording.
         path: PathBuf,
     },
-    /// Where it took place is not known.
-    #[error("{}: the receiver's fixes never settled on a place, so there is no frame to refine it in", path.display())]
+    /// Its place is not known.
+    #[error("{}: there is no datum, because no three fixes of the receiver agreed; so there is no local frame for the refinement", path.display())]
     NoPlace {
         /// The flight.
         path: PathBuf,
@@ -49,10 +49,10 @@ pub enum RefineFlightError {
     Refine {
         /// The flight.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: windhover_refine::RefineError,
     },
-    /// Positions from outside could not be read.
+    /// External positions could not be read.
     #[error(transparent)]
     Outside(#[from] outside::OutsideError),
     /// The result could not be written.
@@ -66,25 +66,25 @@ pub struct RefinedFlight {
     pub flight: Flight,
     /// Its configuration.
     pub config: Config,
-    /// What was found.
+    /// The result.
     pub refined: Refined,
-    /// Marks of the flight that a reader should know of.
+    /// Remarks on the flight for its reader.
     pub remarks: Vec<String>,
 }
 
-/// Where the result stands unless another place is named: `FLIGHT.refined.mcap` beside the flight.
+/// The default place of the result: `FLIGHT.refined.mcap` beside the flight.
 pub fn beside(flight: &Path) -> PathBuf {
     let mut name = flight.file_stem().unwrap_or(flight.as_os_str()).to_owned();
     name.push(".refined.mcap");
     flight.with_file_name(name)
 }
 
-/// Refines flights over the same markers together, each with a path of its own and constants that they share, by the
-/// configuration of the first. `positions` are the antenna's from outside. `watch` gets the share that is done, and says
-/// whether to go on.
+/// Refines flights over the same markers together: each has its own path, and they share the constants. The
+/// configuration is that of the first flight. `positions` are external positions of the antenna. `watch` gets the
+/// completed share, and returns whether to continue.
 ///
 /// # Errors
-/// Why they cannot be refined; nothing is written here.
+/// Why the flights cannot be refined; nothing is written here.
 pub fn refine_flights(
     paths: &[PathBuf],
     positions: Option<&Path>,
@@ -113,7 +113,7 @@ pub fn refine_flights(
     Ok(done.collect())
 }
 
-/// What of several flights is one's, in the frame of its own datum.
+/// The part of the common result that belongs to one flight, in the frame of its own datum.
 fn of_flight(all: &Refined, flight: usize, datum: Option<Geodetic>) -> Refined {
     let mut refined = all.clone();
     refined.own.retain(|(of, _)| *of == flight);
@@ -151,7 +151,7 @@ fn site(
 }
 
 impl RefinedFlight {
-    /// Writes everything of the flight but its pictures, and the result, to a file that stands in its place when it is whole.
+    /// Writes everything of the flight except its pictures, and the result. The file gets its name when it is complete.
     ///
     /// # Errors
     /// The flight cannot be read again, or the file not written.

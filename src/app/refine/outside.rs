@@ -1,10 +1,12 @@
-//! Positions of the antenna from outside: RTKLIB's solutions, GPX tracks, tables.
+//! External positions of the antenna: RTKLIB's solutions, GPX tracks, tables.
 //!
 //! | form | times | sigmas |
 //! |---|---|---|
-//! | RTKLIB's `.pos` (`lat lon height`) | GPST or UTC as its header says, as dates or as week and seconds | `sdn sde sdu` |
-//! | GPX (`trkpt lat lon`, `ele`, `time`) | UTC | [`UNSAID_M`] |
-//! | CSV with `time_ns` (host time) or `utc`, `lat_deg`, `lon_deg`, `height_m`; `sigma_m` or `sigma_n_m`, `sigma_e_m`, `sigma_d_m` | as named | as given, else [`UNSAID_M`] |
+//! | RTKLIB's `.pos` (`lat lon height`) | GPST or UTC as its header states, as dates or as week and seconds | `sdn sde
+//! sdu` |
+//! | GPX (`trkpt lat lon`, `ele`, `time`) | UTC | [`DEFAULT_SIGMA_M`] |
+//! | CSV with `time_ns` (host time) or `utc`, `lat_deg`, `lon_deg`, `height_m`; `sigma_m` or `sigma_n_m`, `sigma_e_m`,
+//! `sigma_d_m` | as named | as given, else [`DEFAULT_SIGMA_M`] |
 
 use std::path::{Path, PathBuf};
 
@@ -14,11 +16,11 @@ use windhover_base::geo::Geodetic;
 use windhover_base::time::{MonoTime, Span};
 use windhover_refine::{OutsidePosition, Recording};
 
-/// Sigma north, east, down, where a track does not tell any, m.
-const UNSAID_M: [f64; 3] = [0.5, 0.5, 1.0];
-/// GPS time is ahead of UTC by so many leap seconds (since 2017).
+/// Sigma north, east, down, where a track gives none, m.
+const DEFAULT_SIGMA_M: [f64; 3] = [0.5, 0.5, 1.0];
+/// GPS time minus UTC, leap seconds (since 2017).
 const GPS_LEAP_S: f64 = 18.0;
-/// UTC of the begin of GPS weeks, s since 1970.
+/// UTC of the start of GPS weeks, s since 1970.
 const GPS_EPOCH_S: f64 = 315_964_800.0;
 
 /// Why positions could not be read.
@@ -29,10 +31,10 @@ pub enum OutsideError {
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// A line is not as it should be.
+    /// A line is malformed.
     #[error("positions {}, line {line}: {reason}", path.display())]
     Malformed {
         /// The file.
@@ -42,23 +44,23 @@ pub enum OutsideError {
         /// What is wrong.
         reason: String,
     },
-    /// Its times are UTC, and the flight does not tell UTC.
-    #[error("positions {}: their times are UTC, and no fix of the flight tells a date", path.display())]
+    /// Its times are UTC, and the flight has no UTC.
+    #[error("positions {}: their times are UTC, and no fix of the flight has a date", path.display())]
     NoUtc {
         /// The file.
         path: PathBuf,
     },
-    /// None of them is of this flight.
-    #[error("positions {}: none of its {count} positions is of the time of the flight", path.display())]
+    /// No position is within the time of this flight.
+    #[error("positions {}: none of its {count} positions is within the time of the flight", path.display())]
     Elsewhen {
         /// The file.
         path: PathBuf,
-        /// How many there are.
+        /// Number of positions.
         count: usize,
     },
 }
 
-/// A position with its time, of UTC or of the host.
+/// A position with its time, UTC or host time.
 #[derive(Clone, Copy, PartialEq, Debug)]
 struct Row {
     /// Nanoseconds.
@@ -73,7 +75,7 @@ type Parsed = Result<Vec<Row>, (usize, String)>;
 /// Reads positions and puts them into a recording.
 ///
 /// # Errors
-/// The file cannot be read or understood, or is of another time than all of them.
+/// The file cannot be read or parsed, or no position is within the time of any of the recordings.
 pub fn add_positions(path: &Path, recordings: &mut [Recording]) -> Result<(), OutsideError> {
     let text = std::fs::read_to_string(path)
         .map_err(|source| OutsideError::Unreadable { path: path.to_owned(), source })?;
@@ -95,7 +97,7 @@ pub fn add_positions(path: &Path, recordings: &mut [Recording]) -> Result<(), Ou
     }
 }
 
-/// Puts those rows into a recording that are of its time.
+/// Puts the rows that are within its time into a recording.
 fn add_rows(rows: &[Row], recording: &mut Recording) {
     let ahead = utc_ahead(recording);
     let known = rows.iter().filter(|row| row.is_host || ahead.is_some());
@@ -112,7 +114,7 @@ fn add_rows(rows: &[Row], recording: &mut Recording) {
     recording.positions.extend(positions);
 }
 
-/// UTC less host time: the middle of what the epochs tell.
+/// UTC less host time: the median over the epochs.
 fn utc_ahead(recording: &Recording) -> Option<Span> {
     let told = recording.epochs.iter().filter_map(|e| Some(e.value.utc?.unix_ns() - e.t_valid.ns()));
     let mut told: Vec<i64> = told.collect();
@@ -145,7 +147,7 @@ fn rtklib_row(fields: &[&str], is_gpst: bool) -> Result<Row, String> {
     let [first, second, rest @ ..] = fields else { return Err("it has no time".to_owned()) };
     let seconds = if first.contains('/') || first.contains('-') {
         let date = first.replace('/', "-");
-        let t = parse_time(&format!("{date} {second}")).ok_or("its time is none")?;
+        let t = parse_time(&format!("{date} {second}")).ok_or("its time is invalid")?;
         t.ns()
     } else {
         let (week, in_week) = (text::number(first)?, text::number(second)?);
@@ -153,17 +155,17 @@ fn rtklib_row(fields: &[&str], is_gpst: bool) -> Result<Row, String> {
     };
     let leap_ns = if is_gpst { (GPS_LEAP_S * 1e9) as i64 } else { 0 };
     let figure =
-        |i: usize| rest.get(i).ok_or("it has too few figures".to_owned()).and_then(|f| text::number(f));
+        |i: usize| rest.get(i).ok_or("it has too few columns".to_owned()).and_then(|f| text::number(f));
     let at = Geodetic { lat_deg: figure(0)?, lon_deg: figure(1)?, height_m: figure(2)? };
     let told = [figure(5), figure(6), figure(7)];
     let sigma_m = std::array::from_fn(|i| match &told[i] {
         Ok(sigma) if *sigma > 0.0 => *sigma,
-        _ => UNSAID_M[i],
+        _ => DEFAULT_SIGMA_M[i],
     });
     Ok(Row { t_ns: seconds - leap_ns, is_host: false, at, sigma_m })
 }
 
-/// A GPX track: only its points, whatever else it holds.
+/// A GPX track: only its points, whatever else the file has.
 fn gpx(text: &str) -> Parsed {
     let mut rows = Vec::new();
     for (at, begin) in text.match_indices("<trkpt") {
@@ -183,12 +185,12 @@ fn gpx(text: &str) -> Parsed {
             let time = element("time").and_then(parse_time).ok_or("a point without a time")?;
             let height_m = text::number(element("ele").ok_or("a point without ele")?)?;
             let at = Geodetic { lat_deg: attribute("lat")?, lon_deg: attribute("lon")?, height_m };
-            Ok(Row { t_ns: time.ns(), is_host: false, at, sigma_m: UNSAID_M })
+            Ok(Row { t_ns: time.ns(), is_host: false, at, sigma_m: DEFAULT_SIGMA_M })
         };
         rows.push(row().map_err(|reason| (line, reason))?);
     }
     if rows.is_empty() {
-        return Err((1, "there is no track in it".to_owned()));
+        return Err((1, "it has no track".to_owned()));
     }
     Ok(rows)
 }
@@ -198,11 +200,11 @@ fn csv(text: &str) -> Parsed {
     let (_, header) = lines.next().ok_or((1, "it is empty".to_owned()))?;
     let names: Vec<&str> = header.split(',').map(str::trim).collect();
     let column = |name: &str| names.iter().position(|n| *n == name);
-    let must = |name: &str| column(name).ok_or((1, format!("there is no column {name}")));
+    let must = |name: &str| column(name).ok_or((1, format!("the column {name} is missing")));
     let (lat, lon, height) = (must("lat_deg")?, must("lon_deg")?, must("height_m")?);
     let (host, utc) = (column("time_ns"), column("utc"));
     if host.is_none() && utc.is_none() {
-        return Err((1, "there is no column time_ns or utc".to_owned()));
+        return Err((1, "a column time_ns or utc is missing".to_owned()));
     }
     let sigmas = ["sigma_n_m", "sigma_e_m", "sigma_d_m"].map(|name| column(name).or(column("sigma_m")));
     let mut rows = Vec::new();
@@ -213,19 +215,19 @@ fn csv(text: &str) -> Parsed {
             let number = |c: usize| text::number(field(c));
             let (t_ns, is_host) = match (host, utc) {
                 (Some(c), _) => {
-                    (field(c).parse().map_err(|_| format!("{:?} is no time_ns", field(c)))?, true)
+                    (field(c).parse().map_err(|_| format!("{:?} is not a time_ns", field(c)))?, true)
                 }
                 (None, Some(c)) => {
-                    (parse_time(field(c)).ok_or(format!("{:?} is no time", field(c)))?.ns(), false)
+                    (parse_time(field(c)).ok_or(format!("{:?} is not a time", field(c)))?.ns(), false)
                 }
                 (None, None) => return Err("it has no time".to_owned()),
             };
             let at = Geodetic { lat_deg: number(lat)?, lon_deg: number(lon)?, height_m: number(height)? };
-            let mut sigma_m = UNSAID_M;
+            let mut sigma_m = DEFAULT_SIGMA_M;
             for (sigma, c) in sigma_m.iter_mut().zip(sigmas) {
                 if let Some(c) = c {
                     *sigma = number(c)
-                        .and_then(|s| if s > 0.0 { Ok(s) } else { Err(format!("{s} is no sigma")) })?;
+                        .and_then(|s| if s > 0.0 { Ok(s) } else { Err(format!("{s} is not a sigma")) })?;
                 }
             }
             Ok(Row { t_ns, is_host, at, sigma_m })
@@ -250,7 +252,7 @@ mod tests {
         let rows = rtklib(text).expect("well formed");
         assert_eq!(rows[0].t_ns, UTC_NS);
         assert_eq!((rows[0].at.lat_deg, rows[0].sigma_m), (30.069_604_785, [0.01, 0.02, 0.03]));
-        assert_eq!((rows[1].t_ns, rows[1].sigma_m), (UTC_NS, UNSAID_M));
+        assert_eq!((rows[1].t_ns, rows[1].sigma_m), (UTC_NS, DEFAULT_SIGMA_M));
         let utc = "%  UTC  latitude(deg)\n2026/11/18 15:04:05.200 30 -85 26 1 12 0.1 0.1 0.1\n";
         assert_eq!(rtklib(utc).expect("well formed")[0].t_ns, UTC_NS);
         assert_eq!(rtklib("%  GPST  x-ecef(m)\n").expect_err("not a place").0, 1);

@@ -1,4 +1,4 @@
-//! Names and units of what a refinement finds, and what else is to be said of it.
+//! Names and units of the refined constants, and remarks on the result.
 
 use crate::app::flight::Flight;
 use crate::text::counted;
@@ -6,14 +6,14 @@ use windhover_base::msg::{FeltTilt, MarkerId};
 use windhover_base::settings::{MarkerKind, TargetConfig};
 use windhover_refine::{Constant, ConstantKind, Refined, Source};
 
-/// A constant as people read it.
+/// A constant in readable form.
 #[derive(Clone, PartialEq, Debug)]
 pub struct ConstantWords {
     /// Its name.
     pub name: String,
     /// Its unit; empty where it has none.
     pub unit: &'static str,
-    /// What one of the unit is in the constant's own.
+    /// The size of one such unit in the constant's own unit.
     pub scale: f64,
 }
 
@@ -95,11 +95,11 @@ pub(super) fn in_unit(constant: &Constant, words: &ConstantWords) -> [f64; 4] {
     [value, sigma, prior, prior_sigma].map(|figure| figure / words.scale)
 }
 
-/// What a reader should know of the flight.
+/// Remarks on the flight for its reader.
 pub(super) fn remarks(flight: &Flight, refined: &Refined) -> Vec<String> {
     let mut remarks = Vec::new();
     if !flight.had_frames() {
-        remarks.push("no frame came from the camera: only the helicopter is estimated".to_owned());
+        remarks.push("no frame was received from the camera: only the helicopter is estimated".to_owned());
     } else if refined.targets.iter().all(|(_, e)| e.state.is_none()) {
         remarks.push("no marker of a target was seen: only the helicopter is estimated".to_owned());
     }
@@ -108,23 +108,23 @@ pub(super) fn remarks(flight: &Flight, refined: &Refined) -> Vec<String> {
         let at: Vec<String> =
             refined.begins.iter().skip(1).map(|(_, t)| format!("{:.1} s", flight.seconds(*t))).collect();
         remarks.push(format!(
-            "{} without fixes and compass: the trajectory begins anew at {}",
+            "{} without fixes and compass: the trajectory starts again at {}",
             counted(silences, "long silence"),
             at.join(", ")
         ));
     }
     for (t, why) in &refined.resets {
         remarks.push(format!(
-            "the filter that gave first values began again at {:.1} s: {why}",
+            "the filter that gave the first values was reset at {:.1} s: {why}",
             flight.seconds(*t)
         ));
     }
     if refined.features.1 > 0 {
         let moving = counted(refined.features.1, "ground feature");
-        remarks.push(format!("{moving} left out: what they lie on moves"));
+        remarks.push(format!("{moving} left out: they lie on something that moves"));
     }
     match refined.felt {
-        Some(FeltTilt::Force) => remarks.push("the compass's tilt sensor feels force".to_owned()),
+        Some(FeltTilt::Force) => remarks.push("the compass's tilt sensor measures specific force".to_owned()),
         Some(FeltTilt::Share(share)) => {
             remarks.push(format!("the compass's tilt sensor reads {:.0} % of the tilt", 100.0 * share));
         }

@@ -1,4 +1,4 @@
-//! A refined flight as MCAP: the flight without its pictures, and beside each estimate the refined one.
+//! A refined flight as MCAP: the flight without its pictures, with a refined estimate beside each estimate.
 
 use std::path::Path;
 
@@ -15,7 +15,7 @@ use windhover_base::geo::rot_z;
 use windhover_base::msg::{Ownship, TargetEstimate};
 use windhover_base::time::MonoTime;
 
-/// Writes everything of the flight at `from` but its pictures, with the result, to `to`.
+/// Writes everything of the flight at `from` except its pictures, with the result, to `to`.
 pub(super) fn write(done: &RefinedFlight, from: &Path, to: &Path) -> Result<(), RefineFlightError> {
     let text = done.config.to_toml().unwrap_or_default();
     let mut file = McapFile::create(to, Maker::Refine, &text, done.flight.began)?;
@@ -75,7 +75,7 @@ fn record(topic: String, schema: Schema, t: MonoTime, message: &impl Message) ->
     Record { topic: topic.into(), schema, log_time: t, publish_time: t, data: message.encode_to_vec() }
 }
 
-/// What the flight says of its configuration, as a message.
+/// What the flight shows about its configuration, as a message.
 fn summary(done: &RefinedFlight, end: MonoTime) -> wh::Refined {
     let (refined, targets) = (&done.refined, &done.config.target[..]);
     let constants = refined.constants.iter().filter(|constant| constant.prior_sigma > 0.0);
@@ -97,7 +97,7 @@ fn summary(done: &RefinedFlight, end: MonoTime) -> wh::Refined {
             .map(|constant| {
                 let words = constant_words(constant.kind, targets);
                 let [value, sigma, expected, expected_sigma] = in_unit(constant, &words);
-                let (name, unit, told) = (words.name, words.unit.into(), constant.is_told());
+                let (name, unit, told) = (words.name, words.unit.into(), constant.is_determined());
                 wh::RefinedConstant { name, unit, value, sigma, expected, expected_sigma, told }
             })
             .collect(),

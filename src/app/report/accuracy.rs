@@ -1,4 +1,4 @@
-//! Errors against truth: root mean squares, and whether the covariances tell the truth (NEES).
+//! Errors against truth: root mean squares, and whether the covariances are consistent (NEES).
 
 use nalgebra::{SMatrix, SVector};
 
@@ -10,17 +10,17 @@ use crate::io::proto::windhover as wh;
 use crate::plot::{Ink, Mark, thin};
 use windhover_base::geo::{Geodetic, LocalFrame, wrap_angle};
 
-/// The filter settles over this time; figures count from here, seconds.
+/// The filter settles in this time; statistics start after it, seconds.
 const SETTLING_S: f64 = 6.0;
 
 /// Estimated minus true at one frame.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct ErrorRow {
-    /// Seconds from the flight's beginning.
+    /// Seconds from the flight's start.
     pub t_s: f64,
-    /// North, east (m), heading (rad), speed (m/s), yaw rate (rad/s); not a number where truth is silent.
+    /// North, east (m), heading (rad), speed (m/s), yaw rate (rad/s); NaN where the truth has no value.
     pub error: [f64; 5],
-    /// One-sigma of each; not a number where there is no covariance.
+    /// One-sigma of each; NaN where there is no covariance.
     pub sigma: [f64; 5],
     /// Normalised error squared of all five, and of heading, speed and yaw rate.
     pub nees: Option<(f64, f64)>,
@@ -61,7 +61,7 @@ pub fn errors_of(
     Errors { rows: rows.collect() }
 }
 
-/// Whether an estimate holds figures worth comparing.
+/// Whether an estimate has values to compare.
 pub(super) fn is_held(s: &wh::TargetState) -> bool {
     s.known && matches!(s.status(), wh::TrackStatus::Tracking | wh::TrackStatus::Coasting)
 }
@@ -125,9 +125,9 @@ pub(super) fn section(context: &Context<'_>) -> Option<Section> {
     let (name, track) = context.flight.targets.iter().next()?;
     let estimators = estimators_of(context.flight, track, truth)?;
     let mut body = paragraph(&format!(
-        "Estimates of {name} against the truth given, root mean square after the first {SETTLING_S:.0} s. \
-         The position's own mean error is the receiver's bias; without it remains what matters for following. \
-         Normalised error squared (NEES) is near 5 and 3 where the covariances tell the truth; larger is overconfident."
+        "Estimates of {name} against the given truth, root mean square after the first {SETTLING_S:.0} s. \
+         The position's own mean error is the receiver's bias; the error without it is what matters for following. \
+         Normalised error squared (NEES) is near 5 and 3 where the covariances are consistent; larger is overconfident."
     ));
     body += &table(&ERROR_COLUMNS, &error_rows(&estimators));
     let specs = [
@@ -199,7 +199,7 @@ pub fn error_text(flight: &Flight, truth: &Truth) -> Option<String> {
     (all.len() > 1).then(|| all.iter().map(line).collect())
 }
 
-/// Errors of each estimator, with its ink.
+/// Errors of each estimator, with its colour.
 fn estimators_of(flight: &Flight, track: &Track, truth: &Truth) -> Option<[(&'static str, Errors, Ink); 4]> {
     let frame = LocalFrame::new(flight.datum?);
     let at = |s: &wh::TargetState| flight.at(s.timestamp.as_ref());
@@ -255,7 +255,7 @@ fn nees_chart(context: &Context<'_>, errors: &Errors) -> String {
     chart.named("real time", Mark::Line(thin(&points, super::LINE_POINTS)), Ink::Blue);
     let end = context.flight.duration_s();
     chart.named("ideal mean", Mark::Dashed(vec![[0.0, 3.0], [end, 3.0]]), Ink::Grey);
-    // 99 % of a chi-squared of three degrees of freedom.
+    // The 99 % quantile of chi-squared with three degrees of freedom.
     chart.named("99 % below", Mark::Dashed(vec![[0.0, 11.345], [end, 11.345]]), Ink::Red);
     figure(&chart.render())
 }

@@ -1,4 +1,4 @@
-//! What only the daemon knows (card, link, temperature), its notices, and the configuration.
+//! Data of the daemon alone (card, link, temperature), its notices, and the configuration.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -9,7 +9,7 @@ use crate::io::proto::foxglove as fox;
 use crate::plot::Ink;
 use crate::text::xml;
 
-/// Notices listed; a flight with more has a fault that the first ones tell.
+/// Most notices that are listed; in a flight with more, the first ones show the fault.
 const MOST_NOTICES: usize = 200;
 
 /// Card and link.
@@ -84,11 +84,11 @@ pub(super) fn notices(context: &Context<'_>) -> Option<Section> {
     Some(Section { id: "notices", title: "Notices", body })
 }
 
-/// The configuration, folded away.
+/// The configuration, collapsed.
 pub(super) fn configuration(context: &Context<'_>) -> Option<Section> {
     let text = context.flight.config_text.as_ref()?;
     let body = format!(
-        "<details><summary>The configuration flown with</summary><pre>{}</pre></details>\n",
+        "<details><summary>The configuration of the flight</summary><pre>{}</pre></details>\n",
         xml(text)
     );
     Some(Section { id: "configuration", title: "Configuration", body })

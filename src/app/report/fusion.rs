@@ -1,4 +1,4 @@
-//! What became of the measurements: dispositions and innovations per source.
+//! Use of the measurements: dispositions and innovations of each source.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use crate::io::proto::windhover as wh;
 use crate::plot::{Ink, Mark};
 use windhover_base::msg::{Disposition, FusionSource};
 
-/// Sources in the order of the page, with the unit and the scale their innovations are shown in.
+/// Sources in the order of the page, with the unit and scale of their innovations.
 const SOURCES: [(FusionSource, &str, f64); 10] = [
     (FusionSource::GpsPosition, "m", 1.0),
     (FusionSource::GpsVelocity, "m/s", 1.0),
@@ -22,7 +22,7 @@ const SOURCES: [(FusionSource, &str, f64); 10] = [
     (FusionSource::Feature, "px", 1.0),
 ];
 
-/// The section; nothing where nothing was fused.
+/// The section; empty where nothing was fused.
 pub(super) fn section(context: &Context<'_>) -> Option<Section> {
     let fusion = &context.flight.fusion;
     if fusion.is_empty() {
@@ -93,7 +93,7 @@ fn innovation_chart(context: &Context<'_>, source: FusionSource, unit: &str, sca
     let reach = {
         let mut sizes: Vec<f64> = kept.iter().flatten().map(|p| p[1].abs()).collect();
         sizes.sort_by(f64::total_cmp);
-        // A few far innovations must not flatten all others.
+        // A few large innovations must not flatten all others.
         sizes.get(sizes.len() * 995 / 1000).copied().unwrap_or(1.0).max(1e-9) * 1.4
     };
     if of_source().next().is_none() {
@@ -107,10 +107,10 @@ fn innovation_chart(context: &Context<'_>, source: FusionSource, unit: &str, sca
     }
     let refused: Vec<[f64; 2]> = (0..parts.len()).flat_map(|k| points(k, true)).collect();
     if !refused.is_empty() {
-        // What lies beyond the chart is shown at its edge.
+        // Values beyond the chart are drawn at its edge.
         let edge = 0.97 * reach;
         let clamped: Vec<[f64; 2]> = refused.iter().map(|p| [p[0], p[1].clamp(-edge, edge)]).collect();
-        chart.named("weighed down or refused", Mark::Dots(clamped, 2.0), Ink::Red);
+        chart.named("down-weighted or refused", Mark::Dots(clamped, 2.0), Ink::Red);
     }
     figure(&chart.render())
 }

@@ -14,7 +14,7 @@ const ELLIPSES: usize = 10;
 /// Mahalanobis distance that holds 95 % of a Gaussian in the plane.
 const SCALE_95: f64 = 2.447_746_8;
 
-/// The section; nothing where no position is known.
+/// The section; empty where no position is known.
 pub(super) fn section(context: &Context<'_>) -> Option<Section> {
     let mut chart = Chart::new("", 640.0, 500.0).labels("east (m)", "north (m)").equal();
     let flight = context.flight;
@@ -60,7 +60,7 @@ pub(super) fn section(context: &Context<'_>) -> Option<Section> {
     Some(Section { id: "map", title: "Map", body })
 }
 
-/// A path; unlike a curve over time it is thinned evenly.
+/// A path; unlike a curve over time, its points are thinned evenly.
 fn path(points: &[[f64; 2]]) -> Mark {
     let step = points.len().div_ceil(900).max(1);
     let mut kept: Vec<[f64; 2]> = points.iter().step_by(step).copied().collect();

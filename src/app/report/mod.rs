@@ -22,19 +22,19 @@ use windhover_base::geo::{Geodetic, LocalFrame};
 
 pub use accuracy::{Errors, error_text, errors_of};
 
-/// Points drawn of one line.
+/// Most points of a line.
 const LINE_POINTS: usize = 600;
-/// Points drawn of one cloud.
+/// Most points of a cloud.
 const CLOUD_POINTS: usize = 700;
 
-/// What every section works from.
+/// The input of every section.
 struct Context<'a> {
     flight: &'a Flight,
     truth: Option<&'a Truth>,
 }
 
 impl Context<'_> {
-    /// The NED frame of the flight, or of its first fix.
+    /// The NED frame of the flight, or one at its first fix.
     fn frame(&self) -> Option<LocalFrame> {
         let first = || {
             let e = self.flight.epochs.iter().find(|e| e.lat_deg.is_some() && e.lon_deg.is_some())?;
@@ -50,12 +50,12 @@ impl Context<'_> {
     }
 }
 
-/// A line thinned to what a picture shows.
+/// A line, thinned to the resolution of a chart.
 fn line(points: &[[f64; 2]]) -> Mark {
     Mark::Line(thin(points, LINE_POINTS))
 }
 
-/// A cloud thinned to what a picture shows, its extremes kept.
+/// A cloud, thinned to the resolution of a chart; its extremes are kept.
 fn cloud(points: &[[f64; 2]], radius: f64) -> Mark {
     Mark::Dots(thin(points, CLOUD_POINTS), radius)
 }
@@ -70,8 +70,7 @@ fn single(context: &Context<'_>, title: &str, unit: &str, points: &[[f64; 2]], i
     page::figure(&chart.render())
 }
 
-/// The page of a flight, with errors where truth is given. Reads frames of the recording at `path`
-/// for pictures.
+/// The page of a flight, with errors where truth is given. Reads frames of the recording at `path` for the pictures.
 pub fn render(path: &Path, flight: &Flight, truth: Option<&Truth>) -> Result<String, ReadError> {
     let context = Context { flight, truth };
     let pictures = pictures::read(path, flight)?;

@@ -1,4 +1,4 @@
-//! The page itself: skeleton, style, and the small parts sections are made of.
+//! The page: skeleton, style, and the elements of sections.
 
 use std::fmt::Write as _;
 
@@ -86,12 +86,12 @@ pub(super) fn figure(svg: &str) -> String {
     format!("<figure>{svg}</figure>\n")
 }
 
-/// Charts side by side where there is room; nothing where there is no chart.
+/// Charts side by side where there is room; empty where there is no chart.
 pub(super) fn grid(figures: &str) -> String {
     if figures.is_empty() { String::new() } else { format!("<div class=\"grid\">{figures}</div>\n") }
 }
 
-/// Figures with their names, large.
+/// Values with their names, in large type.
 pub(super) fn tiles(tiles: &[(String, String)]) -> String {
     let one = |(value, name): &(String, String)| {
         format!("<div class=\"tile\"><b>{}</b><span>{}</span></div>", xml(value), xml(name))

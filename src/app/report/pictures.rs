@@ -1,4 +1,4 @@
-//! A few frames with what was found on them, and the quality of a sample of all frames.
+//! A few frames with their detections, and the image quality of a sample of all frames.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -21,7 +21,7 @@ const WIDEST: usize = 640;
 /// Quality of the pictures' JPEG, percent.
 const JPEG_QUALITY: u8 = 72;
 
-/// How good a frame is.
+/// Image quality of a frame.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(super) struct Quality {
     /// Mean grey level.
@@ -32,10 +32,10 @@ pub(super) struct Quality {
     pub(super) sharpness: f64,
 }
 
-/// A frame made small.
+/// A reduced frame.
 pub(super) struct FramePicture {
     jpeg: Vec<u8>,
-    /// Of the frame itself, pixels.
+    /// Size of the full frame, pixels.
     width: usize,
     height: usize,
     t_s: f64,
@@ -43,7 +43,7 @@ pub(super) struct FramePicture {
     seen: wh::Detections,
 }
 
-/// What was taken from the frames.
+/// Data from the frames.
 #[derive(Default)]
 pub(super) struct Pictures {
     shown: Vec<FramePicture>,
@@ -53,7 +53,7 @@ pub(super) struct Pictures {
     pub(super) unreadable: usize,
 }
 
-/// Reads the frames worth showing, and a sample for quality.
+/// Reads the frames to show, and a sample for quality.
 pub(super) fn read(path: &Path, flight: &Flight) -> Result<Pictures, ReadError> {
     let shown = chosen(flight);
     let step = flight.frames.len().div_ceil(MEASURED).max(1);
@@ -75,7 +75,7 @@ pub(super) fn read(path: &Path, flight: &Flight) -> Result<Pictures, ReadError> 
     Ok(pictures)
 }
 
-/// Numbers of the frames to show: spread over the flight, of each part the one with most on it.
+/// Numbers of the frames to show: spread over the flight, in each part the frame with the most detections.
 fn chosen(flight: &Flight) -> Vec<u32> {
     let n = flight.frames.len();
     if flight.detections.is_empty() {
@@ -114,7 +114,7 @@ fn picture(image: &GrayImage, number: u32, t_s: f64, flight: &Flight) -> Option<
     Some(FramePicture { jpeg, width: image.width, height: image.height, t_s, number, seen })
 }
 
-/// Each pixel the mean of a block, so that the picture is no wider than [`WIDEST`].
+/// Each pixel is the mean of a block, so that the picture is no wider than [`WIDEST`].
 fn shrunk(image: &GrayImage) -> GrayImage {
     let block = image.width.div_ceil(WIDEST).max(1);
     let mut small = GrayImage::new(image.width / block, image.height / block);
@@ -131,7 +131,7 @@ fn shrunk(image: &GrayImage) -> GrayImage {
     small
 }
 
-/// The section; nothing without pictures.
+/// The section; empty without pictures.
 pub(super) fn section(pictures: &Pictures) -> Option<Section> {
     if pictures.shown.is_empty() {
         return None;
@@ -158,7 +158,7 @@ pub(super) fn section(pictures: &Pictures) -> Option<Section> {
     Some(Section { id: "frames", title: "Frames", body })
 }
 
-/// Outlines in the frame's own pixels; the centre of the first pixel is (½, ½) of the picture.
+/// Outlines in pixels of the full frame; the centre of the first pixel is (½, ½) of the picture.
 fn overlay(p: &FramePicture) -> String {
     let mut out = format!("<svg viewBox=\"0 0 {} {}\">", p.width, p.height);
     let size = p.width as f64 / 45.0;

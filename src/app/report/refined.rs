@@ -1,4 +1,4 @@
-//! What a refinement says of the configuration, and which measurements it could not explain.
+//! What a refinement shows about the configuration, and which measurements it rejected.
 
 use super::Context;
 use super::page::{Section, list, paragraph, table};
@@ -7,12 +7,12 @@ use crate::io::proto::windhover as wh;
 /// Outliers listed.
 const MOST_OUTLIERS: usize = 20;
 
-/// The section; nothing of a flight that was not refined.
+/// The section; empty for a flight that was not refined.
 pub(super) fn section(context: &Context<'_>) -> Option<Section> {
     let refined = context.flight.refined.as_ref()?;
     let mut body = paragraph(
-        "From the whole flight at once, afterwards: constants beside what the configuration states, with one sigma. What the \
-         flight does not tell stays about where it was expected.",
+        "Estimated from the whole flight, afterwards: constants beside the configured values, with one sigma. What the \
+         flight does not determine stays near its configured value.",
     );
     let told: Vec<Vec<String>> = refined.constants.iter().filter(|constant| constant.told).map(row).collect();
     if !told.is_empty() {
@@ -21,7 +21,7 @@ pub(super) fn section(context: &Context<'_>) -> Option<Section> {
     let silent: Vec<&str> =
         refined.constants.iter().filter(|c| !c.told).map(|constant| constant.name.as_str()).collect();
     if !silent.is_empty() {
-        body += &paragraph(&format!("Not told by this flight: {}.", silent.join(", ")));
+        body += &paragraph(&format!("Not determined by this flight: {}.", silent.join(", ")));
     }
     body += &list("", &refined.remarks);
     let rows: Vec<Vec<String>> = refined.sources.iter().map(source_row).collect();
@@ -38,7 +38,7 @@ pub(super) fn section(context: &Context<'_>) -> Option<Section> {
     if !outliers.is_empty() {
         body += &table(&["at s", "source", "marker", "square over the gate"], &outliers);
     }
-    Some(Section { id: "refined", title: "What the flight says of your configuration", body })
+    Some(Section { id: "refined", title: "Configuration as the flight shows it", body })
 }
 
 fn row(constant: &wh::RefinedConstant) -> Vec<String> {

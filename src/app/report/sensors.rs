@@ -1,4 +1,4 @@
-//! How the sensors did: rates, gaps, latency, losses, the fit of clocks.
+//! Sensors: rates, gaps, latency, losses, the fit of clocks.
 
 use super::page::{Section, figure, grid, table};
 use super::{Context, cloud, single};
@@ -6,22 +6,22 @@ use crate::io::proto::host_time;
 use crate::plot::{Ink, Mark};
 use windhover_base::time::MonoTime;
 
-/// One stream of messages: when each was true and when it was heard.
+/// One stream of messages: times of validity and of reception.
 pub(super) struct Stream {
     /// Its name.
     pub(super) name: &'static str,
-    /// (true, heard), in the order heard.
+    /// (validity, reception), in order of reception.
     pub(super) times: Vec<(MonoTime, MonoTime)>,
 }
 
-/// What a stream's times tell.
+/// Statistics of a stream's times.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Timing {
     /// Messages a second.
     pub(super) rate_hz: f64,
-    /// Usual time between two, ms.
+    /// Median time between two messages, ms.
     pub(super) median_ms: f64,
-    /// Longest time between two, ms, and when it began.
+    /// Longest time between two messages, ms, and when it began.
     pub(super) longest: (f64, MonoTime),
     /// Median and 95 % of the latency, ms.
     pub(super) latency_ms: (f64, f64),
@@ -69,7 +69,7 @@ impl Stream {
     }
 }
 
-/// The value below which this share lies; not a number for none.
+/// The value that this share does not exceed; NaN for no values.
 pub(super) fn quantile(values: &[f64], share: f64) -> f64 {
     let mut sorted: Vec<f64> = values.iter().copied().filter(|v| v.is_finite()).collect();
     sorted.sort_by(f64::total_cmp);
@@ -79,7 +79,7 @@ pub(super) fn quantile(values: &[f64], share: f64) -> f64 {
     }
 }
 
-/// The section; nothing where nothing was heard.
+/// The section; empty where nothing was received.
 pub(super) fn section(context: &Context<'_>) -> Option<Section> {
     let streams = streams(context);
     if streams.is_empty() && context.flight.reads == 0 {
@@ -156,7 +156,7 @@ fn latency_chart(context: &Context<'_>, streams: &[Stream]) -> String {
     if streams.is_empty() {
         return String::new();
     }
-    let mut chart = context.chart("Heard after it was true", "ms");
+    let mut chart = context.chart("From validity to reception", "ms");
     for (stream, ink) in streams.iter().zip([Ink::Blue, Ink::Orange, Ink::Green]) {
         let points: Vec<[f64; 2]> = stream
             .times
@@ -182,7 +182,7 @@ fn satellite_chart(context: &Context<'_>) -> String {
     for (name, points, ink) in [
         ("satellites", satellites, Ink::Blue),
         ("HDOP", hdop, Ink::Orange),
-        ("error it claims (m)", hpe, Ink::Green),
+        ("reported error (m)", hpe, Ink::Green),
     ] {
         if !points.is_empty() {
             chart.named(name, super::line(&points), ink);

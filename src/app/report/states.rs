@@ -1,4 +1,4 @@
-//! States over time: heading, speed and yaw rate of each target; the helicopter's own.
+//! States over time: heading, speed and yaw rate of each target; the helicopter's own state.
 
 use nalgebra::{Quaternion, UnitQuaternion};
 
@@ -53,7 +53,7 @@ const QUANTITIES: [Quantity; 3] = [
     },
 ];
 
-/// The section; nothing without targets.
+/// The section; empty without targets.
 pub(super) fn section(context: &Context<'_>) -> Option<Section> {
     let mut charts = String::new();
     for (k, (name, track)) in context.flight.targets.iter().enumerate() {
@@ -64,7 +64,7 @@ pub(super) fn section(context: &Context<'_>) -> Option<Section> {
     (!charts.is_empty()).then(|| Section { id: "states", title: "States", body: grid(&charts) })
 }
 
-/// Keeps an angle continuous: the turn nearest the last one.
+/// Keeps an angle continuous: adds the turns that bring it nearest to the last one.
 struct Unwrap {
     last: Option<f64>,
 }
@@ -100,7 +100,7 @@ fn chart_of(context: &Context<'_>, name: &str, track: &Track, q: &Quantity, with
     if reference.is_empty() {
         return String::new();
     }
-    // Other curves take the turn that the filter's has at the same frame.
+    // Other curves use the same number of turns as the filter's at the same frame.
     let beside = |frame: u32, value: f64| {
         if !q.angle {
             return value * q.scale;
@@ -140,7 +140,7 @@ fn chart_of(context: &Context<'_>, name: &str, track: &Track, q: &Quantity, with
     figure(&chart.render())
 }
 
-/// The helicopter's own flight; nothing where its state is not known.
+/// The helicopter's own flight; empty where its state is not known.
 pub(super) fn ownship_section(context: &Context<'_>) -> Option<Section> {
     let flight = context.flight;
     if flight.ownship.is_empty() {

@@ -1,4 +1,4 @@
-//! The flight in words and numbers.
+//! The flight as text and numbers.
 
 use super::Context;
 use super::accuracy::{covariance, errors_of, is_held};
@@ -8,7 +8,7 @@ use super::sensors::{quantile, streams};
 use crate::app::flight::Track;
 use crate::io::proto::windhover as wh;
 
-/// A sensor silent for longer than this many of its usual gaps (and a third of a second) is told of.
+/// A sensor is reported as silent after this many of its median gaps (and a third of a second).
 const LONG_GAP: f64 = 3.5;
 
 /// The section.
@@ -31,17 +31,17 @@ pub(super) fn section(context: &Context<'_>, pictures: &Pictures) -> Option<Sect
     Some(Section { id: "summary", title: "Summary", body })
 }
 
-/// What to say where there is nothing of any vehicle.
+/// The text where there are no data of any vehicle.
 fn without_targets(context: &Context<'_>) -> Option<&'static str> {
     let flight = context.flight;
     match (flight.targets.is_empty(), flight.ownship.is_empty()) {
         (false, _) => None,
         (true, false) => Some(
-            "No frame came from the camera, so no vehicle was looked for: the report tells of the helicopter's own \
+            "No frame was received from the camera, so no vehicle was searched for: the report covers the helicopter's own \
              flight alone.",
         ),
         (true, true) => Some(
-            "It holds no estimates: it is a bare capture. Replay it (windhover replay CAPTURE.mcap --out \
+            "It has no estimates: it is a capture. Replay it (windhover replay CAPTURE.mcap --out \
              FLIGHT.mcap) and report the result.",
         ),
     }
@@ -91,7 +91,7 @@ fn length(seconds: f64) -> String {
     format!("{} min {:02} s", (seconds / 60.0) as u64, (seconds % 60.0) as u64)
 }
 
-/// What is known of a track, for words and tiles.
+/// Data of a track for text and tiles.
 struct Known {
     held: f64,
     distance_m: f64,
@@ -102,7 +102,7 @@ struct Known {
 fn known(track: &Track) -> Option<Known> {
     let held: Vec<&wh::TargetState> = track.filtered.iter().filter(|s| is_held(s)).collect();
     let first = held.first()?;
-    // Speed over time, not the path: noise of position would lengthen it.
+    // The distance is speed over time, not the length of the path: noise of position would lengthen that.
     let mut distance_m = 0.0;
     let mut before = first;
     for s in &held {
@@ -129,11 +129,11 @@ fn known(track: &Track) -> Option<Known> {
 
 fn of_target(context: &Context<'_>, name: &str, track: &Track) -> String {
     let Some(k) = known(track) else {
-        return format!("{name} was never held: no state of it is known.");
+        return format!("{name} was never tracked: its state is not known.");
     };
     let lost = track.filtered.iter().filter(|s| !is_held(s)).count();
     let mut text = format!(
-        "{name} was held in {:.1} % of {} frames{}. It drove about {:.0} m, up to {:.1} m/s. ",
+        "{name} was tracked in {:.1} % of {} frames{}. It drove about {:.0} m, up to {:.1} m/s. ",
         100.0 * k.held,
         track.filtered.len(),
         if lost == 0 { ", without a break".to_owned() } else { String::new() },
@@ -189,7 +189,7 @@ fn troubles(context: &Context<'_>, pictures: &Pictures) -> Vec<String> {
     let flight = context.flight;
     let mut found = flight.warnings.clone();
     if !flight.had_frames() && !flight.health.is_empty() {
-        found.push("No frame came from the camera.".to_owned());
+        found.push("No frame was received from the camera.".to_owned());
     }
     for stream in streams(context) {
         let Some(t) = stream.timing() else { continue };
@@ -203,7 +203,7 @@ fn troubles(context: &Context<'_>, pictures: &Pictures) -> Vec<String> {
         }
         if t.latency_ms.0 < 0.0 {
             found.push(format!(
-                "The {} is stamped later than it was heard: its clock or latency is wrong.",
+                "The {} is stamped later than it was received: its clock or latency is wrong.",
                 stream.name
             ));
         }
@@ -235,15 +235,15 @@ fn troubles(context: &Context<'_>, pictures: &Pictures) -> Vec<String> {
         .filter(|n| n.name == windhover_base::msg::NoticeKind::FilterReset.name())
         .count();
     if resets > 0 {
-        found.push(format!("The filter started again {resets} times."));
+        found.push(format!("The filter was reset {resets} times."));
     }
     if pictures.unreadable > 0 {
-        found.push(format!("{} of the frames looked at could not be read.", pictures.unreadable));
+        found.push(format!("{} of the examined frames could not be read.", pictures.unreadable));
     }
     found
 }
 
-/// What did not fit the configuration: each thing once, as it was told last, and from when to when.
+/// Misfits of the configuration: each one once, with its last value, and its first and last time.
 fn misfits(context: &Context<'_>) -> Vec<String> {
     let mut known: Vec<(&wh::Misfit, f64, f64)> = Vec::new();
     for health in &context.flight.health {

@@ -1,4 +1,4 @@
-//! What the camera saw: markers, features, and how good the pictures were.
+//! Vision: markers, features, and image quality.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +9,7 @@ use super::{Context, cloud, line};
 use crate::io::proto::windhover as wh;
 use crate::plot::{Ink, Mark};
 
-/// The section; nothing without frames.
+/// The section; empty without frames.
 pub(super) fn section(context: &Context<'_>, pictures: &Pictures) -> Option<Section> {
     let flight = context.flight;
     if flight.detections.is_empty() && pictures.quality.is_empty() {

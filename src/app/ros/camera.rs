@@ -1,4 +1,4 @@
-//! The camera: images, lens, what was seen in them.
+//! The camera: images, lens, detections.
 
 use super::CAMERA;
 use crate::io::proto::windhover::{Detections, Marker};
@@ -9,10 +9,10 @@ use crate::io::ros::{
 use windhover_base::msg::{FrameEncoding, FramePayload};
 use windhover_base::time::MonoTime;
 
-/// How an image goes out.
+/// The encoding of an image.
 enum Form {
     Compressed(&'static str),
-    /// Bytes as they are, under this name.
+    /// Bytes without conversion, under this name.
     Raw(&'static str),
     /// A name for the first plane, which is luma.
     Luma,
@@ -65,7 +65,7 @@ pub(super) fn frame(
     }
 }
 
-/// The lens as `sensor_msgs` has it; the terms of another shape than it wants are zeros.
+/// The lens in the form of `sensor_msgs`; distortion of another number of terms is written as zeros.
 pub(super) fn lens(calibration: fox::CameraCalibration) -> CameraInfo {
     let distortion_model = match calibration.distortion_model.as_str() {
         "kannala_brandt" | "fisheye" => "equidistant".to_owned(),

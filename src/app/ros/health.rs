@@ -1,4 +1,4 @@
-//! How the parts do, as diagnostics and as the log.
+//! State of the parts, as diagnostics and as the log.
 
 use crate::io::proto::foxglove::log::Level;
 use crate::io::proto::windhover::{Health, SourceHealth, TargetHealth, TrackStatus};
@@ -11,7 +11,7 @@ const OK: u8 = 0;
 const WARN: u8 = 1;
 const STALE: u8 = 3;
 
-/// `/diagnostics`: a status a source, a target and a misfit, and one of the whole with every figure of the daemon.
+/// `/diagnostics`: one status for each source, target and misfit, and one of the whole with every value of the daemon.
 pub(super) fn diagnostics(health: &Health, log: MonoTime) -> RosRecord {
     let t = host_time(health.timestamp.as_ref());
     let mut status = vec![whole(health)];

@@ -1,4 +1,4 @@
-//! What a flight holds as messages of ROS 2: its outputs, frames and samples, in REP-103's axes and REP-105's frames.
+//! A flight as messages of ROS 2: its outputs, frames and samples, in REP-103's axes and REP-105's frames.
 //!
 //! | frame | axes | origin |
 //! |---|---|---|
@@ -37,13 +37,14 @@ const CAMERA: &str = "camera_optical_frame";
 const IMU: &str = "imu_link";
 const GPS: &str = "gps_link";
 
-/// Targets of a flight: a configuration has half as many at most.
+/// Most targets of a flight: a configuration has at most half as many.
 const TARGETS: usize = 64;
 
-/// Variance of what is not estimated, as mobile robots' drivers put it: finite, so that covariances stay invertible.
+/// Variance of a quantity that is not estimated, as in drivers of mobile robots: finite, so that covariances stay
+/// invertible.
 const NOT_ESTIMATED: f64 = 1e6;
 
-/// Turns what is kept into messages of ROS 2, in the order in which it is kept.
+/// Converts recorded messages to messages of ROS 2, in the same order.
 pub struct RosTranslator {
     imu: Option<ImuConfig>,
     antenna_m: [f64; 3],
@@ -55,7 +56,7 @@ pub struct RosTranslator {
 }
 
 impl RosTranslator {
-    /// For a flight of this configuration.
+    /// A translator for a flight of this configuration.
     pub fn new(config: Option<&Config>) -> Self {
         let reference =
             |target: &windhover_base::settings::TargetConfig| (target.name.clone(), target.reference_m);
@@ -80,7 +81,7 @@ impl RosTranslator {
         }
     }
 
-    /// Appends the messages of an output, by its topic. What is no output, or holds no figures, makes none.
+    /// Appends the messages of an output, by its topic. A message that is not an output, or has no values, makes none.
     ///
     /// # Errors
     /// The data is not a message of the topic's schema.
@@ -125,7 +126,7 @@ impl RosTranslator {
         let origin = Geodetic { lat_deg: datum.lat_deg, lon_deg: datum.lon_deg, height_m: datum.height_m };
         let frame = LocalFrame::new(origin);
         let at = origin.to_ecef();
-        // The columns of earth_from_map are where steps of a metre east, north and up lead.
+        // The columns of earth_from_map are the directions of steps of a metre east, north and up.
         let step = |ned: Vector3<f64>| frame.geodetic(&ned).to_ecef() - at;
         let axes = [Vector3::y(), Vector3::x(), -Vector3::z()].map(step);
         let matrix = nalgebra::Rotation3::from_basis_unchecked(&axes);
@@ -139,7 +140,7 @@ impl RosTranslator {
         self.constant(earth_from_map, log, out);
     }
 
-    /// The camera's mount; where helicopter and targets are is told from their states.
+    /// The camera's mount; transforms of helicopter and targets come from their states.
     fn mount(&mut self, tf: &fox::FrameTransform, log: MonoTime, out: &mut Vec<RosRecord>) {
         if (tf.parent_frame_id.as_str(), tf.child_frame_id.as_str()) != ("body", "camera") {
             return;
@@ -156,7 +157,7 @@ impl RosTranslator {
         self.constant(mount, log, out);
     }
 
-    /// A transform that does not change. Every message has all so far: who comes late gets the last one only.
+    /// A constant transform. Every message contains all so far, because a late subscriber gets only the last one.
     fn constant(&mut self, transform: Transform, log: MonoTime, out: &mut Vec<RosRecord>) {
         let stamp = transform.header.stamp;
         self.statics.insert(transform.child_frame_id.clone(), transform);
@@ -164,8 +165,8 @@ impl RosTranslator {
         out.push(RosRecord::new("/tf_static", log, stamp, &all));
     }
 
-    /// A target's name as ROS allows it in topics: letters, digits and `_`, no digit first, no two alike. `None` for more
-    /// targets than a flight has.
+    /// A target's name in characters that ROS allows in topics: letters, digits and `_`, no digit first, all different.
+    /// `None` for more targets than a flight has.
     fn ros_name(&mut self, target: &str) -> Option<String> {
         if let Some(known) = self.names.get(target) {
             return Some(known.clone());

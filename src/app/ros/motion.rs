@@ -11,7 +11,7 @@ use crate::io::ros::{Header, Imu, NavSatFix, Odometry, RosRecord, TfMessage, Tra
 use windhover_base::geo::{Geodetic, skew};
 use windhover_base::time::MonoTime;
 
-/// Forward-left-up of forward-right-down; the same way back.
+/// Converts forward-right-down to forward-left-up, and back.
 pub(super) fn flu(frd: &Vector3<f64>) -> Vector3<f64> {
     Vector3::new(frd.x, -frd.y, -frd.z)
 }
@@ -27,13 +27,13 @@ fn enu_from_ned() -> UnitQuaternion<f64> {
     UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(0.0, half, half, 0.0))
 }
 
-/// Row by row; matrices here are kept column by column and symmetric.
+/// Row by row; the matrices are stored by columns and are symmetric.
 fn rows<const N: usize, const M: usize>(p: &SMatrix<f64, N, N>) -> [f64; M] {
     std::array::from_fn(|k| p[(k / N, k % N)])
 }
 
-/// The symmetric matrix of an upper triangle given row by row; `None` for another number of terms, and
-/// for terms that are no numbers.
+/// The symmetric matrix of an upper triangle given row by row; `None` for another number of terms, and for terms that
+/// are not finite.
 fn symmetric<const N: usize>(upper: &[f64]) -> Option<SMatrix<f64, N, N>> {
     if upper.len() != N * (N + 1) / 2 || !upper.iter().all(|term| term.is_finite()) {
         return None;
@@ -56,12 +56,12 @@ fn nothing_known() -> Matrix6<f64> {
 
 /// Sets a covariance and its mirror.
 fn set(p: &mut Matrix6<f64>, (i, j): (usize, usize), value: f64) {
-    // Zero keeps its sign out of files.
+    // Adding zero removes the sign of −0 from files.
     (p[(i, j)], p[(j, i)]) = (value + 0.0, value + 0.0);
 }
 
 /// Yaw counts from east counter-clockwise, heading from north clockwise: yaw = π/2 − heading, their rates are opposite.
-/// Pose and twist covariances of the state (north, east, heading, speed, yaw rate): signs change, no figure does.
+/// Pose and twist covariances of the state (north, east, heading, speed, yaw rate): only signs change.
 fn target_covariances(p: &SMatrix<f64, 5, 5>) -> (Matrix6<f64>, Matrix6<f64>) {
     let (mut pose, mut twist) = (nothing_known(), nothing_known());
     set(&mut pose, (0, 0), p[(1, 1)]);
@@ -76,8 +76,8 @@ fn target_covariances(p: &SMatrix<f64, 5, 5>) -> (Matrix6<f64>, Matrix6<f64>) {
     (pose, twist)
 }
 
-/// Pose covariance of the helicopter's (north, east, down; velocity; rotations about north, east, down): the same figures
-/// in another order, down turned into up.
+/// Pose covariance of the helicopter's (north, east, down; velocity; rotations about north, east, down): the same
+/// values in another order, with down changed to up.
 fn ownship_pose(p: &SMatrix<f64, 9, 9>) -> Matrix6<f64> {
     const FROM: [(usize, f64); 6] = [(1, 1.0), (0, 1.0), (2, -1.0), (7, 1.0), (6, 1.0), (8, -1.0)];
     Matrix6::from_fn(|i, j| FROM[i].1 * FROM[j].1 * p[(FROM[i].0, FROM[j].0)] + 0.0)
@@ -102,7 +102,7 @@ fn ownship_twist(
     twist
 }
 
-/// Flights of earlier versions hold sigmas alone.
+/// Flights of earlier versions have sigmas only.
 fn ownship_covariance(own: &Ownship) -> Option<SMatrix<f64, 9, 9>> {
     symmetric(&own.covariance).or_else(|| {
         let (position, attitude) = (&own.position_sigma_m, &own.attitude_sigma_rad);
@@ -174,15 +174,15 @@ impl RosTranslator {
         transform(t, log, BASE_LINK, position, orientation, out);
     }
 
-    /// `/ownship/odometry_refined`: of what was found later.
+    /// `/ownship/odometry_refined`: the refined estimate.
     pub(super) fn ownship_refined(&self, own: &Ownship, log: MonoTime, out: &mut Vec<RosRecord>) {
         if let Some((odometry, _)) = ownship_odometry(own) {
             out.push(RosRecord::new("/ownship/odometry_refined", log, odometry.header.stamp, &odometry));
         }
     }
 
-    /// `/target/NAME/odometry`, `…/fix`, `/tf` of what is known now; of what was found later the odometry alone, under a name
-    /// of its own.
+    /// `/target/NAME/odometry`, `…/fix`, `/tf` of the real-time state; of later estimates the odometry alone, under its
+    /// own name.
     pub(super) fn target(&mut self, s: &TargetState, later: &str, log: MonoTime, out: &mut Vec<RosRecord>) {
         if !s.known || !s.is_sound() || s.status() == TrackStatus::Lost {
             return;
@@ -256,7 +256,7 @@ mod tests {
         assert!(level.angle() < 1e-7, "{level}");
     }
 
-    /// The body velocity's covariance against differences: each of the nine states moved by a little.
+    /// The covariance of body velocity against finite differences: each of the nine states is varied by a little.
     #[test]
     fn the_twist_takes_the_attitudes_error_along() {
         let v = Vector3::new(4.0, -3.0, 1.0);

@@ -1,4 +1,4 @@
-//! What sensors said: the receiver's fixes, rates and forces.
+//! Sensors: the receiver's fixes, rates and forces.
 
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 
@@ -10,8 +10,8 @@ use windhover_base::msg::InertialSample;
 use windhover_base::time::{MonoTime, Span};
 
 impl RosTranslator {
-    /// `/gps/fix`. The height is told where the receiver says it above the ellipsoid; its errors are taken as one sigma,
-    /// the horizontal one as that of both axes together.
+    /// `/gps/fix`. The height is given where the receiver reports it above the ellipsoid; its errors are taken as one
+    /// sigma, the horizontal one as that of both axes together.
     pub(super) fn fix(&mut self, epoch: &GnssEpoch, log: MonoTime, out: &mut Vec<RosRecord>) {
         let t = host_time(epoch.timestamp.as_ref());
         if !self.statics.contains_key(GPS) {
@@ -46,8 +46,8 @@ impl RosTranslator {
         out.push(RosRecord::new("/gps/fix", log, t, &fix));
     }
 
-    /// `/imu/data`, in the sensor's own axes, with their mount as a transform and the configured noise as covariance (of a
-    /// tenth of a second's mean; zeros, "not known", without a configuration).
+    /// `/imu/data`, in the sensor's own axes, with their mount as a transform and the configured noise as covariance
+    /// (of the mean over a tenth of a second; without a configuration zeros, which mean "not known").
     pub(super) fn inertial(&mut self, sample: &InertialSample, heard: MonoTime, out: &mut Vec<RosRecord>) {
         let settings = self.imu.unwrap_or_default();
         let t = heard - Span::from_ms(settings.latency_ms);
@@ -75,7 +75,7 @@ impl RosTranslator {
     }
 }
 
-/// The covariance of a vector that is there, or ROS's word for one that is not.
+/// The covariance of a vector that is present, or ROS's value for an absent one.
 fn of(figures: Option<Vector3<f64>>, sigma: f64) -> [f64; 9] {
     figures.map_or(diagonal(-1.0, 0.0), |_| diagonal(sigma * sigma, sigma * sigma))
 }

@@ -1,4 +1,4 @@
-//! The data card's sink: events as they arrived, records, the flight's date, where vehicles are in the image.
+//! The data card's sink: events as they arrived, records, the flight's date, places of the vehicles in the image.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use windhover_base::msg::{Event, GnssEpoch, MarkerDetection, Output, SensorReadi
 use windhover_base::settings::CameraConfig;
 use windhover_base::time::{MonoTime, UtcTime};
 
-/// Keeps everything on the data card, while there is one.
+/// Stores everything on the data card, while there is one.
 pub struct CardSink {
     camera: CameraConfig,
     flight_store: FlightStore,
@@ -22,12 +22,12 @@ pub struct CardSink {
 }
 
 impl CardSink {
-    /// Onto the store in this flight_store. The link is told when its flight is closed.
+    /// A sink into this store. It reports to the link when its flight is closed.
     pub fn new(camera: CameraConfig, flight_store: FlightStore, downlink: Downlink) -> Self {
         Self { camera, flight_store, downlink, began: None, dated: false, opened: false }
     }
 
-    /// The flight's name is the UTC of its start, as the receiver tells it.
+    /// Sets the flight's name: the UTC of its start, as the receiver reports it.
     fn date(&mut self, epoch: &Stamped<GnssEpoch>, store: &StoreHandle) {
         if let (false, Some(utc), Some(began)) = (self.dated, epoch.value.utc, self.began) {
             let start = UtcTime::from_unix_ns(utc.unix_ns() - (epoch.t_valid - began).ns());
@@ -45,7 +45,7 @@ impl Sink for CardSink {
             }
             return;
         };
-        // A flight opened anew begins with what every flight begins with, and wants its date again.
+        // A reopened flight begins with the same messages as any flight, and needs its date again.
         if !std::mem::replace(&mut self.opened, true) {
             self.dated = false;
             for record in records::opening(&self.camera, event.t_recv) {
@@ -71,7 +71,7 @@ impl Sink for CardSink {
     }
 }
 
-/// Pixels of everything seen of vehicles.
+/// Pixels of all detections of vehicles.
 fn pixels(markers: &[MarkerDetection]) -> impl Iterator<Item = (f64, f64)> + '_ {
     markers.iter().flat_map(|marker| {
         let corners = marker.corners_px.unwrap_or([marker.center_px; 4]);

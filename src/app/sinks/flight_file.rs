@@ -1,4 +1,4 @@
-//! The flight file of a replay: what the recording has, and the outputs anew.
+//! The flight file of a replay: the messages of the recording, and new outputs.
 
 use std::path::PathBuf;
 
@@ -9,7 +9,7 @@ use crate::io::records::{self, topic};
 use windhover_base::settings::CameraConfig;
 use windhover_base::time::MonoTime;
 
-/// Writes a flight: begun when the first message is there, in its place when it is finished.
+/// Writes a flight: the file is created with the first message and gets its name when it is finished.
 pub struct FlightFile {
     path: PathBuf,
     config_toml: String,
@@ -19,12 +19,12 @@ pub struct FlightFile {
 }
 
 impl FlightFile {
-    /// At `path`, with the configuration attached.
+    /// A flight at `path`, with the configuration attached.
     pub fn new(path: PathBuf, config_toml: String, camera: CameraConfig) -> Self {
         Self { path, config_toml, camera, writer: None, fault: None }
     }
 
-    /// Copies a message of the recording, unless a replay makes it anew.
+    /// Copies a message of the recording, unless the replay makes a new one.
     ///
     /// # Errors
     /// The file cannot be made or written.
@@ -43,7 +43,7 @@ impl FlightFile {
         records::opening(&self.camera, t).iter().try_for_each(|record| writer.write(record))
     }
 
-    /// Whether everything given to it so far was written.
+    /// Checks that everything passed to it so far was written.
     ///
     /// # Errors
     /// The first record that was not.
@@ -54,7 +54,7 @@ impl FlightFile {
     /// Ends the file.
     ///
     /// # Errors
-    /// What was left cannot be written.
+    /// The rest cannot be written.
     pub fn finish(self) -> Result<(), WriteError> {
         self.writer.map_or(Ok(()), |writer| writer.close(&self.path))
     }

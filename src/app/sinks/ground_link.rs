@@ -4,11 +4,11 @@ use crate::app::downlink::Downlink;
 use crate::app::sink::{OutgoingRecord, Sink};
 use windhover_base::msg::{Event, TimedOutput};
 
-/// Gives the link what goes down, and records the numbers under which stations know them.
+/// Passes records to the link, and stores the numbers under which stations know them.
 pub struct LinkSink(Downlink);
 
 impl LinkSink {
-    /// Into this link.
+    /// A sink into this link.
     pub fn new(downlink: Downlink) -> Self {
         Self(downlink)
     }

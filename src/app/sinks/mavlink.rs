@@ -4,11 +4,11 @@ use crate::app::downlink::Downlink;
 use crate::app::sink::Sink;
 use windhover_base::msg::TimedOutput;
 
-/// Gives MAVLink the outputs of which its messages are made.
+/// Passes to MAVLink the outputs that its messages need.
 pub struct MavlinkSink(Downlink);
 
 impl MavlinkSink {
-    /// Into this link's MAVLink.
+    /// A sink into this link's MAVLink.
     pub fn new(downlink: Downlink) -> Self {
         Self(downlink)
     }

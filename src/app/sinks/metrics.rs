@@ -1,4 +1,4 @@
-//! Metrics' sink: the latest health, for whoever asks for it.
+//! Metrics' sink: the latest health, for requests.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -8,12 +8,12 @@ use crate::app::sink::{OutgoingRecord, Sink};
 use crate::io::proto::windhover::Health;
 use crate::io::records::Schema;
 
-/// The latest health, shared with the task that tells it.
+/// The latest health, shared with the task that serves it.
 #[derive(Clone, Debug, Default)]
 pub struct LatestHealth(Arc<Mutex<Option<Health>>>);
 
 impl LatestHealth {
-    /// It, once there is one.
+    /// The latest health, once there is one.
     pub fn get(&self) -> Option<Health> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
@@ -23,7 +23,7 @@ impl LatestHealth {
 pub struct MetricsSink(LatestHealth);
 
 impl MetricsSink {
-    /// Into this place.
+    /// A sink into this place.
     pub fn new(latest: LatestHealth) -> Self {
         Self(latest)
     }

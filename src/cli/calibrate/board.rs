@@ -11,9 +11,9 @@ use crate::plot::MADE_BY;
 use windhover_calibrate::TagGrid;
 use windhover_detect::tag_pattern;
 
-/// Draw a calibration target to print, as SVG in real size: a chessboard, or a grid of tags.
+/// Draw a calibration target for printing, as SVG in real size: a chessboard, or a grid of tags.
 ///
-/// Print at 100 %, measure with a ruler, and glue the sheet to something flat and stiff.
+/// Print it at 100 %, measure it with a ruler, and glue the sheet to something flat and stiff.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
   windhover calibrate board --board 9x6 --square-m 0.025

@@ -16,16 +16,16 @@ use windhover_base::msg::MarkerId;
 use windhover_base::msg::TagFamily;
 use windhover_calibrate::boresight::{Boresight, Finding, boresight};
 
-/// Calibrate how camera and compass are mounted and timed, from flights over markers at rest.
+/// Calibrate mounting and timing of camera and compass, from flights over markers at rest.
 ///
-/// Flights must hold what the pipeline saw: replay a bare capture first. Markers are those of static
-/// targets of the configuration, or all where no target is static. Uncertainties are one sigma.
+/// Flights must have the pipeline's detections: replay a capture first. Markers are those of static targets of the
+/// configuration, or all where no target is static. Uncertainties are one sigma.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
   windhover calibrate boresight flight.mcap
   windhover calibrate boresight a.mcap b.mcap --surveyed 7:30.069604785,-85.575391587,6.0
 
-What the flights did not tell is marked so, with what to fly to tell it.")]
+Quantities that the flights do not determine are marked, with the manoeuvre that would determine them.")]
 pub(super) struct Args {
     /// Flights: files, or directories of segments
     #[arg(required = true, value_name = "FLIGHT")]
@@ -33,7 +33,7 @@ pub(super) struct Args {
     /// Configuration; the one attached to the first flight where absent
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// A marker whose position is known: ID:LAT,LON,HEIGHT (degrees, metres over the ellipsoid)
+    /// A marker whose position is known: ID:LAT,LON,HEIGHT (degrees, metres above the ellipsoid)
     #[arg(long, value_name = "ID:LAT,LON,HEIGHT")]
     surveyed: Vec<Surveyed>,
     /// One-sigma of surveyed positions, metres
@@ -72,7 +72,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     for (path, flight) in args.flights.iter().zip(&flights) {
         if flight.detections.is_empty() && !flight.frames.is_empty() {
             return Err(CliError::failed(format!(
-                "{} is a bare capture: replay it first (windhover replay {0} --out FLIGHT.mcap)",
+                "{} is a capture: replay it first (windhover replay {0} --out FLIGHT.mcap)",
                 path.display()
             )));
         }
@@ -81,7 +81,7 @@ pub(super) fn run(args: &Args) -> CliResult {
         (Some(path), _) => config_file::load(path).map_err(CliError::config)?,
         (None, Some(config)) => config,
         (None, None) => {
-            return Err(CliError::usage("the flight carries no configuration: give --config FILE"));
+            return Err(CliError::usage("the flight has no configuration: give --config FILE"));
         }
     };
     let first = flights.first().ok_or_else(|| CliError::usage("no flight was given"))?;
@@ -141,14 +141,14 @@ fn name_of(marker: MarkerId) -> String {
 fn print_text(found: &Boresight, config: &Config) -> CliResult {
     outln!("{} pixel coordinates, residual {:.3} px (root mean square)", found.pixels, found.rms_px)?;
     if found.refused > 0 {
-        outln!("{} measurements lay outside the gate and were left out", found.refused)?;
+        outln!("{} measurements were outside the gate and were left out", found.refused)?;
     }
     outln!("\n                         value  one sigma")?;
     for f in &found.parameters {
-        let note = if f.told { "" } else { "   not told by these flights" };
+        let note = if f.told { "" } else { "   not determined by these flights" };
         outln!("{:<20} {:>9.3} {:>9.3} {:<3}{note}", f.name, f.value, f.sigma, f.unit)?;
     }
-    outln!("\ncamera against compass (what positions a vehicle)")?;
+    outln!("\ncamera relative to compass (which determines a vehicle's position)")?;
     for f in &found.camera_to_compass {
         outln!("{:<20} {:>9.3} {:>9.3} {}", f.name, f.value, f.sigma, f.unit)?;
     }

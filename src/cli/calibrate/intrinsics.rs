@@ -18,10 +18,10 @@ use windhover_calibrate::{PlaneView, WINDOW_PX, find_corners};
 
 /// Calibrate the lens from photographs of a printed chessboard or grid of tags.
 ///
-/// Corners are found without help, whichever way the board is turned. Photographs that cannot be
-/// used are named with the reason. Uncertainties are one sigma (MATLAB's toolbox prints three).
-/// At the end stands the block for the configuration. Take 15 to 30 photographs, the board tilted
-/// by 20 to 45 degrees in different directions and near every edge of the image.
+/// Corners are found automatically, in every orientation of the board. Photographs that cannot be used are listed with
+/// the reason. Uncertainties are one sigma (MATLAB's toolbox prints three). The output ends with the block for the
+/// configuration. Take 15 to 30 photographs, the board tilted by 20 to 45 degrees in different directions and near
+/// every edge of the image.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
   windhover calibrate intrinsics photos/*.png --board 9x6 --square-m 0.025 --plots plots
@@ -33,14 +33,14 @@ pub(super) struct Args {
     images: Vec<PathBuf>,
     #[command(flatten)]
     target: TargetArgs,
-    /// Half the window in which a chessboard's corner is placed, pixels; of it only what is nearer to the
-    /// corner's own edges than to the next ones is used. The default is what OpenCV's calibration uses
+    /// Half the window in which a chessboard's corner is located, pixels; only the part that is nearer to the corner's
+    /// own edges than to the next ones is used. The default is that of OpenCV's calibration
     #[arg(long, value_name = "PX", value_parser = positive, default_value_t = WINDOW_PX)]
     window: f64,
     /// Keep the third radial term at zero
     #[arg(long)]
     no_k3: bool,
-    /// Estimate how far the pixel axes are from square
+    /// Also estimate the skew of the pixel axes
     #[arg(long)]
     skew: bool,
     /// Draw residuals, error per image and coverage into this directory
@@ -54,7 +54,7 @@ pub(super) struct Args {
 /// The drawings.
 const PLOTS: [&str; 3] = ["residuals.svg", "per_image.svg", "coverage.svg"];
 
-/// A photograph and what was found on it.
+/// A photograph and its detections.
 struct Photo {
     name: String,
     found: Result<PlaneView, String>,

@@ -1,4 +1,4 @@
-//! What was photographed: a chessboard or a grid of tags, as arguments.
+//! The photographed target as arguments: a chessboard or a grid of tags.
 
 use std::str::FromStr;
 
@@ -18,7 +18,7 @@ pub(super) struct TargetArgs {
     /// A grid of tags numbered from 0 row by row: edge of a tag's black square, metres
     #[arg(long, value_name = "METRES", value_parser = positive, conflicts_with = "square_m", requires = "gap_m")]
     tag_m: Option<f64>,
-    /// White between one tag's black square and the next one's, metres
+    /// Gap between one tag's black square and the next one's, metres
     #[arg(long, value_name = "METRES", value_parser = positive, requires = "tag_m")]
     gap_m: Option<f64>,
     /// Family of the tags
@@ -26,7 +26,7 @@ pub(super) struct TargetArgs {
     family: TagFamily,
 }
 
-/// The same, sorted out.
+/// The same, as one value.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Target {
     /// A chessboard.
@@ -87,5 +87,5 @@ pub(super) fn positive(text: &str) -> Result<f64, String> {
 fn family(name: &str) -> Result<TagFamily, String> {
     let known = || TagFamily::ALL.map(TagFamily::name).join(", ");
     let found = TagFamily::ALL.into_iter().find(|f| f.name() == name);
-    found.ok_or_else(|| format!("no such family; there are {}", known()))
+    found.ok_or_else(|| format!("unknown family; the families are {}", known()))
 }

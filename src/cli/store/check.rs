@@ -14,8 +14,8 @@ use crate::io::store::seal::{Condition, condition};
 use crate::io::store::volume::Volume;
 use crate::text::counted;
 
-/// What was found: what is wrong, and what the daemon finishes by itself at its next start (a kill or a power cut
-/// leaves it so, and nothing is lost).
+/// The findings: errors, and what the daemon completes at its next start (after a kill or a power cut; nothing is
+/// lost).
 #[derive(Default)]
 struct Found {
     wrong: usize,
@@ -34,8 +34,8 @@ impl Found {
     }
 }
 
-/// Reads every byte of the flights; says what is wrong; compares with the index where `all` are
-/// looked at and nobody else has it open. `called` is how `store` was called, for advice.
+/// Reads every byte of the flights; reports errors; compares with the index where `all` flights are read and no process
+/// has the index open. `called` is the command line of `store`, for advice.
 pub(super) fn verify(root: &Path, names: &[String], all: bool, called: &str) -> CliResult {
     let present = inspect::in_the_air(root)?;
     let mut found = Found::default();
@@ -52,16 +52,18 @@ pub(super) fn verify(root: &Path, names: &[String], all: bool, called: &str) -> 
     if unfinished > 0 {
         let things = counted(unfinished, "thing");
         outln!(
-            "{things} unfinished, and none of them lost: the daemon finishes it at its next start, or `{called} repair`"
+            "{things} unfinished, without loss: completed by the daemon at its next start, or by `{called} repair`"
         )?;
     }
     if wrong == 0 {
         return Ok(());
     }
-    Err(CliError::failed(format!("the store is not whole; `{called} repair` and `{called} rebuild` mend it")))
+    Err(CliError::failed(format!(
+        "the store has errors; `{called} repair` and `{called} rebuild` correct them"
+    )))
 }
 
-/// Reads a flight's segments; how many.
+/// Reads a flight's segments; returns their number.
 fn verify_flight(root: &Path, name: &str, found: &mut Found) -> Result<usize, CliError> {
     let dir = root.join(FLIGHTS).join(name);
     let is_closed = dir.join(flight::FLIGHT_FILE).exists();
@@ -77,7 +79,8 @@ fn verify_flight(root: &Path, name: &str, found: &mut Found) -> Result<usize, Cl
             }
             Condition::CutOff { chunks, cut_bytes } => {
                 let (chunks, cut) = (counted(chunks, "chunk"), counted(cut_bytes, "byte"));
-                let words = format!("was cut off; {chunks} whole, {cut} behind them were never acknowledged");
+                let words =
+                    format!("was cut off; {chunks} complete, {cut} after them were never acknowledged");
                 found.unfinished(&format!("{name}/{segment_name}: {words}"))?;
             }
         }
@@ -91,7 +94,7 @@ fn verify_flight(root: &Path, name: &str, found: &mut Found) -> Result<usize, Cl
 fn verify_index(root: &Path, called: &str, found: &mut Found) -> CliResult {
     let dir = root.join(INDEX);
     if !dir.exists() {
-        return found.unfinished(&format!("no index; the daemon makes it, or `{called} rebuild`"));
+        return found.unfinished(&format!("there is no index; the daemon makes it, or `{called} rebuild`"));
     }
     if inspect::is_recording(root) {
         return Ok(outln!("the daemon has the index; it was not compared")?);
@@ -106,7 +109,7 @@ fn verify_index(root: &Path, called: &str, found: &mut Found) -> CliResult {
     }
 }
 
-/// Seals what is not whole.
+/// Seals incomplete segments.
 pub(super) fn repair(root: &Path, names: &[String]) -> CliResult {
     let present = inspect::in_the_air(root)?;
     let volume = Volume::new(root);
@@ -122,18 +125,18 @@ pub(super) fn repair(root: &Path, names: &[String]) -> CliResult {
         mended += done.len();
         done.iter().try_for_each(|line| outln!("{line}"))?;
         if left.is_none() {
-            outln!("{name}: held nothing and was removed")?;
+            outln!("{name}: was empty and was removed")?;
         }
     }
     outln!("{} mended", counted(mended, "segment"))?;
     Ok(())
 }
 
-/// Makes the index again. The new one is made beside the old and takes its place when it is whole.
+/// Rebuilds the index. The new one is made beside the old and replaces it when it is complete.
 pub(super) fn rebuild(root: &Path) -> CliResult {
     if inspect::is_recording(root) {
         return Err(CliError::failed(
-            "the daemon records to this store and mends its index itself; stop it first",
+            "the daemon records to this store and maintains its index; stop it first",
         ));
     }
     let (dir, fresh) = (root.join(INDEX), root.join("index.new"));
@@ -157,6 +160,6 @@ pub(super) fn rebuild(root: &Path) -> CliResult {
     }
     std::fs::rename(&fresh, &dir)?;
     Volume::new(root).sync_dir("")?;
-    outln!("index of {} made again", counted(flights.len(), "flight"))?;
+    outln!("index of {} rebuilt", counted(flights.len(), "flight"))?;
     Ok(())
 }

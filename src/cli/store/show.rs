@@ -12,7 +12,7 @@ use crate::io::store::wear;
 use crate::text::{counted, one_line};
 use windhover_base::time::{Civil, UtcTime};
 
-/// Silences shorter than this are not worth a line.
+/// Gaps shorter than this are not listed.
 const GAP_SHOWN_NS: u64 = 1_000_000_000;
 
 pub(super) fn list(root: &Path, json: bool) -> CliResult {
@@ -41,7 +41,7 @@ pub(super) fn list(root: &Path, json: bool) -> CliResult {
 fn marks(info: &FlightInfo, present: Option<&str>) -> String {
     let mut marks = Vec::new();
     if present == Some(&info.name) {
-        marks.push("in the air");
+        marks.push("being recorded");
     } else if !info.closed {
         marks.push("not sealed");
     }
@@ -132,7 +132,7 @@ fn rate_hz(stats: &TopicStats) -> f64 {
 fn show_dropouts(dropouts: &[Dropout], clock: &FlightClock) -> CliResult {
     outln!()?;
     if dropouts.is_empty() {
-        outln!("  nothing was dropped")?;
+        outln!("  no data were dropped")?;
     }
     for d in dropouts {
         let count: u64 = d.messages.values().sum();
@@ -157,18 +157,18 @@ fn show_wear(info: &FlightInfo, capacity: Option<u64>) -> CliResult {
     }
     let rate = info.bytes as f64 / seconds;
     outln!(
-        "\n  recording like this costs the card {} an hour; one of {}",
+        "\n  recording like this writes {} an hour to the card; one of {}",
         size(((rate + wear::OVERHEAD_BYTES_PER_S) * 3600.0) as u64),
         size(capacity)
     )?;
     for cycles in [10_000.0, 100_000.0] {
         let life = wear::life(capacity, cycles, rate);
-        outln!("    and {cycles:>6} cycles lasts about {:.0} hours in the air", life.hours)?;
+        outln!("    and {cycles:>6} cycles lasts about {:.0} hours of recording", life.hours)?;
     }
     Ok(())
 }
 
-/// Bytes for people.
+/// Bytes in a readable form.
 pub(super) fn size(bytes: u64) -> String {
     match bytes as f64 {
         b if b >= 1e9 => format!("{:.2} GB", b * 1e-9),
@@ -177,7 +177,7 @@ pub(super) fn size(bytes: u64) -> String {
     }
 }
 
-/// A length of time for people.
+/// A duration in a readable form.
 fn span(ns: u64) -> String {
     let s = ns / 1_000_000_000;
     if s >= 3600 {
@@ -187,8 +187,8 @@ fn span(ns: u64) -> String {
     }
 }
 
-/// Times of a flight for people. A flight that has its date is named after the UTC of its start, as the receiver told it;
-/// of any other only host time is known.
+/// Times of a flight in a readable form. A flight with a date is named after the UTC of its start, from the receiver;
+/// for any other flight only host time is known.
 struct FlightClock {
     /// UTC less host time, to a second.
     utc_minus_host_ns: Option<i64>,
@@ -214,7 +214,7 @@ impl FlightClock {
     }
 }
 
-/// UTC of the start of a flight named `YYYYMMDDTHHMMSSZ`, with `-N` behind it or not.
+/// UTC of the start of a flight named `YYYYMMDDTHHMMSSZ`, with or without `-N`.
 fn utc_of_name(name: &str) -> Option<UtcTime> {
     let date = name.get(..16).filter(|date| date.is_ascii() && date.ends_with('Z'))?;
     let number = |from: usize, to: usize| date[from..to].parse::<u8>().ok();

@@ -1,4 +1,4 @@
-//! Pixel formats by their V4L2 names, and which of those offered is taken.
+//! Pixel formats by their V4L2 names, and the choice among the offered ones.
 
 use windhover_base::msg::{Bayer, FrameEncoding};
 use windhover_base::settings::PixelFormat;
@@ -6,7 +6,7 @@ use windhover_base::settings::PixelFormat;
 /// A four-character code of V4L2.
 pub(super) type FourCc = [u8; 4];
 
-/// The code V4L2 knows a format by.
+/// The V4L2 code of a format.
 pub(super) const fn fourcc(format: PixelFormat) -> FourCc {
     match format {
         PixelFormat::Grey => *b"GREY",
@@ -26,7 +26,7 @@ pub(super) const fn fourcc(format: PixelFormat) -> FourCc {
     }
 }
 
-/// How frames of a V4L2 format are read; `None` where they are not understood.
+/// How frames of a V4L2 format are read; `None` where they are not supported.
 pub(super) const fn encoding(code: FourCc) -> Option<FrameEncoding> {
     Some(match &code {
         b"GREY" | b"Y8  " | b"Y800" => FrameEncoding::Grey,
@@ -48,15 +48,15 @@ pub(super) const fn encoding(code: FourCc) -> Option<FrameEncoding> {
     })
 }
 
-/// Formats in the order they are preferred when what was asked for is not offered: those whose grey
-/// is read off directly first, lossy ones last.
+/// Formats in order of preference when the requested one is not offered: first those whose grey values are read
+/// directly, last the lossy ones.
 const PREFERENCE: [FourCc; 18] = [
     *b"GREY", *b"Y8  ", *b"Y800", *b"NV12", *b"YUYV", *b"UYVY", *b"RGB3", *b"BGR3", *b"Y10P", *b"Y10 ",
     *b"Y12 ", *b"Y16 ", *b"RGGB", *b"BA81", *b"GBRG", *b"GRBG", *b"MJPG", *b"JPEG",
 ];
 
-/// Which format to ask the driver for: `asked` where it is offered (or where the driver offers no
-/// list), else the preferred one of those understood; `None` where none is.
+/// The format to request from the driver: `asked` where it is offered (or where the driver offers no list), else the
+/// most preferred of the supported ones; `None` where none is supported.
 pub(super) fn choose(asked: FourCc, offered: &[FourCc]) -> Option<FourCc> {
     if offered.is_empty() || offered.contains(&asked) {
         return Some(asked);
@@ -64,7 +64,7 @@ pub(super) fn choose(asked: FourCc, offered: &[FourCc]) -> Option<FourCc> {
     PREFERENCE.into_iter().find(|code| offered.contains(code))
 }
 
-/// A code as people write it.
+/// A code in its readable form.
 pub(super) fn name(code: FourCc) -> String {
     code.iter().map(|&byte| if byte.is_ascii_graphic() { char::from(byte) } else { '.' }).collect()
 }

@@ -1,4 +1,4 @@
-//! The camera as a task: a V4L2 device, a recording of one played at its own pace, or another program's frames.
+//! The camera as a task: a V4L2 device, a recording played at its own pace, or frames of another program.
 
 mod format;
 mod recorded;
@@ -14,23 +14,23 @@ use windhover_base::settings::PixelFormat;
 use super::clock::HostClock;
 use super::device::{Backoff, Report, Reports};
 
-/// What is asked of the camera.
+/// The requested settings of the camera.
 #[derive(Clone, PartialEq, Debug)]
 pub struct CameraSettings {
-    /// Path of a V4L2 device; `capture:PATH` for a recording (`capture-loop:PATH` plays it for ever); `socket:PATH` for
-    /// frames of another program (`socket.rs`).
+    /// Path of a V4L2 device; `capture:PATH` for a recording (`capture-loop:PATH` plays it repeatedly); `socket:PATH`
+    /// for frames of another program (`socket.rs`).
     pub device: String,
     /// Frame width, pixels.
     pub width: u32,
     /// Frame height, pixels.
     pub height: u32,
-    /// Frames a second asked for.
+    /// Requested frame rate, frames a second.
     pub fps: f64,
-    /// Format asked for; any other that is understood is used where the driver gives it.
+    /// Requested format; another supported format is used where the driver delivers that.
     pub pixel_format: PixelFormat,
 }
 
-/// Delivers frames for ever; dropping the future closes the camera.
+/// Delivers frames without end; dropping the future closes the camera.
 pub async fn run(settings: &CameraSettings, clock: HostClock, reports: Reports<'_>) -> Infallible {
     let recording = |prefix| settings.device.strip_prefix(prefix).map(str::to_owned);
     let mut backoff = Backoff::new();

@@ -1,6 +1,6 @@
 //! A recorded camera: the frames of a capture or a folder of images, delivered at their own pace.
 //!
-//! It stands in for the device in tests and measurements: everything after the V4L2 call is the same.
+//! It replaces the device in tests and measurements: everything after the V4L2 call is the same.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -15,10 +15,10 @@ use crate::io::device::{Fault, FaultKind, NoteKind, Report, Reports, wait_for};
 use windhover_base::msg::{EventBody, FrameEncoding, FramePayload};
 use windhover_base::time::{MonoTime, Span};
 
-/// Frames that wait for the task, as in a driver's buffers; the player waits while so many do.
+/// Frames that wait for the task, as in a driver's buffers; with this many the player waits.
 const WAITING: usize = 12;
 
-/// The next image is read this share of a frame time after one was delivered.
+/// After a frame was delivered, the next image is read after this share of a frame time.
 const READ_AFTER: f64 = 0.25;
 
 /// A recorded frame and when it was delivered, both on the recording's own clock.
@@ -27,7 +27,7 @@ struct Recorded {
     frame: FramePayload,
 }
 
-/// What the player delivers.
+/// A report of the player.
 enum Played {
     /// The recording can be read.
     Opened,
@@ -37,8 +37,8 @@ enum Played {
     Unusable(Fault),
 }
 
-/// Delivers a recording's frames for ever, or until it cannot be read. Reading files blocks, so a thread of its own
-/// plays it as a driver does a camera's frames, and the task takes what it delivers.
+/// Delivers a recording's frames without end, or until it cannot be read. Reading files blocks, so a thread plays it,
+/// as a driver does for a camera, and the task takes the frames.
 pub(super) async fn play(
     path: &str,
     settings: &CameraSettings,
@@ -63,7 +63,7 @@ pub(super) async fn play(
     wait_for(std::future::pending(), reports).await
 }
 
-/// Plays a recording on a thread of its own, until its end or until nobody takes the frames.
+/// Plays a recording on its own thread, until its end or until nothing takes the frames.
 struct Player {
     path: String,
     frame_time: Span,
@@ -100,11 +100,11 @@ impl Player {
                 if self.delivered.blocking_send(Played::Frame(frame)).is_err() {
                     return Ok(());
                 }
-                // A driver takes no processor from those who handle its frame; reading the next one does.
+                // A driver takes no processor time from those who handle its frame; reading the next file does.
                 self.wait_until(began + played + Span::from_s(self.frame_time.s() * READ_AFTER));
             }
             if first.is_none() {
-                return Err(Fault::new(FaultKind::Unsuitable, &self.path, "holds no camera frame"));
+                return Err(Fault::new(FaultKind::Unsuitable, &self.path, "has no camera frames"));
             }
             if !self.again {
                 return Ok(());
@@ -133,11 +133,11 @@ fn open(path: &Path) -> Result<Box<dyn Iterator<Item = Recorded>>, String> {
     })))
 }
 
-/// The list of a folder's images: `time_s,file`, a row an image, after a header row.
+/// The list of a folder's images: `time_s,file`, a row for each image, after a header row.
 const TIMES: &str = "times.csv";
 
-/// Images of a folder by its list; an image is read when it is due. Images that cannot be read are
-/// left out.
+/// Images of a folder, in the order of its list; an image is read when it is due. Images that cannot be read are left
+/// out.
 fn folder(path: &Path) -> Result<impl Iterator<Item = Recorded> + use<>, String> {
     let list = path.join(TIMES);
     let text = std::fs::read_to_string(&list).map_err(|e| format!("cannot read {}: {e}", list.display()))?;
@@ -147,13 +147,13 @@ fn folder(path: &Path) -> Result<impl Iterator<Item = Recorded> + use<>, String>
         let time: f64 = time
             .trim()
             .parse()
-            .map_err(|_| format!("{}, line {}: {time:?} is no time", list.display(), number + 1))?;
+            .map_err(|_| format!("{}, line {}: {time:?} is not a time", list.display(), number + 1))?;
         images.push((MonoTime::from_ns(0) + Span::from_s(time), path.join(file.trim())));
     }
     Ok(images.into_iter().filter_map(|(t, file)| Some(Recorded { t_recv: t, frame: image(t, &file)? })))
 }
 
-/// An image file as a frame: PGM as raw grey, JPEG and PNG as they are.
+/// An image file as a frame: PGM as raw grey, JPEG and PNG without conversion.
 fn image(t_exposure: MonoTime, file: &Path) -> Option<FramePayload> {
     let data = std::fs::read(file).ok()?;
     let extension = file.extension()?.to_str()?.to_ascii_lowercase();
@@ -240,7 +240,7 @@ mod tests {
             fault = play(&path, &settings, false, HostClock::start(), &reports) => panic!("{fault}"),
         }
 
-        // Then two frames came, as far apart as they were recorded.
+        // Then two frames came, with the recorded interval between them.
         assert_eq!(frames.len(), 2);
         let apart = frames[1].1.t_exposure - frames[0].1.t_exposure;
         assert!((apart - Span::from_ms(40.0)).abs() < Span::from_ms(0.001), "{apart:?}");

@@ -1,8 +1,8 @@
 //! Frames from another program over a Unix socket: a simulator, or a camera that V4L2 does not have.
 //!
-//! The other program listens at the path; each frame is a header of 32 bytes, little-endian, and the pixels:
+//! The other program listens at the path. Each frame is a header of 32 bytes, little-endian, and the pixels:
 //!
-//! | bytes | what |
+//! | bytes | content |
 //! |---|---|
 //! | 0–3 | `WHF1` |
 //! | 4–7 | four characters: `GREY`, `YUYV`, `UYVY`, `NV12`, `RGB3`, `BGR3`, `MJPG` |
@@ -22,17 +22,17 @@ use crate::io::device::{Fault, FaultKind, NoteKind, Report, Reports, wait_for};
 use windhover_base::msg::{FrameEncoding, FramePayload};
 use windhover_base::time::{MonoTime, Span};
 
-/// Bytes of a header, and its first.
+/// Bytes of a header, and its first bytes.
 const HEADER: usize = 32;
 const MAGIC: &[u8; 4] = b"WHF1";
-/// No frame is larger.
+/// Largest frame.
 const LARGEST: usize = 64 << 20;
-/// A frame that began is there by then.
+/// Longest time for the rest of a frame that has begun.
 const STALLED: Duration = Duration::from_secs(2);
-/// A stamp farther from its frame's arrival is none of it: the frame's arrival stands in.
+/// A stamp that is farther than this from its frame's arrival is invalid: the arrival replaces it.
 const ODD: Span = Span::from_ns(2_000_000_000);
 
-/// Takes frames until the other end goes away, stalls or sends what is no frame.
+/// Takes frames until the other end closes, stalls or sends anything but a frame.
 pub(super) async fn stream(
     path: &str,
     clock: HostClock,
@@ -72,13 +72,13 @@ struct Sent {
 async fn next(socket: &mut UnixStream, path: &str) -> Result<Sent, Fault> {
     let lost = |error: std::io::Error| match error.kind() {
         std::io::ErrorKind::UnexpectedEof => {
-            Fault::new(FaultKind::Unplugged, path, "the other end closed it")
+            Fault::new(FaultKind::Unplugged, path, "the other end closed the connection")
         }
         _ => Fault::from_io(path, &error),
     };
     let stalled = |_| Fault::new(FaultKind::Frozen, path, "the other end stopped in the middle of a frame");
     let mut header = [0; HEADER];
-    // However long the next frame takes to begin, what began is to go on.
+    // The next frame may begin at any time; a frame that has begun must continue.
     socket.read_exact(&mut header[..1]).await.map_err(lost)?;
     let rest = tokio::time::timeout(STALLED, socket.read_exact(&mut header[1..])).await;
     rest.map_err(stalled)?.map_err(lost)?;
@@ -90,11 +90,11 @@ async fn next(socket: &mut UnixStream, path: &str) -> Result<Sent, Fault> {
     Ok(sent)
 }
 
-/// A header, and how many bytes follow it.
+/// A header, and the number of bytes that follow it.
 fn parse(header: &[u8; HEADER]) -> Result<(Sent, usize), String> {
     let word = |at: usize| u32::from_le_bytes([header[at], header[at + 1], header[at + 2], header[at + 3]]);
     if &header[..4] != MAGIC {
-        return Err("what comes is no frame: a header begins with WHF1".into());
+        return Err("the data are not a frame: a header begins with WHF1".into());
     }
     let code = &header[4..8];
     let (encoding, bits) = match code {
@@ -105,12 +105,12 @@ fn parse(header: &[u8; HEADER]) -> Result<(Sent, usize), String> {
         b"RGB3" => (FrameEncoding::Rgb24, 24),
         b"BGR3" => (FrameEncoding::Bgr24, 24),
         b"MJPG" => (FrameEncoding::Jpeg, 0),
-        _ => return Err(format!("pixels of format {:?} are not understood", String::from_utf8_lossy(code))),
+        _ => return Err(format!("pixels of format {:?} are not supported", String::from_utf8_lossy(code))),
     };
     let (width, height, stride, length) = (word(16), word(20), word(24), word(28) as usize);
     let wanted = u64::from(width) * u64::from(height) * bits / 8;
     if length == 0 || length > LARGEST || (length as u64) < wanted {
-        return Err(format!("a frame of {width} x {height} in {length} bytes cannot be"));
+        return Err(format!("a frame of {width} x {height} in {length} bytes is impossible"));
     }
     let mut stamp = [0; 8];
     stamp.copy_from_slice(&header[8..16]);
@@ -141,7 +141,7 @@ pub fn grey_header(stamp_ns: i64, width: u32, height: u32) -> [u8; HEADER] {
 fn refused(path: &str, error: &std::io::Error) -> Fault {
     match error.kind() {
         std::io::ErrorKind::ConnectionRefused => {
-            Fault::new(FaultKind::Missing, path, "nobody listens there; is the simulator running?")
+            Fault::new(FaultKind::Missing, path, "no program listens there; is the simulator running?")
         }
         _ => Fault::from_io(path, error),
     }
@@ -155,7 +155,7 @@ mod tests {
 
     use super::*;
 
-    /// What the camera reports of what the other end sends, and the fault it ends with.
+    /// The camera's reports for the bytes that the other end sends, and its final fault.
     async fn heard(sent: Vec<Vec<u8>>, stays: bool) -> (Vec<Report>, Fault) {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("camera.sock").to_string_lossy().into_owned();
@@ -197,7 +197,7 @@ mod tests {
             .collect();
         assert_eq!((frames.len(), frames[0].1.data.len(), frames[0].1.stride), (2, 8, 4));
         assert!((frames[0].0 - frames[0].1.t_exposure).abs() < Span::from_ms(1_000.0));
-        assert_eq!(frames[1].0, frames[1].1.t_exposure, "an hour ahead: its arrival stands in");
+        assert_eq!(frames[1].0, frames[1].1.t_exposure, "an hour ahead: the arrival replaces it");
         assert!(reports.iter().any(|r| matches!(r, Report::Note(NoteKind::StampsUnusable, ..))));
         assert_eq!(fault.kind, FaultKind::Unplugged);
     }

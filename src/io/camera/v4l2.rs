@@ -1,4 +1,4 @@
-//! A V4L2 camera: negotiate a format, stream mapped buffers, and survive whatever the driver does.
+//! A V4L2 camera: negotiates a format, streams mapped buffers, and tolerates errors of the driver.
 
 use std::convert::Infallible;
 use std::io::ErrorKind::{Interrupted, TimedOut, WouldBlock};
@@ -27,16 +27,15 @@ use crate::io::device::{
 use windhover_base::msg::{FrameEncoding, FramePayload};
 use windhover_base::time::{MonoTime, Span};
 
-/// Mapped buffers. One is being copied while the others fill: at 30 frames a second the driver can
-/// run on for a third of a second while this task waits for a processor. A driver that has less memory gives
-/// fewer.
+/// Mapped buffers. One is being copied while the others fill: at 30 frames a second the driver can continue for a third
+/// of a second while this task waits for a processor. A driver with less memory gives fewer.
 const BUFFERS: u32 = 12;
 
-/// A camera that gives no frame for this long, or for [`FROZEN_FRAMES`] frame times, is frozen.
+/// A camera that delivers no frame for this long, or for [`FROZEN_FRAMES`] frame times, is frozen.
 const FROZEN: Duration = Duration::from_secs(2);
 const FROZEN_FRAMES: f64 = 5.0;
 
-/// A stamp this far before its arrival, or at all after it, is not the time of exposure.
+/// A stamp this far before its arrival, or after it, is not the time of exposure.
 const OLDEST_STAMP: Span = Span::from_ns(2_000_000_000);
 
 /// `POLLIN` of poll(2), the same on every Linux.
@@ -63,10 +62,10 @@ async fn try_stream(
     delivered: &mut (dyn FnMut() + Send),
 ) -> Result<Infallible, Fault> {
     let lost = || {
-        let what = "the driver gave up; the camera is opened again";
+        let what = "the driver failed; the camera is opened again";
         Fault::new(FaultKind::Unplugged, &settings.device, what)
     };
-    // Opening talks to the device, which takes a while over USB; so does the first frame.
+    // Opening talks to the device, which takes time over USB; so does the first frame.
     let asked = settings.clone();
     let opened = blocking(move || catch_panics(|| open(asked)));
     let (camera, found) = opened.await.ok_or_else(lost)??;
@@ -95,7 +94,7 @@ async fn try_stream(
     Err(fault)
 }
 
-/// What the driver agreed to.
+/// The negotiated camera.
 struct Camera {
     settings: CameraSettings,
     device: Device,
@@ -105,13 +104,13 @@ struct Camera {
     stride: u32,
 }
 
-/// Opens the camera and agrees on a format; what is to be reported of it.
+/// Opens the camera and agrees on a format; also returns the notes to report.
 fn open(settings: CameraSettings) -> Result<(Camera, Vec<Report>), Fault> {
     let path = settings.device.as_str();
     let mut reports = Vec::new();
     let device = Device::with_path(path).map_err(|e| Fault::from_io(path, &e))?;
     let unsuitable = |text: String| Fault::new(FaultKind::Unsuitable, path, text);
-    let caps = device.query_caps().map_err(|_| unsuitable("is no camera (V4L2)".into()))?;
+    let caps = device.query_caps().map_err(|_| unsuitable("is not a camera (V4L2)".into()))?;
     if !caps.capabilities.contains(Capability::VIDEO_CAPTURE | Capability::STREAMING) {
         return Err(unsuitable(format!("{} delivers no video stream; is it the right node?", caps.card)));
     }
@@ -120,13 +119,13 @@ fn open(settings: CameraSettings) -> Result<(Camera, Vec<Report>), Fault> {
     let asked = format::fourcc(settings.pixel_format);
     let offer = || offered.iter().map(|&code| format::name(code)).collect::<Vec<_>>().join(", ");
     let wanted = format::choose(asked, &offered)
-        .ok_or_else(|| unsuitable(format!("offers {} and none of them is understood", offer())))?;
+        .ok_or_else(|| unsuitable(format!("offers {} and none of them is supported", offer())))?;
     let given = device
         .set_format(&Format::new(settings.width, settings.height, FourCC::new(&wanted)))
         .map_err(|e| Fault::from_io(path, &e))?;
     if (given.width, given.height) != (settings.width, settings.height) {
         return Err(unsuitable(format!(
-            "gives {}x{} where camera.width and camera.height ask for {}x{}; it offers {}",
+            "delivers {}x{} where camera.width and camera.height request {}x{}; it offers {}",
             given.width,
             given.height,
             settings.width,
@@ -135,10 +134,10 @@ fn open(settings: CameraSettings) -> Result<(Camera, Vec<Report>), Fault> {
         )));
     }
     let encoding = format::encoding(given.fourcc.repr).ok_or_else(|| {
-        unsuitable(format!("gives {}, which is not understood; it offers {}", given.fourcc, offer()))
+        unsuitable(format!("delivers {}, which is not supported; it offers {}", given.fourcc, offer()))
     })?;
     if given.fourcc.repr != asked {
-        let text = format!("asked for {}, the driver gives {}", format::name(asked), given.fourcc);
+        let text = format!("requested {}, the driver delivers {}", format::name(asked), given.fourcc);
         reports.push(Report::Note(NoteKind::FormatDiffers, 1, text));
     }
     let fps = set_rate(&device, settings.fps);
@@ -152,15 +151,15 @@ fn open(settings: CameraSettings) -> Result<(Camera, Vec<Report>), Fault> {
     Ok((camera, reports))
 }
 
-/// Asks for a frame rate; what the driver then gives, frames a second. Drivers without this call run
-/// at a rate of their own.
+/// Requests a frame rate; returns the rate that the driver sets, frames a second. Drivers without this call have a
+/// fixed rate.
 fn set_rate(device: &Device, fps: f64) -> Option<f64> {
     let interval = Fraction::new(1000, (fps * 1000.0).round() as u32);
     let given = device.set_params(&Parameters::new(interval)).ok()?.interval;
     (given.numerator > 0).then(|| f64::from(given.denominator) / f64::from(given.numerator))
 }
 
-/// The descriptor of an open device, for the runtime to wait on.
+/// The descriptor of an open device, on which the runtime waits.
 struct Descriptor(Arc<Handle>);
 
 impl AsRawFd for Descriptor {
@@ -169,7 +168,7 @@ impl AsRawFd for Descriptor {
     }
 }
 
-// SAFETY: the handle closes its descriptor when the last of its holders is dropped, and this is one.
+// SAFETY: the handle closes its descriptor when the last of its holders is dropped, and this value is one of them.
 unsafe impl OwnsDescriptor for Descriptor {}
 
 /// A running stream.
@@ -178,11 +177,11 @@ struct Running {
     ready: AsyncFd<Descriptor>,
     stream: Stream<'static>,
     following: Following,
-    /// Whether a dequeue failed: the stream's own count of buffers is right again once one is given up.
+    /// Whether a dequeue failed: the stream's own count of buffers is correct again after one is returned.
     owes_buffer: bool,
 }
 
-/// What is kept from one frame to the next.
+/// State from one frame to the next.
 #[derive(Default)]
 struct Following {
     sequence: Option<u32>,
@@ -197,13 +196,13 @@ impl Camera {
         let mut stream =
             Stream::with_buffers(&self.device, Type::VideoCapture, BUFFERS).map_err(|e| fault(&e))?;
         stream.set_timeout(self.patience());
-        // An error of the driver alone is no readiness to read, but it is to be seen.
+        // An error state of the driver is not readiness to read, but it must be noticed.
         let interest = Interest::READABLE | Interest::ERROR;
         let ready = register(Descriptor(stream.handle()), interest).map_err(|e| fault(&e))?;
         let following = Following::default();
         let mut running = Running { camera: self, ready, stream, following, owes_buffer: false };
         let first = running.take_next(clock)?;
-        // From here on readiness is waited for before anything is dequeued.
+        // From here on, nothing is dequeued before readiness.
         running.stream.set_timeout(Duration::ZERO);
         Ok((running, first))
     }
@@ -218,12 +217,12 @@ impl Camera {
         Fault::new(FaultKind::Frozen, &self.settings.device, text)
     }
 
-    /// What a failed system call means.
+    /// The fault of a failed system call.
     fn lost(&self, error: &std::io::Error) -> Fault {
         let mut fault = Fault::from_io(&self.settings.device, error);
         if fault.kind == FaultKind::Missing {
             fault.kind = FaultKind::Unplugged;
-            fault.detail = "went away; waiting for it to come back".into();
+            fault.detail = "disappeared; waiting for it to return".into();
         }
         fault
     }
@@ -249,7 +248,7 @@ impl Running {
         }
     }
 
-    /// Dequeues what is there; what is to be reported of it.
+    /// Dequeues a frame; also returns the notes to report.
     fn take_next(&mut self, clock: HostClock) -> Result<Vec<Report>, Fault> {
         if self.owes_buffer {
             return match CaptureStream::dequeue(&mut self.stream) {
@@ -296,22 +295,22 @@ impl Camera {
             .sequence
             .replace(meta.sequence)
             .map_or(0, |last| meta.sequence.wrapping_sub(last).saturating_sub(1));
-        // A driver that starts its count again has not lost four thousand million frames.
+        // A driver that restarts its count has not lost four thousand million frames.
         if (1..100_000).contains(&missed) {
-            tell(Report::Note(NoteKind::FramesMissed, missed, format!("{missed} frames never came")));
+            tell(Report::Note(NoteKind::FramesMissed, missed, format!("{missed} frames were not delivered")));
         }
         if meta.flags.contains(Flags::ERROR) {
             tell(Report::Note(
                 NoteKind::FrameDamaged,
                 1,
-                format!("frame {} is flagged damaged", meta.sequence),
+                format!("frame {} is flagged as damaged", meta.sequence),
             ));
             return None;
         }
         let used = if meta.bytesused == 0 { bytes.len() } else { (meta.bytesused as usize).min(bytes.len()) };
         let needed = format::frame_bytes(self.encoding, self.stride as usize, self.height as usize);
         if needed.is_some_and(|needed| used < needed) || used == 0 {
-            tell(Report::Note(NoteKind::FrameDamaged, 1, format!("frame {} is cut short", meta.sequence)));
+            tell(Report::Note(NoteKind::FrameDamaged, 1, format!("frame {} is incomplete", meta.sequence)));
             return None;
         }
         let t_exposure = self.exposure(meta, t_recv, following, clock, tell);
@@ -327,8 +326,7 @@ impl Camera {
         })
     }
 
-    /// The driver's stamp where it is of the monotonic clock, recent, and later than the last; else
-    /// the arrival.
+    /// The driver's stamp where it is of the monotonic clock, recent, and later than the last; else the arrival.
     fn exposure(
         &self,
         meta: &Metadata,

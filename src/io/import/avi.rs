@@ -38,7 +38,7 @@ fn chunk_head(input: &mut impl Read) -> std::io::Result<Option<([u8; 4], u32)>> 
     Ok(Some(([head[0], head[1], head[2], head[3]], size)))
 }
 
-/// Leaves the input at the first frame's chunk; gives the frame period.
+/// Moves the input to the first frame's chunk; returns the frame period.
 fn find_movi(input: &mut (impl Read + Seek)) -> std::io::Result<Option<Span>> {
     let mut kind = [0; 4];
     match chunk_head(input)? {
@@ -91,7 +91,7 @@ impl Reader {
         while let Some((code, size)) = chunk_head(&mut self.input)? {
             let is_video = code[2..] == *b"dc" || code[2..] == *b"db";
             if &code == b"LIST" {
-                // `rec ` lists group frames: step inside.
+                // `rec ` lists group frames: enter them.
                 self.input.seek(SeekFrom::Current(4))?;
             } else if &code == b"idx1" || size > FRAME_MAX {
                 return Ok(None);
@@ -105,7 +105,7 @@ impl Reader {
                 }
                 return Ok(Some(self.frame(data)));
             } else {
-                // An empty chunk repeats the frame before: a dropped frame, but its time passes.
+                // An empty chunk repeats the frame before: a dropped frame, for which time passes.
                 self.index += u32::from(is_video);
                 skip(&mut self.input, size)?;
             }

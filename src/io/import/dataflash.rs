@@ -9,11 +9,11 @@ use windhover_base::geo::ned_from_body_321;
 use windhover_base::time::{MonoTime, Span};
 
 pub(super) const MAGIC: [u8; 2] = [0xa3, 0x95];
-/// The message that defines others, its length with the head, and its fields' places after the head.
+/// The message that defines others: its length with the head, and the places of its fields after the head.
 const FMT: u8 = 128;
 const FMT_LENGTH: usize = 89;
 const HEAD: usize = 3;
-/// GPS time is ahead of UTC by so much since 2017.
+/// GPS time minus UTC since 2017.
 const LEAP_S: i64 = 18;
 /// 1980-01-06, seconds since 1970.
 const GPS_EPOCH_S: i64 = 315_964_800;
@@ -58,7 +58,7 @@ impl Format {
     }
 }
 
-/// A message, its head included.
+/// A message, including its head.
 struct Row<'a> {
     format: &'a Format,
     data: &'a [u8],
@@ -98,7 +98,7 @@ impl Row<'_> {
     }
 }
 
-/// Reads a log. Times are UTC where a fix told it, else since the start.
+/// Reads a log. Times are UTC where a fix has the date, else time since the start.
 pub(super) fn read(bytes: &[u8], name: &str) -> ImportedLog {
     let mut log = MeasuredLog::default();
     let mut formats: HashMap<u8, Format> = HashMap::new();
@@ -122,10 +122,10 @@ pub(super) fn read(bytes: &[u8], name: &str) -> ImportedLog {
             take(&Row { format, data }, &mut receiver, &mut log);
         }
     }
-    // A log's end is where it was when power went.
+    // A log ends wherever power failed.
     if skipped > 0 {
         log.warnings
-            .push(format!("{name}: {skipped} bytes are no messages, or of kinds not defined: left out"));
+            .push(format!("{name}: {skipped} bytes are not messages, or of undefined kinds: left out"));
     }
     log.is_utc = receiver.utc_less_boot.is_some();
     let ahead = Span::from_ns(receiver.utc_less_boot.unwrap_or(0).saturating_mul(1_000));
@@ -133,12 +133,12 @@ pub(super) fn read(bytes: &[u8], name: &str) -> ImportedLog {
     log.into_packets("ArduPilot DataFlash")
 }
 
-/// What belongs to fixes and stands in messages of their own.
+/// Data of fixes that are in separate messages.
 #[derive(Default)]
 struct Receiver {
     hpe_m: Option<f64>,
     vpe_m: Option<f64>,
-    /// Microseconds, by the first fix that told the date.
+    /// Microseconds, by the first fix with a date.
     utc_less_boot: Option<i64>,
 }
 
@@ -168,7 +168,7 @@ fn take(row: &Row<'_>, receiver: &mut Receiver, log: &mut MeasuredLog) {
         "GPS" => {
             let Some(fix) = fix(row, receiver) else { return };
             let (week, ms) = (row.get("GWk").unwrap_or(0.0), row.get("GMS").unwrap_or(0.0));
-            // 2020 began in week 2086: earlier ones are no date.
+            // 2020 began in week 2086: earlier weeks are invalid.
             if fix.kind >= 2 && (2086.0..5_000.0).contains(&week) {
                 let utc_s = GPS_EPOCH_S + week as i64 * 604_800 - LEAP_S;
                 receiver.utc_less_boot.get_or_insert(utc_s * 1_000_000 + ms as i64 * 1_000 - usec);

@@ -8,9 +8,9 @@ use crate::io::regular;
 use windhover_base::msg::{FrameEncoding, FramePayload};
 use windhover_base::time::MonoTime;
 
-/// Bytes of the longest table that is read: a day of 30 Hz.
+/// Size of the longest table that is read: a day at 30 Hz.
 const LONGEST_TABLE: u64 = 1 << 28;
-/// Bytes of the largest image file that is read: 16 384² grey levels.
+/// Size of the largest image file that is read: 16 384² grey levels.
 const LARGEST_IMAGE: u64 = 1 << 28;
 
 /// Opens a folder with `times.csv` (`time_s,file`, with or without that header).
@@ -34,13 +34,13 @@ fn row(table: &Path, folder: &Path, number: usize, line: &str) -> Result<(MonoTi
     let refused = || ImportError::line(table, number, "expected a time, a comma and the name of an image");
     let (time, file) = line.split_once(',').ok_or_else(refused)?;
     let t = parse_time(time.trim()).ok_or_else(refused)?;
-    // A folder may be somebody else's: it names its own images, not what else is on this machine.
+    // The folder may come from another person: it may name its own images only, not other files of this machine.
     let file =
         regular::inside(folder, file.trim()).map_err(|e| ImportError::line(table, number, e.to_string()))?;
     Ok((t, file))
 }
 
-/// JPEG and PNG go in as they are; other formats are read and go in as grey levels.
+/// JPEG and PNG are stored unchanged; other formats are decoded and stored as grey levels.
 fn image(index: u32, t: MonoTime, path: &Path) -> Result<FramePayload, ImportError> {
     let bytes = regular::read(path, LARGEST_IMAGE).map_err(|e| ImportError::io(path, e))?;
     let encoding = match image::guess_format(&bytes) {
@@ -48,7 +48,7 @@ fn image(index: u32, t: MonoTime, path: &Path) -> Result<FramePayload, ImportErr
         Ok(image::ImageFormat::Png) => FrameEncoding::Png,
         _ => {
             let gray = image::load_from_memory(&bytes)
-                .map_err(|e| ImportError::video(path, format!("is no image that can be read here: {e}")))?
+                .map_err(|e| ImportError::video(path, format!("is not a readable image: {e}")))?
                 .into_luma8();
             let (width, height) = gray.dimensions();
             return Ok(grey(index, t, width, height, gray.into_raw()));

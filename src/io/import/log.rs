@@ -1,4 +1,4 @@
-//! Logs of autopilots and cameras, told apart by how they begin.
+//! Logs of autopilots and cameras, distinguished by their first bytes.
 
 use std::io::Read as _;
 use std::path::Path;
@@ -8,14 +8,14 @@ use super::{ImportError, dataflash, srt, tlog, ulog};
 use crate::io::regular;
 use windhover_base::time::MonoTime;
 
-/// Longest log that is read: hours of the fullest ones.
+/// Longest log that is read: hours of the densest ones.
 const MOST: u64 = 1 << 32;
 
-/// Reads PX4's ULog, ArduPilot's DataFlash log, a telemetry log, or DJI's subtitles. `video_start` is when the video began,
-/// where that is told: subtitles count from there.
+/// Reads PX4's ULog, ArduPilot's DataFlash log, a telemetry log, or DJI's subtitles. `video_start` is the start of the
+/// video, where given: times of subtitles count from there.
 ///
 /// # Errors
-/// The file cannot be read, or is none of these, or tells nothing that can be used.
+/// The file cannot be read, or is none of these, or has nothing usable.
 pub fn read_log(path: &Path, video_start: Option<MonoTime>) -> Result<ImportedLog, ImportError> {
     let refuse = |reason: String| ImportError::Log { path: path.to_owned(), reason };
     let file = regular::open(path).map_err(|e| ImportError::io(path, e))?;
@@ -33,7 +33,7 @@ pub fn read_log(path: &Path, video_start: Option<MonoTime>) -> Result<ImportedLo
             Ok(text) if srt::is_one(text) => srt::read(text, &name, video_start),
             _ => {
                 let kinds = "PX4's ULog, ArduPilot's .bin, a .tlog, DJI's .SRT";
-                return Err(refuse(format!("is none of the logs that are read: {kinds}")));
+                return Err(refuse(format!("is none of the supported logs: {kinds}")));
             }
         },
     };
@@ -42,8 +42,8 @@ pub fn read_log(path: &Path, video_start: Option<MonoTime>) -> Result<ImportedLo
             .warnings
             .first()
             .cloned()
-            .unwrap_or_else(|| "no fix, attitude or inertial sample is in it".into());
-        return Err(refuse(format!("tells nothing that can be used: {why}")));
+            .unwrap_or_else(|| "it has no fix, attitude or inertial sample".into());
+        return Err(refuse(format!("has nothing usable: {why}")));
     }
     Ok(log)
 }

@@ -1,5 +1,5 @@
-//! Measurements that others' logs hold as figures, as the MAVLink frames an autopilot would have sent: one way into the
-//! pipeline for all of them, that of `[autopilot]`.
+//! Measurements from logs of other programs, as MAVLink frames of an autopilot: all of them enter the pipeline in one
+//! way, that of `[autopilot]`.
 
 use std::collections::BTreeSet;
 
@@ -9,14 +9,14 @@ use nalgebra::{UnitQuaternion, Vector3};
 use crate::io::mavlink::packet::{Sender, encode};
 use windhover_base::time::{MonoTime, NS_PER_S, Span};
 
-/// A fix of a receiver. Figures that are not told are `None`.
+/// A fix of a receiver. Values that are not given are `None`.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Fix {
     /// As MAVLink's `GPS_FIX_TYPE` counts: 1 none, 2 two-dimensional, 3 three-dimensional, 5 RTK float, 6 RTK fixed.
     pub kind: u8,
     /// Latitude.
     pub lat_deg: f64,
-    /// Longitude.
+    /// Above the sea; above the ellipsoid where only that is given.
     pub lon_deg: f64,
     /// Above the sea; above the ellipsoid where only that is told.
     pub alt_m: f64,
@@ -37,7 +37,7 @@ pub struct Fix {
 }
 
 impl Fix {
-    /// A fix of this kind at this place, nothing else told.
+    /// A fix of this kind at this place, without further values.
     pub fn at(kind: u8, lat_deg: f64, lon_deg: f64, alt_m: f64) -> Self {
         let (ellipsoid_m, speed_mps, course_deg) = (None, None, None);
         let (hpe_m, vpe_m, hdop, sats) = (None, None, None, None);
@@ -49,7 +49,7 @@ impl Fix {
     }
 }
 
-/// Something that was measured.
+/// A measurement.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Measured {
     /// A fix.
@@ -60,22 +60,22 @@ pub enum Measured {
     Inertial(Vector3<f64>, Vector3<f64>),
 }
 
-/// What a log gave.
+/// The content of a log.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct ImportedLog {
     /// MAVLink bytes with their times, in order.
     pub packets: Vec<(MonoTime, Vec<u8>)>,
-    /// What the bytes were made of, for people; empty where the log holds the very bytes.
+    /// The origin of the bytes, as text; empty where the log has the original bytes.
     pub made_of: String,
-    /// Fixes, attitudes and inertial samples in them; none are counted of bytes.
+    /// Number of fixes, attitudes and inertial samples; zero where the log has the original bytes.
     pub counts: [usize; 3],
-    /// When its video began, where it is the log of one.
+    /// The start of its video, where it is the log of one.
     pub video_start: Option<MonoTime>,
-    /// What was left out, in words.
+    /// What was left out, as text.
     pub warnings: Vec<String>,
 }
 
-/// Measurements on their way to frames.
+/// Measurements before their conversion to frames.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub(super) struct MeasuredLog {
     pub measured: Vec<(MonoTime, Measured)>,
@@ -97,17 +97,17 @@ impl MeasuredLog {
         self.measured.push((t, what));
     }
 
-    /// As frames of an autopilot that started with the first measurement.
+    /// Converts them to frames of an autopilot that started with the first measurement.
     pub(super) fn into_packets(mut self, format: &str) -> ImportedLog {
         self.measured.sort_by_key(|(t, _)| *t);
-        let mut teller = Teller::default();
+        let mut builder = FrameBuilder::default();
         let mut packets = Vec::with_capacity(self.measured.len() + 16);
         let mut counts = [0; 3];
         let began = self.measured.first().map_or(MonoTime::default(), |(t, _)| *t);
         let mut beat = began;
         for (t, what) in self.measured {
             if t >= beat {
-                packets.push((t, teller.beat(t, t - began, self.is_utc)));
+                packets.push((t, builder.beat(t, t - began, self.is_utc)));
                 beat = t + Span::from_ns(NS_PER_S);
             }
             counts[match what {
@@ -115,7 +115,7 @@ impl MeasuredLog {
                 Measured::Attitude(_) => 1,
                 Measured::Inertial(..) => 2,
             }] += 1;
-            packets.push((t, teller.frame(&message(&what, t - began))));
+            packets.push((t, builder.frame(&message(&what, t - began))));
         }
         let used: Vec<&str> = self.used.iter().map(String::as_str).collect();
         let made_of = format!("{format}: {}", used.join(", "));
@@ -123,20 +123,20 @@ impl MeasuredLog {
     }
 }
 
-/// Numbers frames.
+/// Makes numbered frames.
 #[derive(Default)]
-struct Teller {
+struct FrameBuilder {
     sequence: u8,
 }
 
-impl Teller {
+impl FrameBuilder {
     fn frame(&mut self, message: &MavMessage) -> Vec<u8> {
         const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
         self.sequence = self.sequence.wrapping_add(1);
         encode(self.sequence, AUTOPILOT, message, None)
     }
 
-    /// What every autopilot sends once a second, with the date where it is known.
+    /// The messages that every autopilot sends once a second, with the date where it is known.
     fn beat(&mut self, t: MonoTime, boot: Span, is_utc: bool) -> Vec<u8> {
         let mut bytes = self.frame(&MavMessage::HEARTBEAT(HEARTBEAT_DATA {
             custom_mode: 0,
@@ -170,7 +170,7 @@ fn message(what: &Measured, boot: Span) -> MavMessage {
             q2: q.i as f32,
             q3: q.j as f32,
             q4: q.k as f32,
-            // Rates are told by the inertial samples, or not at all.
+            // Rates come from the inertial samples, or not at all.
             rollspeed: f32::NAN,
             pitchspeed: f32::NAN,
             yawspeed: f32::NAN,
@@ -190,7 +190,7 @@ fn message(what: &Measured, boot: Span) -> MavMessage {
 }
 
 fn fix_message(fix: &Fix, time_usec: u64) -> GPS_RAW_INT_DATA {
-    // Hundredths where they are known; MAVLink's word for what is not is the largest figure.
+    // Hundredths where known; MAVLink's value for unknown is the largest number.
     let hundredths = |figure: Option<f64>| match figure.map(|x| (x * 1e2).round()) {
         Some(x) if (0.0..f64::from(u16::MAX)).contains(&x) => x as u16,
         _ => u16::MAX,
@@ -200,7 +200,7 @@ fn fix_message(fix: &Fix, time_usec: u64) -> GPS_RAW_INT_DATA {
         _ => 0,
     };
     GPS_RAW_INT_DATA {
-        // Two fixes of one instant would be taken for one: none is at zero.
+        // Two fixes of one instant would be taken for one: zero is avoided.
         time_usec: time_usec.max(1),
         fix_type: match fix.kind {
             2 => GpsFixType::GPS_FIX_TYPE_2D_FIX,

@@ -1,4 +1,4 @@
-//! Recordings people already have, made into the events of a capture.
+//! Existing recordings, converted to the events of a capture.
 
 mod avi;
 mod bag;
@@ -30,15 +30,15 @@ use windhover_base::msg::FramePayload;
 /// Why a recording could not be imported.
 #[derive(Debug, thiserror::Error)]
 pub enum ImportError {
-    /// The system refused.
+    /// The system's refusal.
     #[error("cannot read {}: {source}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// A line or header that is not what it should be.
+    /// A malformed line or header.
     #[error("{}:{line}: {reason}", path.display())]
     Line {
         /// The file.

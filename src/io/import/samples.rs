@@ -1,4 +1,4 @@
-//! Tables of samples: rates and forces, or attitudes, a row a sample, columns by the names in the header.
+//! Tables of samples: rates and forces, or attitudes; a row for each sample, columns by the names in the header.
 
 use std::path::Path;
 
@@ -23,8 +23,8 @@ pub struct Samples<T> {
 const RATES: [&str; 3] = ["gyro_x_dps", "gyro_y_dps", "gyro_z_dps"];
 const FORCES: [&str; 3] = ["acc_x_mps2", "acc_y_mps2", "acc_z_mps2"];
 
-/// Reads `time_s,gyro_x_dps,gyro_y_dps,gyro_z_dps,acc_x_mps2,acc_y_mps2,acc_z_mps2`: columns in any order, others beside
-/// them, the three rates or the three forces left out.
+/// Reads `time_s,gyro_x_dps,gyro_y_dps,gyro_z_dps,acc_x_mps2,acc_y_mps2,acc_z_mps2`: columns in any order, others
+/// allowed; the three rates or the three forces may be absent.
 pub fn read_inertial(path: &Path) -> Result<Samples<InertialSample>, ImportError> {
     read(path, |header, fields| {
         let three = |names: [&str; 3]| {
@@ -37,8 +37,8 @@ pub fn read_inertial(path: &Path) -> Result<Samples<InertialSample>, ImportError
     })
 }
 
-/// Reads `time_s,heading_deg,pitch_deg,roll_deg`: heading true, nose up and right side down positive; columns in any order,
-/// others beside them, the heading or both of the others left out.
+/// Reads `time_s,heading_deg,pitch_deg,roll_deg`: heading true, nose up and right side down positive; columns in any
+/// order, others allowed; the heading or both other angles may be absent.
 pub fn read_attitude(path: &Path) -> Result<Samples<AttitudeSample>, ImportError> {
     read(path, |header, fields| {
         let angle = |name| figure(header, fields, name).map(f64::to_radians);
@@ -52,7 +52,7 @@ pub fn read_attitude(path: &Path) -> Result<Samples<AttitudeSample>, ImportError
     })
 }
 
-/// The figure in a column; `None` where there is none, or no such column.
+/// The value in a column; `None` where it is empty or the column is absent.
 fn figure(header: &[&str], fields: &[&str], name: &str) -> Option<f64> {
     let at = header.iter().position(|column| *column == name)?;
     number(fields.get(at)?).ok()
@@ -63,7 +63,7 @@ fn read<T>(path: &Path, sample: impl Fn(&[&str], &[&str]) -> Option<T>) -> Resul
     let mut lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
     let header: Vec<&str> = lines.next().map_or(Vec::new(), |(_, line)| split(line));
     let Some(time) = header.iter().position(|column| *column == "time_s") else {
-        return Err(ImportError::line(path, 1, "the header names no column time_s"));
+        return Err(ImportError::line(path, 1, "the header has no column time_s"));
     };
     let mut table = Samples { samples: Vec::new(), unread: Vec::new() };
     for (index, line) in lines {

@@ -1,4 +1,4 @@
-//! Serial logs with a time stamp a line.
+//! Serial logs with a time stamp on each line.
 
 use std::path::Path;
 
@@ -6,11 +6,11 @@ use super::ImportError;
 use super::stamp::timed;
 use windhover_base::time::MonoTime;
 
-/// What a line of the log had on the wire, with its time. Lines without a time are told, by number,
-/// and left out; a log in which no line has one is an error.
+/// The lines of the log with their times. Lines without a time are reported by number and left out; a log in which no
+/// line has one is an error.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct SerialLog {
-    /// Time of the line and its bytes, line end restored; in order of time.
+    /// Time of the line and its bytes, with its line end; in order of time.
     pub lines: Vec<(MonoTime, Vec<u8>)>,
     /// Numbers of lines without a time, from 1.
     pub untimed: Vec<usize>,

@@ -1,19 +1,19 @@
-//! The subtitles that DJI's cameras write beside a video (`.SRT`): where the helicopter was, cue by cue.
+//! The subtitles that DJI's cameras write beside a video (`.SRT`): the position of the helicopter, cue by cue.
 //!
-//! | form | of |
+//! | form | used |
 //! |---|---|
 //! | `[latitude: 47.1] [longitude: 8.1] [rel_alt: 10.3 abs_alt: 512.3]`, also `longtitude`, `altitude` | since 2018 |
-//! | `GPS(8.1,47.1,19)`, `GPS (8.1, 47.1, 19)`: longitude first | before, and small ones |
+//! | `GPS(8.1,47.1,19)`, `GPS (8.1, 47.1, 19)`: longitude first | earlier, and by small ones |
 
 use super::measured::{Fix, ImportedLog, Measured, MeasuredLog};
 use super::stamp::parse_time;
 use crate::text::number;
 use windhover_base::time::{MonoTime, Span};
 
-/// A place that stays is told again after so long: cues come with every frame, fixes seldom.
+/// An unchanged place is repeated as a fix after this time: cues come with every frame.
 const AGAIN: Span = Span::from_ns(1_000_000_000);
 
-/// Whether a file begins as subtitles do: a number, then a time.
+/// Whether a file begins like subtitles: a number, then a time.
 pub(super) fn is_one(text: &str) -> bool {
     let mut lines =
         text.trim_start_matches('\u{feff}').lines().map(str::trim).filter(|line| !line.is_empty());
@@ -39,7 +39,7 @@ fn figure(text: &str, key: &str) -> Option<f64> {
         let at = rest.find(key)?;
         let before = rest[..at].chars().next_back();
         rest = &rest[at + key.len()..];
-        // `altitude` is no end of another word.
+        // `altitude` must not be the end of another word.
         if before.is_none_or(|c| !c.is_ascii_alphanumeric() && c != '_')
             && let Some(value) = rest.trim_start().strip_prefix(':')
         {
@@ -73,7 +73,7 @@ fn date(text: &str) -> Option<MonoTime> {
         let line = line.get(
             ..line.find(|c: char| !(c.is_ascii_digit() || "-: .,T".contains(c))).unwrap_or(line.len()),
         )?;
-        // 12:00:00.123 and 12:00:00,123,456 alike.
+        // Both 12:00:00.123 and 12:00:00,123,456.
         let mut parts = line.trim_end_matches([',', ' ']).splitn(2, ',');
         let (clock, rest) = (parts.next()?, parts.next());
         let whole =
@@ -82,8 +82,8 @@ fn date(text: &str) -> Option<MonoTime> {
     })
 }
 
-/// Reads subtitles. The video began at `start`; where that is not told, at the first cue's own date (its clock's, whatever
-/// zone it keeps), else at zero.
+/// Reads subtitles. The video began at `start`; where that is not given, at the first cue's own date (in whatever time
+/// zone its clock was set), else at zero.
 pub(super) fn read(text: &str, name: &str, start: Option<MonoTime>) -> ImportedLog {
     let mut log = MeasuredLog::default();
     let text = text.replace('\r', "");
@@ -102,7 +102,7 @@ pub(super) fn read(text: &str, name: &str, start: Option<MonoTime>) -> ImportedL
     let mut last: Option<(MonoTime, Place)> = None;
     for (at, words) in &cues {
         let t = base + *at;
-        // Zeros are what is written without a fix.
+        // Zeros are written where there is no fix.
         let Some(place) = place(words).filter(|place| (place.0, place.1) != (0.0, 0.0)) else { continue };
         if last.is_some_and(|(then, same)| same == place && t - then < AGAIN) {
             continue;
@@ -113,7 +113,7 @@ pub(super) fn read(text: &str, name: &str, start: Option<MonoTime>) -> ImportedL
         log.push(t, Measured::Fix(Fix::at(kind, lat_deg, lon_deg, height.unwrap_or(0.0))), "subtitles");
     }
     if log.measured.is_empty() {
-        log.warnings.push(format!("{name}: none of its {} cues tells a place", cues.len()));
+        log.warnings.push(format!("{name}: none of its {} cues has a place", cues.len()));
     }
     let video_start = (!cues.is_empty()).then_some(base);
     ImportedLog { video_start, ..log.into_packets("DJI SRT") }

@@ -1,10 +1,10 @@
-//! Times as people and their tools write them.
+//! Times as people and tools write them.
 //!
 //! | form | example |
 //! |---|---|
 //! | seconds since any epoch, with point or comma | `1795014245.5010376`, `12,5` |
 //! | ISO 8601, with `T` or a blank, any fraction, any offset or none (UTC) | `2026-11-18 16:04:05,501+0100` |
-//! | the system's own words, as `gpspipe -t` has them by default | `Wed Nov 18 15:04:05 2026` |
+//! | the form of the C library, as `gpspipe -t` has by default | `Wed Nov 18 15:04:05 2026` |
 //!
 //! In a log a blank, a tab, or a colon and a blank (`gpspipe`) follow the time.
 
@@ -12,7 +12,7 @@ use chrono::{DateTime, FixedOffset, NaiveDateTime};
 
 use windhover_base::time::MonoTime;
 
-/// Longest time at the begin of a line.
+/// Longest time at the start of a line.
 const LONGEST: usize = 48;
 
 /// A time in any of the forms.
@@ -32,7 +32,7 @@ pub fn parse_time(text: &str) -> Option<MonoTime> {
     Some(MonoTime::from_ns(zoned.or_else(plain)?.timestamp_nanos_opt()?))
 }
 
-/// The time a line of a log begins with, and what came over the line then: the longest begin that is a time.
+/// The time at the start of a log's line, and the rest of the line: the longest prefix that is a time.
 pub(super) fn timed(line: &[u8]) -> Option<(MonoTime, &[u8])> {
     let head = &line[..line.len().min(LONGEST)];
     let ends = head.iter().enumerate().rev().filter(|(_, byte)| matches!(byte, b' ' | b'\t'));
@@ -43,8 +43,8 @@ pub(super) fn timed(line: &[u8]) -> Option<(MonoTime, &[u8])> {
     })
 }
 
-/// Decimal seconds to nanoseconds without passing through a float, which would lose a fraction of a
-/// microsecond on today's epoch.
+/// Decimal seconds to nanoseconds without floating point, which would lose a fraction of a microsecond in present-day
+/// epochs.
 fn seconds_to_ns(text: &str) -> Option<i64> {
     let (negative, digits) = text.strip_prefix('-').map_or((false, text), |rest| (true, rest));
     let (whole, fraction) = digits.split_once('.').unwrap_or((digits, ""));
@@ -111,7 +111,7 @@ mod tests {
         for line in ["$GPGGA,150405.5,3842.2,N", "12.5,1.0 2", "", " ", "x 12"] {
             assert_eq!(timed(line.as_bytes()), None, "{line}");
         }
-        // Bytes that are no text may follow.
+        // Bytes that are not text may follow.
         assert_eq!(
             timed(b"12 \xb5\x62\x01 \xff"),
             Some((MonoTime::from_ns(12_000_000_000), &b"\xb5\x62\x01 \xff"[..]))

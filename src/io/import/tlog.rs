@@ -1,14 +1,14 @@
-//! A ground station's telemetry log, `.tlog`: before each MAVLink frame the time it was heard, microseconds since 1970 in
-//! eight bytes, the first one first. The frames are kept as they are.
+//! A ground station's telemetry log, `.tlog`: before each MAVLink frame its time of reception, microseconds since 1970
+//! as eight bytes, big-endian. The frames are kept unchanged.
 
 use super::measured::ImportedLog;
 use windhover_base::time::MonoTime;
 
 const STAMP: usize = 8;
-/// 2000-01-01 and 2100-01-01, microseconds since 1970: other times are none.
+/// Valid times: 2000-01-01 to 2100-01-01, microseconds since 1970.
 const TIMES_USEC: std::ops::Range<u64> = 946_684_800_000_000..4_102_444_800_000_000;
 
-/// Length of the frame that these bytes begin with; `None` where none does.
+/// Length of the frame at the start of these bytes; `None` where there is none.
 fn frame_length(bytes: &[u8]) -> Option<usize> {
     let payload = usize::from(*bytes.get(1)?);
     Some(match bytes[0] {
@@ -18,7 +18,7 @@ fn frame_length(bytes: &[u8]) -> Option<usize> {
     })
 }
 
-/// The time and the frame at the begin of these bytes.
+/// The time and the frame at the start of these bytes.
 fn record(bytes: &[u8]) -> Option<(MonoTime, &[u8])> {
     let usec = u64::from_be_bytes(bytes.get(..STAMP)?.try_into().ok()?);
     if !TIMES_USEC.contains(&usec) {
@@ -29,12 +29,12 @@ fn record(bytes: &[u8]) -> Option<(MonoTime, &[u8])> {
     Some((t, rest.get(..frame_length(rest)?)?))
 }
 
-/// Whether a file begins as such a log does.
+/// Whether a file begins like such a log.
 pub(super) fn is_one(bytes: &[u8]) -> bool {
     record(bytes).is_some()
 }
 
-/// Reads a log; what is no record is skipped.
+/// Reads a log; bytes that are not a record are skipped.
 pub(super) fn read(bytes: &[u8], name: &str) -> ImportedLog {
     let mut log = ImportedLog::default();
     let (mut at, mut skipped) = (0, 0);
@@ -51,7 +51,7 @@ pub(super) fn read(bytes: &[u8], name: &str) -> ImportedLog {
         }
     }
     if skipped > 0 {
-        log.warnings.push(format!("{name}: {skipped} bytes are no records and left out"));
+        log.warnings.push(format!("{name}: {skipped} bytes are not records and are left out"));
     }
     log.packets.sort_by_key(|(t, _)| *t);
     log

@@ -1,6 +1,6 @@
 //! PX4's ULog (<https://docs.px4.io/main/en/dev_log/ulog_file_format.html>): attitude, sensors, fixes.
 //!
-//! Formats of messages stand in the file; a field is found by its name in whatever order and beside whatever else.
+//! The file contains the formats of its messages; a field is found by its name, in any order and among any others.
 
 use std::collections::HashMap;
 
@@ -12,14 +12,14 @@ use windhover_base::time::{MonoTime, Span};
 pub(super) const MAGIC: [u8; 7] = [b'U', b'L', b'o', b'g', 0x01, 0x12, 0x35];
 /// Magic, version, time of the start.
 const HEADER: usize = 16;
-/// Formats within formats are followed so deep.
+/// Deepest nesting of formats.
 const DEPTH: usize = 6;
-/// 2100-01-01, microseconds since 1970: later times are none.
+/// 2100-01-01, microseconds since 1970: later times are invalid.
 const LATEST_USEC: f64 = 4.1e15;
-/// Formats and subscriptions that are believed.
+/// Most accepted formats and subscriptions.
 const MOST: usize = 4096;
 
-/// A field of a message: where it stands, and as what.
+/// A field of a message: its place and type.
 #[derive(Clone, Copy, PartialEq, Debug)]
 struct Field {
     offset: usize,
@@ -105,14 +105,14 @@ impl Row<'_> {
     }
 }
 
-/// Reads a log. Times are UTC where a receiver told it, else since the start.
+/// Reads a log. Times are UTC where a receiver has it, else time since the start.
 pub(super) fn read(bytes: &[u8], name: &str) -> ImportedLog {
     let mut log = Log::default();
     log.records(bytes, name);
     let mut measured = log.measured;
     let ahead_usec = log.utc_less_boot;
     measured.is_utc = ahead_usec.is_some();
-    // Two topics tell of the receiver: the raw one is used where the chosen one is not there.
+    // Two topics have the receiver's fixes: the raw one is used where the selected one is absent.
     let fixes = if log.chosen.is_empty() { log.raw } else { log.chosen };
     let of = if fixes.is_empty() { "" } else { log.fixes_of };
     fixes.into_iter().for_each(|(t, fix)| measured.push(t, Measured::Fix(fix), of));
@@ -129,7 +129,7 @@ struct Log {
     chosen: Vec<(MonoTime, Fix)>,
     raw: Vec<(MonoTime, Fix)>,
     fixes_of: &'static str,
-    /// UTC less time since start, microseconds, by the first fix that told it.
+    /// UTC less time since start, microseconds, by the first fix with UTC.
     utc_less_boot: Option<i64>,
 }
 
@@ -139,7 +139,7 @@ impl Log {
         let mut appended: Vec<usize> = Vec::new();
         while let Some(head) = bytes.get(at..at + 3) {
             let size = usize::from(u16::from_le_bytes([head[0], head[1]]));
-            // What was appended after a crash begins at a place of its own; the record before it may be cut.
+            // Data appended after a crash begins at its own place; the record before it may be cut.
             if let Some(&next) = appended.first().filter(|next| at < **next && at + 3 + size > **next) {
                 appended.remove(0);
                 at = next;
@@ -196,7 +196,8 @@ impl Log {
         }
     }
 
-    /// Where the fields of a format stand; gives where it ends. `None` for what is not defined, or longer than a message.
+    /// Places of the fields of a format; returns where it ends. `None` for what is not defined, or longer than a
+    /// message.
     fn layout(
         &self,
         format: &str,
@@ -227,7 +228,7 @@ impl Log {
                 }
             }
         }
-        // A format without fields, many times in itself, would take time and tell nothing.
+        // A format without fields, many times in itself, would take time without any result.
         (offset > begin).then_some(offset)
     }
 
@@ -274,7 +275,8 @@ fn offset_of(bytes: &[u8], length: usize) -> Option<usize> {
     (offset > HEADER && offset < length).then_some(offset)
 }
 
-/// A fix in the fields of either age of PX4: degrees and metres since 1.14, 1e-7 degrees and millimetres before.
+/// A fix in the fields of both generations of PX4: degrees and metres from 1.14 on, 1e-7 degrees and millimetres in
+/// older ones.
 fn fix(row: &Row<'_>) -> Option<Fix> {
     let either = |new: &str, old: &str, scale: f64| row.get(new).or_else(|| Some(row.get(old)? * scale));
     let kind = row.get("fix_type")? as u8;

@@ -1,4 +1,4 @@
-//! Which reader a video needs: a folder, Motion JPEG in AVI, Y4M, or anything else through ffmpeg.
+//! The reader for a video: a folder, Motion JPEG in AVI, Y4M, or ffmpeg for all others.
 
 use std::fs::File;
 use std::io::{BufReader, Read};
@@ -13,15 +13,15 @@ use windhover_base::time::MonoTime;
 pub enum VideoSource {
     /// A folder of images with `times.csv`: the times are its own.
     Folder,
-    /// Motion JPEG in AVI: frames are kept untouched.
+    /// Motion JPEG in AVI: frames are stored unchanged.
     MotionJpeg,
     /// Y4M: luma is kept.
     Y4m,
-    /// Anything else, decoded by an installed ffmpeg.
+    /// Any other, decoded by an installed ffmpeg.
     Ffmpeg,
 }
 
-/// Opens a video. `start` is when its first frame was taken; a folder has times of its own.
+/// Opens a video. `start` is the time of its first frame; a folder has its own times.
 pub fn open_video(path: &Path, start: MonoTime) -> Result<(VideoSource, Frames), ImportError> {
     if path.is_dir() {
         return Ok((VideoSource::Folder, folder::open(path)?));

@@ -44,7 +44,7 @@ fn read_header(input: &mut impl BufRead, path: &Path) -> Result<Header, ImportEr
     let text = String::from_utf8_lossy(&line);
     let mut words = text.split_ascii_whitespace();
     if words.next() != Some("YUV4MPEG2") {
-        return Err(refused("is no Y4M video: it does not begin with YUV4MPEG2"));
+        return Err(refused("is not a Y4M video: it does not begin with YUV4MPEG2"));
     }
     let (mut width, mut height, mut rate_hz, mut space) = (0, 0, None, "420");
     for word in words {
@@ -58,7 +58,7 @@ fn read_header(input: &mut impl BufRead, path: &Path) -> Result<Header, ImportEr
         }
     }
     if width == 0 || height == 0 || width > SIDE_MAX || height > SIDE_MAX {
-        return Err(refused("its Y4M header gives no sensible size"));
+        return Err(refused("its Y4M header gives no valid size"));
     }
     let half = |n: usize| n.div_ceil(2);
     let chroma = match space {
@@ -72,7 +72,7 @@ fn read_header(input: &mut impl BufRead, path: &Path) -> Result<Header, ImportEr
         s if s.starts_with("410") => 2 * width.div_ceil(4) * height.div_ceil(4),
         s if s.starts_with("420") => 2 * half(width) * half(height),
         _ => {
-            return Err(refused("has a chroma layout that is not read here; use 420, 422, 444, 411 or mono"));
+            return Err(refused("has a chroma layout that is not supported; use 420, 422, 444, 411 or mono"));
         }
     };
     let rate_hz = rate_hz.ok_or_else(|| refused("its Y4M header gives no frame rate"))?;

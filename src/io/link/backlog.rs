@@ -1,48 +1,48 @@
-//! What may still have to be sent again: the runs of a payload by sequence number.
+//! Records that may have to be sent again: the runs of a payload by sequence number.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::io::records::Record;
 
-/// A run of the program and what of it is held.
+/// A run of the program and which of its numbers exist.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Extent {
-    /// Identity of the run; never used again.
+    /// Identity of the run; never reused.
     pub run: u32,
     /// Name of the flight's directory.
     pub flight: String,
-    /// Least number held.
+    /// Least number that exists.
     pub first: u32,
-    /// One more than the greatest number given out.
+    /// One more than the greatest assigned number.
     pub end: u32,
 }
 
-/// The numbers asked for up to `end` could not be read just now, which is not to say that they are gone.
+/// The requested numbers up to `end` could not be read now; this does not mean that they no longer exist.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Unread {
     /// One more than the last number concerned.
     pub end: u32,
 }
 
-/// What was read: records by number, ascending.
+/// The records that were read, by number, ascending.
 pub type Found = Result<Vec<(u32, Arc<Record>)>, Unread>;
 
-/// Where records are read again: memory, or the store's queue on the card.
+/// Source of the back-fill: memory, or the store's queue on the card.
 pub trait Backlog: Send + Sync {
-    /// The runs it holds anything of, oldest first.
+    /// The runs of which it has any number, oldest first.
     fn extents(&self) -> Vec<Extent>;
 
-    /// Records `first..end` of a run that it holds, ascending, at most about `max_bytes` of them (but one
-    /// at least, where there is one). Numbers before the last one found, or before `end` when none is,
-    /// that are left out no longer exist. May block on the card.
+    /// Records `first..end` of a run that exist, ascending, at most about `max_bytes` of them (but at least one, where
+    /// there is one). Numbers that are absent, up to the last one returned or up to `end` when none is, no longer
+    /// exist. May block on the card.
     fn read(&self, run: u32, first: u32, end: u32, max_bytes: usize) -> Found;
 
     /// A station has every number below `through` of a run on its disk.
     fn acknowledge(&self, station: &str, run: u32, through: u32);
 }
 
-/// The latest records of the present run, in memory, bounded in bytes: the oldest go first.
+/// The latest records of the present run, in memory, bounded in bytes: the oldest are dropped first.
 #[derive(Debug)]
 pub struct MemoryBacklog {
     run: u32,
@@ -58,11 +58,11 @@ struct Held {
     bytes: usize,
 }
 
-/// What a record takes beside its message: the rest of the struct, its topic, the queue's slot.
+/// Memory of a record apart from its message: the struct, its topic, the queue's slot.
 const OVERHEAD: usize = 160;
 
 impl MemoryBacklog {
-    /// For one run, holding at most `limit` bytes.
+    /// A backlog of one run with at most `limit` bytes.
     pub fn new(run: u32, flight: impl Into<String>, limit: usize) -> Self {
         Self { run, flight: flight.into(), limit, held: Mutex::default() }
     }
@@ -81,7 +81,7 @@ impl MemoryBacklog {
         &self.flight
     }
 
-    /// Keeps a record and gives its number.
+    /// Stores a record and returns its number.
     pub fn append(&self, record: Arc<Record>) -> u32 {
         let mut held = self.held();
         let number = held.first + held.records.len() as u32;
@@ -96,11 +96,11 @@ impl MemoryBacklog {
         number
     }
 
-    /// Takes over what another held, before anything was appended here.
+    /// Takes over the records of another backlog, before any is appended here.
     pub fn adopt(&self, earlier: Self) {
         let earlier = earlier.held.into_inner().unwrap_or_else(PoisonError::into_inner);
         let mut held = self.held();
-        debug_assert!(held.records.is_empty() && held.first == 0, "numbers are given out once");
+        debug_assert!(held.records.is_empty() && held.first == 0, "numbers are assigned once");
         *held = earlier;
     }
 
@@ -149,7 +149,7 @@ impl Backlog for MemoryBacklog {
     }
 
     fn acknowledge(&self, _station: &str, _run: u32, _through: u32) {
-        // Memory is bounded in bytes whoever has what: a station that was never seen may still come.
+        // Memory is bounded in bytes, whatever the stations have: a new station may still connect.
     }
 }
 
@@ -180,7 +180,7 @@ mod tests {
             backlog.read(9, first, end, max).expect("memory").into_iter().map(|(n, _)| n).collect()
         };
         assert_eq!(numbers(10, 18, usize::MAX), [15, 16, 17]);
-        assert_eq!(numbers(20, 99, 1), [20], "one at least");
+        assert_eq!(numbers(20, 99, 1), [20], "at least one");
         assert_eq!(backlog.read(8, 0, 99, usize::MAX).expect("memory").len(), 0, "another run");
         assert_eq!(backlog.get(24).map(|r| r.log_time.ns()), Some(24));
     }

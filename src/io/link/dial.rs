@@ -1,4 +1,4 @@
-//! Calling peers: until they answer, and again whenever the connection is gone or silent.
+//! Connecting to peers: until they answer, and again whenever the connection is lost or silent.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -6,29 +6,29 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-use super::door::{CALL, Door};
+use super::endpoint::{CALL, LinkEndpoint};
 use super::link_events::LinkEvent;
 use super::peer::Peer;
 use super::quic::transport;
 use super::tls::refusal;
 
-/// Silence after which a caller tries a fresh connection beside the old one.
+/// Silence after which a second connection is tried beside the first.
 const SUSPICIOUS: Duration = Duration::from_millis(2_500);
 /// Pause after another connection took over.
 const YIELD: Duration = Duration::from_secs(30);
-/// Pause between calls; it doubles, up to [`CALL`], while connections end young.
+/// Pause between attempts; it doubles, up to [`CALL`], while connections end early.
 const PAUSE: Duration = Duration::from_millis(300);
-/// A connection that ends before is young.
+/// A connection that ends within this time ended early.
 const YOUNG: Duration = Duration::from_secs(10);
 
-impl Door {
-    /// Calls a peer, and again whenever the connection is gone or silent, until the port is closed.
+impl LinkEndpoint {
+    /// Connects to a peer, and again whenever the connection is lost or silent, until the port is closed.
     pub(super) async fn dial(self, address: String) {
         let mut current: Option<Peer> = None;
         let mut told_unresolved = false;
         let (mut pause, mut answered) = (PAUSE, Instant::now());
-        // A call of ours beside a silent connection may have reached the peer though its answer did not
-        // reach us: then it is this call that took over, and nobody else.
+        // An attempt beside a silent connection may have reached the peer although its answer did not reach us: then it
+        // is this attempt that took over.
         let mut called_beside = false;
         loop {
             if let Some(peer) = &current {
@@ -41,8 +41,8 @@ impl Door {
                     Watched::Silent => called_beside = true,
                     Watched::Superseded if called_beside => current = None,
                     Watched::Superseded => {
-                        // Another way to the same peer, or another program with our certificate: taking
-                        // over from it at once would go on without end.
+                        // Another path to the same peer, or another program with our certificate: to take over from it
+                        // at once would repeat without end.
                         tokio::time::sleep(YIELD).await;
                         current = None;
                     }
@@ -113,7 +113,7 @@ enum Watched {
     Superseded,
 }
 
-/// Waits until a connection is closed, or nothing was heard on it for a while.
+/// Waits until a connection is closed or has been silent for a while.
 async fn watch(peer: &Peer) -> Watched {
     let connection = &peer.connection;
     let mut heard = connection.stats().udp_rx.datagrams;
@@ -125,7 +125,7 @@ async fn watch(peer: &Peer) -> Watched {
                     return Watched::Superseded;
                 }
                 if matches!(reason, quinn::ConnectionError::ConnectionClosed(_)) {
-                    // Thrown out, most likely for the certificate: no use in hurrying.
+                    // The peer refused us, most likely for the certificate: a quick retry does not help.
                     tokio::time::sleep(CALL).await;
                 }
                 return Watched::Closed;

@@ -1,56 +1,55 @@
-//! What a path is found to carry, from the delays and losses on it.
+//! Estimates the rate that a path carries, from delays and losses.
 //!
-//! The rate grows until data begins to stand in the path. Then nothing is sent until that is gone, the rate
-//! goes to just under what was delivered, and from there more is tried: little at first, the longer nothing
-//! stands the more.
+//! The rate grows until a queue begins to stand in the path. Then nothing is sent until the queue has drained, and the
+//! rate is set to just below the delivered rate. From there it grows again: slowly at first, faster the longer there is
+//! no queue.
 
 use std::time::Duration;
 
 use tokio::time::Instant;
 
-use super::pace::{Bucket, Way};
+use super::pace::{Bucket, Priority};
 use super::sense::{CLASSES, Noted};
 
-/// Standing delay in the path above which less is sent. Well under the 150 ms that live data may be late at;
-/// above the few milliseconds by which stations are asked to acknowledge at the latest.
+/// Standing delay in the path above which the rate is reduced. Well below the 150 ms that live data may be late; above
+/// the few milliseconds within which stations are asked to acknowledge.
 const QUEUE_LIMIT: Duration = Duration::from_millis(30);
-/// A packet that happens to come behind this many bytes waits for them on a slow line, and no queue stands.
+/// On a slow line, a packet that happens to follow this many bytes waits for them without a standing queue.
 const BESIDE: f64 = 60.0;
-/// Standing delay below which more is tried.
+/// Standing delay below which the rate grows.
 const QUEUE_EMPTY: Duration = Duration::from_millis(15);
-/// Where the search begins, bytes a second: carries two vehicles at 15 Hz, so that on a path that can carry them
-/// nothing waits for the search; on the slowest radios the first queue is found within half a second.
+/// Initial rate, bytes a second: enough for two vehicles at 15 Hz, so that on a path that can carry them nothing waits
+/// for the search; on the slowest radios the first queue is detected within half a second.
 const RATE_AT_START: f64 = 10_000.0;
-/// Never less than this, bytes a second: it finds out when the path is back.
+/// Lowest rate, bytes a second: it detects when the path works again.
 const RATE_LEAST: f64 = 1_500.0;
-/// Never more than this, bytes a second.
+/// Highest rate, bytes a second.
 const RATE_MOST: f64 = 50e6;
-/// While nothing is known of what the path carries, the rate grows by this share of itself a second.
+/// While the capacity of the path is unknown, the rate grows by this share of itself a second.
 const GROWTH_MOST: f64 = 5.0;
-/// Just after it was found how much that is, by this; twice as much with every second without a queue.
+/// Growth just after the capacity was found; it doubles with every second without a queue.
 const GROWTH_LEAST: f64 = 0.05;
-/// Share of what was delivered that is sent once a queue was found.
+/// Share of the delivered rate that is sent after a queue was found.
 const FOUND: f64 = 0.95;
-/// A delay that pauses do not end in this time is the path's own.
+/// A delay that pauses do not remove within this time belongs to the path.
 const STANDS_MOST: Duration = Duration::from_secs(2);
 /// Silence after which the path counts as cut.
 const SILENCE: Duration = Duration::from_millis(600);
-/// How long the least round-trip times are remembered: twice this at most.
+/// How long the least round-trip times are remembered: at most twice this.
 const BASE_MEMORY: Duration = Duration::from_secs(30);
-/// After a cut its losses are not held against the path: they are noted within this of the first
-/// acknowledgement.
+/// Losses from a cut do not count against the path: they are reported within this time of the first acknowledgement.
 const FORGIVEN: Duration = Duration::from_millis(400);
-/// Over how long losses are weighed against what arrived: a slow path carries a packet or two between two
-/// looks, and one lost packet does not make a path lossy.
+/// Time over which losses are compared with arrivals: a slow path carries one or two packets between two updates, and
+/// one lost packet does not make a path lossy.
 const LOSS_MEMORY_S: f64 = 2.0;
-/// Share of losses above which acknowledgements are lost as well, and one look's least delay may be that of a
-/// packet whose own acknowledgement never came: then the least of the last looks counts.
+/// Share of losses above which acknowledgements are also lost, so that the least delay of one update may be that of a
+/// packet whose own acknowledgement was lost: then the least of the last updates counts.
 const LOSSY: f64 = 0.05;
-/// How many looks.
+/// Number of those updates.
 const LOOKS: usize = 3;
 
-/// Delay above the least of packets of the same size. A slow line takes a long packet longer than a short one:
-/// at 48 kbit/s 100 bytes more are 17 ms, and no queue.
+/// Delay above the least of packets of the same size. A slow line takes longer for a long packet: at 48 kbit/s 100
+/// bytes more take 17 ms, which is not a queue.
 #[derive(Clone, Debug)]
 struct Delays {
     base: [[Option<Duration>; CLASSES]; 2],
@@ -63,12 +62,12 @@ impl Delays {
         Self { base: [[None; CLASSES]; 2], turned: now, looks: [Duration::MAX; LOOKS] }
     }
 
-    /// The least round-trip time of packets of a class or of a larger one, of the last half to whole minute.
+    /// The least round-trip time of packets of this or a larger class, over the last half to whole minute.
     fn least(&self, class: usize) -> Option<Duration> {
         self.base.iter().flat_map(|epoch| &epoch[class..]).flatten().min().copied()
     }
 
-    /// The standing delay seen since the last look; `None` where only sizes came that were not known before.
+    /// The standing delay since the last update; `None` where only new sizes of packets were acknowledged.
     fn look(
         &mut self,
         least_rtt: &[Option<Duration>; CLASSES],
@@ -94,7 +93,7 @@ impl Delays {
     }
 }
 
-/// Finds what a path carries.
+/// Estimates the rate that a path carries.
 #[derive(Clone, Debug)]
 pub struct Governor {
     bucket: Bucket,
@@ -103,16 +102,16 @@ pub struct Governor {
     updated: Instant,
     heard: Instant,
     delivered: f64,
-    /// Bytes lost and acknowledged lately, fading away over [`LOSS_MEMORY_S`].
+    /// Recent lost and acknowledged bytes, with exponential forgetting over [`LOSS_MEMORY_S`].
     lost: f64,
     acked: f64,
     delays: Delays,
     queue: Duration,
-    /// What was delivered, bytes a second, when a queue stood last, and when that was.
+    /// The delivered rate, bytes a second, when a queue last stood, and the time of it.
     found: Option<(f64, Instant)>,
     /// Since when a queue stands.
     stands: Option<Instant>,
-    /// Until then what is seen is of packets sent before the rate was changed.
+    /// Until this time, acknowledgements are of packets that were sent before the rate changed.
     settled: Instant,
     limited: bool,
     cut: bool,
@@ -120,7 +119,7 @@ pub struct Governor {
 }
 
 impl Governor {
-    /// At the beginning of a connection whose packets have `headers` bytes of IP and UDP headers.
+    /// For a new connection whose packets have `headers` bytes of IP and UDP headers.
     pub fn new(headers: f64, now: Instant) -> Self {
         Self {
             bucket: Bucket::new(RATE_AT_START, now),
@@ -141,30 +140,30 @@ impl Governor {
         }
     }
 
-    /// Bytes a second allowed now.
+    /// Allowed rate, bytes a second.
     pub fn rate(&self) -> f64 {
         self.bucket.rate()
     }
 
-    /// Whether the path seems cut: nothing was acknowledged for a while.
+    /// Whether the path seems cut: there was no acknowledgement for a while.
     pub fn is_cut(&self) -> bool {
         self.cut
     }
 
     /// Time until sending is allowed.
-    pub fn delay(&mut self, way: Way, now: Instant) -> Duration {
+    pub fn delay(&mut self, way: Priority, now: Instant) -> Duration {
         let delay = self.bucket.delay(way, now);
-        // Half of the debt is a sign in time: the first record that waits for the rate would be late.
-        self.limited |= !delay.is_zero() || (way == Way::Live && self.bucket.debt_used(now) > 0.5);
+        // Half of the debt is an early sign: the first record that waits for the rate would be late.
+        self.limited |= !delay.is_zero() || (way == Priority::Live && self.bucket.debt_used(now) > 0.5);
         delay
     }
 
-    /// Takes what was sent.
+    /// Accounts for sent bytes.
     pub fn charge(&mut self, bytes: f64) {
         self.bucket.charge(bytes);
     }
 
-    /// Learns from what was noted since the last call; call it about ten times a second.
+    /// Updates the estimate from the acknowledgements since the last call; called about ten times a second.
     pub fn update(&mut self, noted: Noted, now: Instant) {
         let passed = now.saturating_duration_since(self.updated).as_secs_f64().clamp(1e-3, 1.0);
         self.updated = now;
@@ -175,7 +174,7 @@ impl Governor {
         if noted.acked == 0 {
             if !self.cut && now.saturating_duration_since(self.heard) > SILENCE + self.queue {
                 self.cut = true;
-                // What was found before may be much more than what comes after.
+                // The earlier result may be much more than the path carries afterwards.
                 self.found = None;
                 self.set_rate(self.rate().min(1.5 * RATE_AT_START));
             }
@@ -198,7 +197,7 @@ impl Governor {
         let beside = Duration::from_secs_f64(BESIDE / self.delivered.max(RATE_LEAST));
         let stands = self.queue > QUEUE_LIMIT + beside;
         if stands && self.found.is_none() {
-            // What the search began with is no measure of what was delivered.
+            // The initial rate is no measure of what was delivered.
             self.delivered = arrived / passed;
         }
         if self.lost > self.acked {
@@ -214,7 +213,7 @@ impl Governor {
         }
     }
 
-    /// A queue stands: pauses until it is gone, `rtt` after which this shows.
+    /// A queue stands: pauses until it has drained; the result shows after `rtt`.
     fn drain(&mut self, rtt: Duration, now: Instant) {
         let since = *self.stands.get_or_insert(now);
         if now.saturating_duration_since(since) > STANDS_MOST {

@@ -1,4 +1,4 @@
-//! The search for a path's rate, on paths made of arithmetic.
+//! The search for a path's rate, on simulated paths.
 
 use super::*;
 
@@ -6,7 +6,7 @@ fn at(start: Instant, ms: u64) -> Instant {
     start + Duration::from_millis(ms)
 }
 
-/// Packets of 240 bytes: acknowledged and lost bytes, least round-trip time.
+/// Acknowledgements of packets of 240 bytes: acknowledged and lost bytes, least round-trip time.
 fn noted(acked: u64, lost: u64, rtt: Duration) -> Noted {
     let mut noted = Noted { lost, ..Noted::default() };
     if acked > 0 {
@@ -15,16 +15,16 @@ fn noted(acked: u64, lost: u64, rtt: Duration) -> Noted {
     Noted { acked, ..noted }
 }
 
-/// A path with a queue: `capacity` bytes a second, `rtt` without queue. Gives the rate found and the
-/// greatest standing delay after the first five seconds.
+/// A path with a queue: `capacity` bytes a second, `rtt` without queue. Returns the found rate and the greatest
+/// standing delay after the first five seconds.
 fn run(capacity: f64, rtt_ms: f64, seconds: u64, start: Instant) -> (f64, f64) {
     let mut governor = Governor::new(0.0, start);
     let (mut queued, mut worst) = (0.0_f64, 0.0_f64);
     for tick in 1..=seconds * 10 {
         let now = at(start, tick * 100);
-        // Everything the bucket allows is sent in messages of 240 bytes.
+        // Everything that the bucket allows is sent, in messages of 240 bytes.
         let mut offered = 0.0_f64;
-        while governor.delay(Way::Low, now).is_zero() && offered < 1e6 {
+        while governor.delay(Priority::Low, now).is_zero() && offered < 1e6 {
             governor.charge(240.0);
             offered += 240.0;
         }
@@ -63,13 +63,13 @@ fn a_third_of_the_packets_lost_does_not_throttle_a_path() {
     for tick in 1..=600 {
         let now = at(start, tick * 100);
         let (mut acked, mut lost) = (0, 0);
-        // As many messages of 240 bytes as the rate allows in a tenth of a second, which is one or a few.
+        // As many messages of 240 bytes as the rate allows in a tenth of a second: one or a few.
         for _ in 0..(governor.rate() * 0.1 / 240.0).ceil() as u64 {
             governor.charge(240.0);
             let fate = if random.random_bool(0.3) { &mut lost } else { &mut acked };
             *fate += 240;
         }
-        assert!(!governor.delay(Way::Low, now).is_zero(), "the rate is the limit");
+        assert!(!governor.delay(Priority::Low, now).is_zero(), "the rate is the limit");
         governor.update(noted(acked, lost, rtt), now);
         early = if tick == 50 { governor.rate() } else { early };
     }
@@ -82,7 +82,7 @@ fn what_a_cut_lost_does_not_slow_the_path_down_after_it() {
     let start = Instant::now();
     let mut governor = Governor::new(0.0, start);
     let up = noted(1_000, 0, Duration::from_millis(40));
-    // Given: a second of life, six of silence.
+    // Given: one second of traffic, six of silence.
     for tick in 1..=10 {
         governor.update(up, at(start, tick * 100));
     }
@@ -90,13 +90,13 @@ fn what_a_cut_lost_does_not_slow_the_path_down_after_it() {
         governor.update(Noted::default(), at(start, tick * 100));
     }
     let before = governor.rate();
-    // When: the first acknowledgement declares all that was sent meanwhile lost, the next some more.
+    // When: the first acknowledgement declares everything sent meanwhile lost, the next some more.
     for (tick, lost) in [(71, 45_000), (72, 2_000), (73, 0), (74, 0)] {
         governor.charge(10.0 * before);
-        assert!(!governor.delay(Way::Low, at(start, tick * 100)).is_zero(), "the rate is the limit");
+        assert!(!governor.delay(Priority::Low, at(start, tick * 100)).is_zero(), "the rate is the limit");
         governor.update(Noted { lost, ..up }, at(start, tick * 100));
     }
-    // Then: more is tried at once.
+    // Then: the rate grows at once.
     assert!(governor.rate() > 1.2 * before, "{} after {before} bytes/s", governor.rate());
 }
 
@@ -107,7 +107,7 @@ fn a_late_acknowledgement_is_a_queue_only_where_none_are_lost() {
         let mut governor = Governor::new(0.0, start);
         let rate = governor.rate();
         for tick in 1..=30 {
-            // Every tenth look sees but one packet, acknowledged 60 ms late.
+            // Every tenth update sees only one packet, acknowledged 60 ms late.
             let late = if tick % 10 == 0 { 60 } else { 0 };
             governor.update(noted(800, lost, Duration::from_millis(40 + late)), at(start, tick * 100));
         }
@@ -127,9 +127,9 @@ fn silence_is_a_cut_and_an_acknowledgement_ends_it() {
     assert!(!governor.is_cut() && governor.rate() >= RATE_LEAST);
 }
 
-/// A line of `capacity` bytes a second and 20 ms each way: thirty records a second of 241 bytes, the newest
-/// in place of one that waits, and seven of 90 beside. Gives how many of the former arrived in each
-/// second, and how late they were beyond the line's own time, ms.
+/// A line of `capacity` bytes a second and 20 ms each way: thirty records a second of 241 bytes, of which the newest
+/// replaces a waiting one, and seven of 90 bytes. Returns how many of the former arrived in each second, and their
+/// delay beyond the line's own time, ms.
 fn line(capacity: f64, seconds: u64, start: Instant) -> (Vec<u64>, Vec<f64>) {
     let mut governor = Governor::new(0.0, start);
     let (mut free_ms, mut waits) = (0.0_f64, None);
@@ -141,7 +141,7 @@ fn line(capacity: f64, seconds: u64, start: Instant) -> (Vec<u64>, Vec<f64>) {
         if ms % 1_000 * 30 % 1_000 < 30 {
             waits = Some(ms);
         }
-        let live = waits.filter(|_| governor.delay(Way::Live, now).is_zero());
+        let live = waits.filter(|_| governor.delay(Priority::Live, now).is_zero());
         for (born, bytes) in
             [live.map(|born| (born, 241)), (ms % 150 == 20).then_some((ms, 90))].into_iter().flatten()
         {
@@ -178,7 +178,7 @@ fn a_slow_line_is_filled_and_no_queue_stands_in_it() {
         let p99 = late[late.len() * 99 / 100];
         assert!(p99 < most_late, "{p99} ms late on {capacity} bytes/s; median {}", late[late.len() / 2]);
     }
-    // Half of a line that carries more is none of its business: everything arrives.
+    // On a line with more capacity everything arrives.
     let (arrived, late) = line(60_000.0, 20, Instant::now());
     assert!(arrived[2..19].iter().all(|n| *n >= 29), "records a second: {arrived:?}");
     assert!(late.iter().filter(|ms| **ms > 10.0).count() <= 5, "late at the start");
@@ -200,7 +200,7 @@ fn a_long_packet_takes_a_slow_line_longer_and_is_no_queue() {
     assert_eq!(look(&[(240, 81), (80, 90)], 300), Some(0));
     assert_eq!(look(&[(240, 121), (80, 94)], 400), Some(40));
     assert_eq!(look(&[(80, 94), (1_100, 400)], 500), Some(40), "a new size hides no queue");
-    // A long packet that was quick bounds what a short one takes.
+    // A quick long packet is an upper bound for a short one.
     assert_eq!(look(&[(1_100, 50)], 600), Some(0));
     assert_eq!(look(&[(80, 60)], 700), Some(10));
 }

@@ -1,8 +1,8 @@
-//! A small certificate authority: payloads and stations know each other by certificates it signed.
+//! A small certificate authority: payloads and stations authenticate each other by certificates that it signed.
 //!
-//! One directory holds it: `authority.pem` and `authority.key`, the revocation list `revoked.pem`, and a
-//! certificate and key for each member (`payload-NAME.pem`, `payload-NAME.key`). Private keys are written
-//! with mode 0600 and refused when looser.
+//! It is one directory: `authority.pem` and `authority.key`, the revocation list `revoked.pem`, and a certificate and
+//! key for each member (`payload-NAME.pem`, `payload-NAME.key`). Private keys are written with mode 0600 and refused
+//! with a wider mode.
 
 use std::io::Write as _;
 use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
@@ -20,12 +20,12 @@ use windhover_base::time::{Civil, NS_PER_S, UtcTime};
 /// Domain under which every certificate carries its role and name.
 const DOMAIN: &str = "windhover";
 
-/// What a certificate lets its holder be.
+/// The role that a certificate gives its holder.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum Role {
-    /// Flies, sends estimates.
+    /// The flying side, which sends estimates.
     Payload,
-    /// Receives them on the ground.
+    /// The ground side, which receives them.
     Station,
 }
 
@@ -62,10 +62,10 @@ pub enum KeyError {
         action: &'static str,
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Others than the owner may read a private key.
+    /// A private key is readable by others than its owner.
     #[error("private key {} is open to others (mode {mode:03o}): chmod 600 it", path.display())]
     Loose {
         /// The file.
@@ -76,7 +76,7 @@ pub enum KeyError {
     /// The file exists already.
     #[error("{} exists already; remove it or choose another name or directory", .0.display())]
     Exists(PathBuf),
-    /// A file does not hold what it should.
+    /// A file has the wrong content.
     #[error("{}: {what}", path.display())]
     Unreadable {
         /// The file.
@@ -84,13 +84,13 @@ pub enum KeyError {
         /// What is wrong.
         what: String,
     },
-    /// A name that cannot stand in a certificate.
+    /// A name that is not allowed in a certificate.
     #[error("name {0:?}: use letters, digits and - only, at most 40 of them")]
     Name(String),
-    /// This computer does not know the date.
-    #[error("this computer's clock says {0}: set it before making certificates")]
+    /// The clock of this computer is not set.
+    #[error("this computer's clock shows {0}: set it before making certificates")]
     ClockNotSet(String),
-    /// The cryptography library refused.
+    /// The cryptography library failed.
     #[error("cannot make a certificate: {0}")]
     Crypto(String),
 }
@@ -99,7 +99,7 @@ fn crypto(error: impl std::fmt::Display) -> KeyError {
     KeyError::Crypto(error.to_string())
 }
 
-/// A member of the authority as its directory shows it.
+/// A member of the authority, from its directory.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Member {
     /// Payload or station.
@@ -121,7 +121,7 @@ pub struct Authority {
 }
 
 impl Authority {
-    /// The authority kept in `dir`, which need not exist yet.
+    /// The authority in `dir`, which need not exist yet.
     pub fn at(dir: impl Into<PathBuf>) -> Self {
         Self { dir: dir.into() }
     }
@@ -214,7 +214,7 @@ impl Authority {
         self.write_revoked(&serials, now)
     }
 
-    /// Every member whose certificate is in the directory, sorted by role and name.
+    /// Every member with a certificate in the directory, sorted by role and name.
     pub fn members(&self) -> Result<Vec<Member>, KeyError> {
         let revoked = self.revoked_serials()?;
         let failed = |source| KeyError::File { action: "read", path: self.dir.clone(), source };
@@ -296,7 +296,7 @@ fn plus_days(now: UtcTime, days: i64) -> UtcTime {
     UtcTime::from_unix_ns(now.unix_ns().saturating_add(days.saturating_mul(86_400 * NS_PER_S)))
 }
 
-/// The start of a day as the certificate library wants it. Before 2020 the clock was never set.
+/// The start of a day in the certificate library's type. Before 2020 the clock was never set.
 fn day(at: UtcTime) -> Result<::time::OffsetDateTime, KeyError> {
     let Civil { year, month, day, .. } = at.civil();
     if year < 2020 {
@@ -305,8 +305,8 @@ fn day(at: UtcTime) -> Result<::time::OffsetDateTime, KeyError> {
     Ok(rcgen::date_time_ymd(year, month, day))
 }
 
-/// What every certificate has: valid from 1970 on, because a payload without a battery-backed clock
-/// starts there and must not be locked out of its link before it knows the time.
+/// Common parameters of all certificates: valid from 1970 on, because a payload without a battery-backed clock starts
+/// there and must be able to use its link before it knows the time.
 fn params(name: &str, days: i64, now: UtcTime) -> Result<CertificateParams, KeyError> {
     let mut params = CertificateParams::default();
     params.not_before = rcgen::date_time_ymd(1970, 1, 1);
@@ -326,12 +326,12 @@ fn write_key(path: &Path, key: &KeyPair) -> Result<(), KeyError> {
     write_file(path, key.serialize_pem().as_bytes(), 0o600)
 }
 
-/// Writes beside the file and renames over it, so that a reader never sees half of it.
+/// Writes a temporary file and renames it, so that a reader never sees part of it.
 fn write_file(path: &Path, bytes: &[u8], mode: u32) -> Result<(), KeyError> {
     let failed = |source| KeyError::File { action: "write", path: path.to_owned(), source };
     let beside = path.with_extension("new");
     let write = || -> std::io::Result<()> {
-        // A leftover of an interrupted run may have another mode.
+        // The temporary file of an interrupted run may have another mode.
         let _ = std::fs::remove_file(&beside);
         let mut file = std::fs::OpenOptions::new().write(true).create_new(true).mode(mode).open(&beside)?;
         file.write_all(bytes)?;
@@ -374,7 +374,7 @@ fn read_der(path: &Path) -> Result<Vec<u8>, KeyError> {
     }
 }
 
-/// Role and name in a certificate's alternative names; `None` where it is not one of ours.
+/// Role and name in a certificate's alternative names; `None` where it is not of such an authority.
 pub fn peer_of(certificate_der: &[u8]) -> Option<(Role, String)> {
     let (_, certificate) = x509_parser::parse_x509_certificate(certificate_der).ok()?;
     let names = certificate.subject_alternative_name().ok()??;

@@ -33,7 +33,7 @@ fn revoked_members_are_on_the_list_and_the_list_grows() {
     }
     authority.revoke(Role::Station, "one", NOW).expect("revoked");
     authority.revoke(Role::Station, "three", NOW).expect("revoked");
-    authority.revoke(Role::Station, "three", NOW).expect("revoked twice is revoked once");
+    authority.revoke(Role::Station, "three", NOW).expect("revoking twice is revoking once");
     let revoked: Vec<_> =
         authority.members().expect("members").into_iter().map(|m| (m.name, m.revoked)).collect();
     assert_eq!(revoked, [("one".to_owned(), true), ("three".to_owned(), true), ("two".to_owned(), false)]);
@@ -75,7 +75,7 @@ proptest::proptest! {
         proptest::prop_assert_eq!(peer_of(&bytes), None);
         proptest::prop_assert_eq!(serial_of(&bytes), None);
         proptest::prop_assert_eq!(expiry_of(&bytes), None);
-        // An empty list could be formed by luck; only a panic is an error here.
+        // An empty list could occur by chance; only a panic is an error here.
         let _ = serials_of_list(&bytes);
     }
 }

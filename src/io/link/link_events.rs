@@ -1,4 +1,4 @@
-//! What the link tells the operator, and why it could not be opened.
+//! The link's events for the operator, and the errors of opening it.
 
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -13,44 +13,44 @@ use super::peer::{Ended, Peer};
 /// At most one refusal is reported in this time; the others are counted.
 const REFUSALS: Duration = Duration::from_secs(1);
 
-/// What the operator may want to know about the link.
+/// An event of the link for the operator.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum LinkEvent {
     /// A peer is connected.
     Up {
         /// Its name.
         peer: String,
-        /// Where it is.
+        /// Its address.
         address: SocketAddr,
     },
-    /// A peer is gone.
+    /// A peer is disconnected.
     Down {
         /// Its name.
         peer: String,
-        /// Why.
+        /// The reason.
         why: String,
     },
-    /// Somebody was not let in, or would not let us in.
+    /// A peer was refused, or refused us.
     Refused {
-        /// Where.
+        /// Its address.
         address: SocketAddr,
-        /// Why, in words.
+        /// The reason, as text.
         why: String,
-        /// How many refusals were not reported one by one since the last.
+        /// How many refusals since the last report were not reported.
         unreported: u64,
     },
     /// The key files changed and were read again.
     KeysReloaded,
-    /// The key files changed and are not usable; the old ones stay in force.
+    /// The key files changed and are not usable; the previous ones stay in use.
     KeysUnusable {
         /// What is wrong.
         why: String,
     },
-    /// A station to be called has no address.
+    /// The name of a configured station does not resolve.
     Unresolved {
         /// As configured.
         address: String,
-        /// What the system said.
+        /// The system's error.
         why: String,
     },
 }
@@ -66,12 +66,12 @@ pub enum LinkError {
     Bind {
         /// The address.
         address: SocketAddr,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
 }
 
-/// Sends events to the operator without ever waiting.
+/// Sends events to the operator; never waits.
 #[derive(Clone, Debug)]
 pub struct Events {
     sender: mpsc::Sender<LinkEvent>,
@@ -80,18 +80,18 @@ pub struct Events {
 }
 
 impl Events {
-    /// Into a channel; what does not fit is left out.
+    /// Events into a channel; they are dropped while it is full.
     pub fn new(sender: mpsc::Sender<LinkEvent>) -> Self {
         Self { sender, refused: Arc::default(), quiet: Arc::default() }
     }
 
-    /// Reports.
+    /// Reports an event.
     pub fn tell(&self, event: LinkEvent) {
-        // The operator's channel being full means hundreds of events are waiting already.
+        // A full channel means that hundreds of events are already waiting.
         let _ = self.sender.try_send(event);
     }
 
-    /// Counts a refusal, and reports it unless another was reported just now.
+    /// Counts a refusal, and reports it unless another one was just reported.
     pub fn refused(&self, address: SocketAddr, why: String) {
         self.refused.fetch_add(1, Ordering::Relaxed);
         let mut quiet = self.quiet.lock().unwrap_or_else(PoisonError::into_inner);
@@ -114,7 +114,7 @@ impl Events {
         }
     }
 
-    /// How many were refused since the start.
+    /// Number of refusals since the start.
     pub fn refusals(&self) -> u64 {
         self.refused.load(Ordering::Relaxed)
     }

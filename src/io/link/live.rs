@@ -1,27 +1,27 @@
-//! What is waiting to be sent live: by priority, newest first, the rest left to back-fill.
+//! Records waiting to be sent live: by priority, newest first, the others left to back-fill.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 
 use crate::io::records::{Record, topic};
 
-/// What goes down live, most urgent first.
+/// Priority of live records, most urgent first.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum Class {
-    /// Operator's notices and what a map needs once: all of them matter.
+    /// Operator's notices, and messages that a map needs once: all of them matter.
     Event,
-    /// Where the vehicle is.
+    /// State of a vehicle.
     Estimate,
-    /// How everything does.
+    /// Health of all parts.
     Health,
-    /// Where the helicopter is.
+    /// State of the helicopter.
     Ownship,
-    /// Not live, but missed by nobody afterwards.
+    /// Not live, but complete after back-fill.
     Later,
 }
 
-/// Whether a topic of the flight goes to the ground, and how urgently. Raw serial bytes, camera frames,
-/// what can be computed from other topics and the filter's inner figures stay on the card.
+/// Whether a topic of the flight is sent to the ground, and its priority. Raw serial bytes, camera frames, data that
+/// can be computed from other topics, and the filter's internal values stay on the card.
 pub fn downlink_class(name: &str) -> Option<Class> {
     match name {
         topic::LOG | topic::DATUM => Some(Class::Event),
@@ -33,7 +33,7 @@ pub fn downlink_class(name: &str) -> Option<Class> {
     }
 }
 
-/// Notices kept waiting; older ones are left to back-fill.
+/// Most notices that wait; older ones are left to back-fill.
 const EVENTS_WAITING: usize = 16;
 
 /// One record waiting.
@@ -45,7 +45,7 @@ pub struct Waiting {
     pub record: Arc<Record>,
 }
 
-/// Records waiting to go live: the newest of each topic, and the latest few notices.
+/// Records waiting to be sent live: the newest of each topic, and the latest few notices.
 #[derive(Debug, Default)]
 pub struct LiveQueue {
     events: VecDeque<Waiting>,
@@ -54,7 +54,7 @@ pub struct LiveQueue {
 }
 
 impl LiveQueue {
-    /// Takes a record; what it replaces is left to back-fill.
+    /// Adds a record; the one that it replaces is left to back-fill.
     pub fn push(&mut self, number: u32, record: Arc<Record>) {
         let waiting = Waiting { number, record };
         match downlink_class(&waiting.record.topic) {
@@ -79,7 +79,7 @@ impl LiveQueue {
         }
     }
 
-    /// Takes the most urgent out; among equals the one waiting longest.
+    /// Removes the most urgent; among equals the one that has waited longest.
     pub fn pop(&mut self) -> Option<Waiting> {
         if let Some(event) = self.events.pop_front() {
             return Some(event);
@@ -93,7 +93,7 @@ impl LiveQueue {
         self.events.is_empty() && self.newest.is_empty()
     }
 
-    /// How many were left to back-fill since the beginning.
+    /// Number of records left to back-fill since the start.
     pub fn thinned(&self) -> u64 {
         self.thinned
     }

@@ -1,10 +1,10 @@
 //! The wireless link: QUIC with certificates on both sides, live datagrams, back-fill on streams.
 //!
-//! `docs/link.md` describes the message format and what is guaranteed.
+//! `docs/link.md` describes the message format and the guarantees.
 
 mod backlog;
 mod dial;
-mod door;
+mod endpoint;
 mod link_events;
 mod governor;
 pub mod keys;

@@ -1,28 +1,27 @@
-//! How much may be sent now: a bucket that may go into debt, for a bandwidth ceiling and for what the path is
-//! found to carry ([`super::governor`]).
+//! How much may be sent now: a token bucket that may go into debt, for a bandwidth ceiling and for the rate that the
+//! path carries ([`super::governor`]).
 //!
-//! What is sent again waits until the balance is not negative; what is live may go into debt by a little more
-//! than one portion of the former, so that it waits for none, and for nothing but the rate itself where live
-//! data alone is more than fits.
+//! Back-fill waits until the balance is not negative. Live data may go into debt by a little more than one portion of
+//! back-fill. So live data never waits for back-fill, and waits for the rate only where live data alone exceeds it.
 
 use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// Debt up to which live data is sent: one portion of what is sent again takes 30 ms, and an estimate and an
-/// ownship sent after it are to wait for nothing.
+/// Debt up to which live data is sent: one portion of back-fill takes 30 ms, and an estimate and an ownship state after
+/// it must not wait.
 const LIVE_DEBT_S: f64 = 0.05;
-/// The same at rates so low that this is less than a packet or two, bytes.
+/// The least such debt, bytes, for rates so low that the above is less than one or two packets.
 const LIVE_DEBT_LEAST: f64 = 300.0;
-/// What is saved up for a burst while nothing is sent, seconds of the rate.
+/// Credit for a burst that is saved while nothing is sent, seconds of the rate.
 const SAVED_S: f64 = 0.004;
 
-/// What is to be sent, as to its right of way.
+/// The priority class of data.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Way {
+pub enum Priority {
     /// Live data.
     Live,
-    /// What is sent again, and pictures.
+    /// Back-fill, and pictures.
     Low,
 }
 
@@ -35,7 +34,7 @@ pub struct Bucket {
 }
 
 impl Bucket {
-    /// Fills at `rate` bytes a second.
+    /// A bucket that fills at `rate` bytes a second.
     pub fn new(rate: f64, now: Instant) -> Self {
         Self { rate, balance: 0.0, filled: now }
     }
@@ -43,7 +42,7 @@ impl Bucket {
     fn fill(&mut self, now: Instant) {
         let passed = now.saturating_duration_since(self.filled).as_secs_f64();
         self.filled = now;
-        // At the least as much as makes up for a timer of a millisecond.
+        // At least as much as compensates for a timer of a millisecond.
         let most = (self.rate * SAVED_S).max(100.0);
         self.balance = (self.balance + passed * self.rate).min(most);
     }
@@ -54,11 +53,11 @@ impl Bucket {
     }
 
     /// Time until sending is allowed; zero when it is.
-    pub fn delay(&mut self, way: Way, now: Instant) -> Duration {
+    pub fn delay(&mut self, way: Priority, now: Instant) -> Duration {
         self.fill(now);
         let debt = match way {
-            Way::Live => self.live_debt(),
-            Way::Low => 0.0,
+            Priority::Live => self.live_debt(),
+            Priority::Low => 0.0,
         };
         Duration::from_secs_f64(((-debt - self.balance) / self.rate).max(0.0))
     }
@@ -79,14 +78,14 @@ impl Bucket {
         self.rate = rate;
     }
 
-    /// Nothing is sent until `bytes` have gone at the present rate; live data only for that part of the time that
+    /// Nothing is sent until `bytes` have gone at the present rate; live data waits only for the part of that time that
     /// its debt at higher rates does not cover.
     pub fn pause(&mut self, bytes: f64, now: Instant) {
         self.fill(now);
         self.balance = self.balance.min(-LIVE_DEBT_LEAST - bytes);
     }
 
-    /// Takes what was sent.
+    /// Accounts for sent bytes.
     pub fn charge(&mut self, bytes: f64) {
         self.balance -= bytes;
     }
@@ -106,7 +105,7 @@ mod tests {
         let mut bucket = Bucket::new(6_000.0, start);
         let mut sent = 0.0;
         for ms in 0..10_000 {
-            if bucket.delay(Way::Low, at(start, ms)).is_zero() {
+            if bucket.delay(Priority::Low, at(start, ms)).is_zero() {
                 bucket.charge(240.0);
                 sent += 240.0;
             }
@@ -118,30 +117,30 @@ mod tests {
     fn live_data_waits_for_no_portion_and_still_obeys_the_rate() {
         let start = Instant::now();
         let mut bucket = Bucket::new(10_000.0, start);
-        // Given: 80 bytes of live data every 10 ms, and all the rest given to what is sent again.
+        // Given: 80 bytes of live data every 10 ms, and all the rest used by back-fill.
         let (mut live, mut low) = (0.0, 0.0);
         for ms in 0..10_000 {
             let now = at(start, ms);
-            if bucket.delay(Way::Low, now).is_zero() {
+            if bucket.delay(Priority::Low, now).is_zero() {
                 bucket.charge(300.0);
                 low += 300.0;
             }
             if ms % 10 == 0 {
-                assert!(bucket.delay(Way::Live, now).is_zero(), "it waits after {ms} ms");
+                assert!(bucket.delay(Priority::Live, now).is_zero(), "it waits after {ms} ms");
                 bucket.charge(80.0);
                 live += 80.0;
             }
         }
         assert!((98_000.0..101_000.0).contains(&(live + low)), "{} bytes in 10 s", live + low);
-        // When: live data alone is more than fits, it gets the rate, and the rest nothing.
+        // When: live data alone exceeds the rate, it gets all of the rate, and back-fill gets nothing.
         let (mut live, mut low) = (0.0, 0.0);
         for ms in 10_000..20_000 {
             let now = at(start, ms);
-            while bucket.delay(Way::Live, now).is_zero() {
+            while bucket.delay(Priority::Live, now).is_zero() {
                 bucket.charge(80.0);
                 live += 80.0;
             }
-            if bucket.delay(Way::Low, now).is_zero() {
+            if bucket.delay(Priority::Low, now).is_zero() {
                 low += 300.0;
             }
         }

@@ -1,4 +1,4 @@
-//! The payload's side of the link: a handle that never blocks, and the tasks behind it.
+//! The payload's side of the link: a handle that never blocks, and its tasks.
 
 use std::net::SocketAddr;
 use std::sync::atomic::Ordering;
@@ -9,7 +9,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 
 use super::backlog::{Backlog, MemoryBacklog};
-use super::door::Door;
+use super::endpoint::LinkEndpoint;
 use super::keys::Role;
 use super::link_events::{Events, LinkError, LinkEvent};
 use super::live::downlink_class;
@@ -22,27 +22,27 @@ use super::tls::KeyFiles;
 use crate::config::LinkConfig;
 use crate::io::records::Record;
 
-/// What the payload's side of the link is made of.
+/// Settings of the payload's side of the link.
 #[derive(Clone, Debug)]
 pub struct PayloadSettings {
     /// Certificates and keys.
     pub files: KeyFiles,
     /// Where stations reach the payload.
     pub listen: Option<SocketAddr>,
-    /// Stations the payload calls.
+    /// Stations to which the payload connects.
     pub dial: Vec<String>,
-    /// Most that may be sent, bytes a second.
+    /// Highest rate, bytes a second.
     pub ceiling: Option<f64>,
     /// Least time between two thumbnails; `None` sends none.
     pub thumbnails: Option<Duration>,
     /// Width of thumbnails, pixels.
     pub thumbnail_width: u32,
-    /// Memory for what may have to be sent again, bytes.
+    /// Memory for back-fill, bytes.
     pub backlog_bytes: usize,
 }
 
 impl PayloadSettings {
-    /// As configured.
+    /// The settings from the configuration.
     pub fn from_config(config: &LinkConfig) -> Self {
         Self {
             files: KeyFiles {
@@ -51,7 +51,7 @@ impl PayloadSettings {
                 key: (&config.key).into(),
                 revoked: config.revoked.as_ref().map(Into::into),
             },
-            // The configuration was checked: what does not parse is not there.
+            // The configuration was checked: a value that does not parse is treated as absent.
             listen: config.listen.as_ref().and_then(|address| address.parse().ok()),
             dial: config.dial.clone(),
             ceiling: config.ceiling_kbps.map(|kbps| kbps * 1e3 / 8.0),
@@ -63,44 +63,43 @@ impl PayloadSettings {
     }
 }
 
-/// Records of a run whose link is not open yet: they are numbered like all that follow.
+/// Records of a run whose link is not open yet: they are numbered like the later ones.
 #[derive(Debug)]
 pub struct EarlyRecords(MemoryBacklog);
 
 impl EarlyRecords {
-    /// Of a link with these settings: bounded like its own memory, the oldest go first.
+    /// For a link with these settings: bounded like its memory, the oldest are dropped first.
     pub fn new(settings: &PayloadSettings) -> Self {
         Self(MemoryBacklog::new(0, "", settings.backlog_bytes))
     }
 
-    /// Keeps a record for when the link is open and gives its number; `None` where its topic is not for the
-    /// ground.
+    /// Stores a record until the link is open and returns its number; `None` where its topic is not for the ground.
     pub fn send(&self, record: &Record) -> Option<u32> {
         numbered(&self.0, record)
     }
 }
 
-/// Keeps a record that is for the ground; its number.
+/// Stores a record that is for the ground; returns its number.
 fn numbered(recent: &MemoryBacklog, record: &Record) -> Option<u32> {
     downlink_class(&record.topic)?;
     Some(recent.append(Arc::new(record.clone())))
 }
 
-/// Gives records to the link. Copies are cheap; nothing here ever blocks.
+/// Passes records to the link. Copies are cheap; no call ever blocks.
 #[derive(Clone)]
 pub struct LinkHandle {
     shared: Arc<PayloadShared>,
 }
 
 impl LinkHandle {
-    /// Begins with records that were made before the link was open, under the numbers they got.
+    /// Takes over records that were made before the link was open, with their numbers.
     pub fn begin_with(&self, early: EarlyRecords) {
         self.shared.recent.adopt(early.0);
         self.shared.end.send_replace(self.shared.recent.end());
     }
 
-    /// Takes a record on its way to the ground and gives its number in this run; `None` where its topic
-    /// is not for the ground. Sessions are told at once.
+    /// Sends a record to the ground and returns its number in this run; `None` where its topic is not for the ground.
+    /// Sessions are notified at once.
     pub fn send(&self, record: &Record) -> Option<u32> {
         let number = numbered(&self.shared.recent, record)?;
         self.shared.end.send_modify(|end| *end = (*end).max(number + 1));
@@ -114,12 +113,12 @@ impl LinkHandle {
         }
     }
 
-    /// Whether a thumbnail would be sent to anybody: spares the making of pictures nobody sees.
+    /// Whether any station would get a thumbnail, so that no unused picture is made.
     pub fn wants_pictures(&self) -> bool {
         self.shared.thumbnails.is_some() && !self.shared.stations().is_empty()
     }
 
-    /// How the link does, for the health line.
+    /// State of the link, for the health line.
     pub fn status(&self) -> LinkStatus {
         LinkStatus {
             stations: self.shared.stations().values().map(|c| c.status.clone()).collect(),
@@ -132,15 +131,15 @@ impl LinkHandle {
 
 /// The payload's side of the link, opened.
 pub struct PayloadLink {
-    door: Door,
+    link_endpoint: LinkEndpoint,
     dial: Vec<String>,
     shared: Arc<PayloadShared>,
     arrivals: mpsc::Receiver<Peer>,
 }
 
 impl PayloadLink {
-    /// Opens the port. `run` and `flight` identify this run of the program; `deep` is what the store
-    /// holds of earlier ones and of what memory lost. Events for the operator come out of the receiver.
+    /// Opens the port. `run` and `flight` identify this run of the program; `deep` is the store's backlog of earlier
+    /// runs and of records that are no longer in memory. Events for the operator come out of the receiver.
     pub fn open(
         settings: &PayloadSettings,
         run: u32,
@@ -149,7 +148,8 @@ impl PayloadLink {
     ) -> Result<(Self, LinkHandle, mpsc::Receiver<LinkEvent>), LinkError> {
         let (event_sender, event_receiver) = mpsc::channel(256);
         let events = Events::new(event_sender);
-        let (door, arrivals) = Door::open(Role::Payload, &settings.files, settings.listen, events.clone())?;
+        let (link_endpoint, arrivals) =
+            LinkEndpoint::open(Role::Payload, &settings.files, settings.listen, events.clone())?;
         let shared = Arc::new(PayloadShared {
             recent: MemoryBacklog::new(run, flight, settings.backlog_bytes),
             deep,
@@ -162,23 +162,23 @@ impl PayloadLink {
             events,
         });
         let handle = LinkHandle { shared: Arc::clone(&shared) };
-        let link = Self { door, dial: settings.dial.clone(), shared, arrivals };
+        let link = Self { link_endpoint, dial: settings.dial.clone(), shared, arrivals };
         Ok((link, handle, event_receiver))
     }
 
-    /// The UDP port it has.
+    /// The local UDP address.
     pub fn local_addr(&self) -> std::io::Result<SocketAddr> {
-        self.door.local_addr()
+        self.link_endpoint.local_addr()
     }
 
-    /// Serves stations until `stop` says so (or its sender is gone).
+    /// Serves stations until `stop` is set (or its sender is gone).
     pub async fn run(self, stop: watch::Receiver<bool>) {
         let shared = self.shared;
-        self.door.run(self.dial, self.arrivals, stop, |peer| welcome(&shared, peer)).await;
+        self.link_endpoint.run(self.dial, self.arrivals, stop, |peer| welcome(&shared, peer)).await;
     }
 }
 
-/// A session; an older one of the same station ends.
+/// Runs a session; an older one of the same station ends.
 fn welcome(shared: &Arc<PayloadShared>, peer: Peer) -> impl Future<Output = ()> + Send + use<> {
     let status = StationStatus {
         name: peer.name.clone(),

@@ -1,4 +1,4 @@
-//! What the payload's handle and its sessions share: records to send again, the stations, how each does.
+//! Shared by the payload's handle and its sessions: records for back-fill, the stations, their state.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::AtomicBool;
@@ -13,7 +13,7 @@ use super::pace::Bucket;
 use super::peer::Peer;
 use super::thumbnail::Picture;
 
-/// How the link does with one station.
+/// State of the link with one station.
 #[derive(Clone, PartialEq, Debug)]
 pub struct StationStatus {
     /// Its name.
@@ -22,21 +22,21 @@ pub struct StationStatus {
     pub hears_us: bool,
     /// Round-trip time, ms.
     pub rtt_ms: f64,
-    /// What the path is found to carry, kbit/s.
+    /// Estimated rate of the path, kbit/s.
     pub rate_kbps: f64,
     /// Records sent live.
     pub live: u64,
-    /// Records left to back-fill because newer ones overtook them.
+    /// Records left to back-fill because newer ones replaced them.
     pub thinned: u64,
     /// Records sent again.
     pub backfilled: u64,
-    /// Times that the card could not be read for it.
+    /// How often the card could not be read for it.
     pub unread: u64,
-    /// Records it asked for that are still to be sent.
+    /// Records that it requested and that are still to be sent.
     pub wanted: u64,
 }
 
-/// How the link does.
+/// State of the link.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct LinkStatus {
     /// Connected stations.
@@ -53,11 +53,11 @@ pub struct LinkStatus {
 pub(super) struct Connected {
     pub(super) peer: Peer,
     pub(super) status: StationStatus,
-    /// Whether the operator was told that it is up; a connection that takes over inherits it.
+    /// Whether `link_up` was reported; a connection that takes over inherits it.
     pub(super) told: Arc<AtomicBool>,
 }
 
-/// What the sessions share.
+/// Shared by the sessions.
 pub(super) struct PayloadShared {
     pub(super) recent: MemoryBacklog,
     pub(super) deep: Option<Arc<dyn Backlog>>,
@@ -71,7 +71,7 @@ pub(super) struct PayloadShared {
 }
 
 impl PayloadShared {
-    /// Tells of every new record.
+    /// Notifies of every new record.
     pub(super) fn news(&self) -> watch::Receiver<u32> {
         self.end.subscribe()
     }
@@ -80,7 +80,7 @@ impl PayloadShared {
         self.stations.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Every run of which something is held; the present one last.
+    /// Every run of which any record exists; the present one last.
     pub(super) fn extents(&self) -> Vec<Extent> {
         let recent = self.recent.extents();
         let mut all = self.deep.as_ref().map_or(Vec::new(), |deep| deep.extents());
@@ -96,8 +96,7 @@ impl PayloadShared {
         all
     }
 
-    /// Reads records again, from memory where they are there, else from the card. Numbers left out are
-    /// gone for good.
+    /// Reads records again, from memory where they are there, else from the card. Absent numbers no longer exist.
     pub(super) async fn read(self: &Arc<Self>, run: u32, first: u32, end: u32, max_bytes: usize) -> Found {
         let recent = self.recent.read(run, first, end, max_bytes)?;
         let covered = recent.first().is_some_and(|(number, _)| *number == first);

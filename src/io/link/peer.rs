@@ -1,4 +1,4 @@
-//! A peer that was let in, and how its connection and session come to an end.
+//! An admitted peer, and the end of its connection and session.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use quinn::{Connection, VarInt};
 use super::tls::refusal;
 use super::wire::WireError;
 
-/// Reasons a side closes a connection with.
+/// Codes with which a side closes a connection.
 pub(super) mod close {
     /// A newer connection of the same peer took its place.
     pub const SUPERSEDED: u32 = 1;
@@ -19,13 +19,13 @@ pub(super) mod close {
     pub const WRONG_ROLE: u32 = 3;
     /// The certificate was revoked meanwhile.
     pub const REVOKED: u32 = 4;
-    /// The peer sent what is no message of the link.
+    /// The peer sent something that is not a message of the link.
     pub const MALFORMED: u32 = 5;
-    /// The peer sent more of something than is kept of any.
+    /// The peer exceeded a limit.
     pub const EXCESS: u32 = 6;
 }
 
-/// A peer that has shown its certificate.
+/// A peer with a valid certificate.
 #[derive(Clone, Debug)]
 pub struct Peer {
     /// Its name.
@@ -36,12 +36,12 @@ pub struct Peer {
 }
 
 impl Peer {
-    /// Of this name, at the other end of a connection.
+    /// The peer of this name at the other end of a connection.
     pub(super) fn new(name: String, connection: Connection) -> Self {
         Self { name, connection, superseded: Arc::default() }
     }
 
-    /// Where it is now; of IPv4 as such also on a socket for both.
+    /// Its present address; an IPv4 address as such, also on a dual-stack socket.
     pub(super) fn address(&self) -> SocketAddr {
         let address = self.connection.remote_address();
         SocketAddr::new(address.ip().to_canonical(), address.port())
@@ -53,8 +53,8 @@ impl Peer {
         self.connection.close(VarInt::from_u32(close::SUPERSEDED), b"a newer connection took over");
     }
 
-    /// Whether a newer connection took its place, by our doing or the other side's. A close of our own
-    /// alone does not say so: a session that ended for any other reason is closed by us as well.
+    /// Whether a newer connection took its place, closed by us or by the other side. A close by us alone does not prove
+    /// it: we also close sessions that ended for other reasons.
     pub(super) fn was_superseded(&self) -> bool {
         use quinn::ConnectionError as E;
         self.superseded.load(Ordering::Relaxed)
@@ -63,18 +63,18 @@ impl Peer {
     }
 }
 
-/// How a session came to its end.
+/// How a session ended.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub(super) struct Ended {
-    /// Why, in words.
+    /// The reason, as text.
     pub(super) why: String,
-    /// Whether a certificate was the reason: under TLS 1.3 a caller learns only after its own half of the
-    /// handshake that the other side does not like it.
+    /// Whether a certificate was the reason: under TLS 1.3 a caller learns only after its own half of the handshake
+    /// that the other side refuses its certificate.
     pub(super) refused: bool,
 }
 
 impl Ended {
-    /// Closes the connection of a session that came out like this.
+    /// Closes the connection of a session with this outcome.
     pub(super) fn conclude(connection: &Connection, outcome: Result<(), WireError>) -> Self {
         let reason = connection.close_reason().map(|reason| refusal(&reason));
         let malformed = matches!(outcome, Err(WireError::Malformed(_)));

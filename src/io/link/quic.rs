@@ -1,4 +1,4 @@
-//! How QUIC behaves under the link: its socket, packets, time-outs and connection numbers.
+//! QUIC settings of the link: socket, packets, time-outs and connection ids.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -12,13 +12,13 @@ use super::link_events::LinkError;
 use super::sense::SenseFactory;
 use super::tls::Identity;
 
-/// A silent connection is kept this long: estimates flow on it the moment a cut is over.
+/// How long a silent connection is kept: estimates flow on it as soon as a cut is over.
 const IDLE: Duration = Duration::from_secs(300);
-/// Sent when nothing else is: keeps address translators open and tells of a new address after roaming.
+/// Sent when nothing else is: it keeps address translators open and announces a new address after roaming.
 const KEEP_ALIVE: Duration = Duration::from_millis(900);
 
-/// Connection numbers of 8 random bytes: unlike the keyed ones they outlive the process, so that resets
-/// reach the peers of the process before.
+/// Connection ids of 8 random bytes: unlike keyed ones they do not depend on the process, so that resets reach the
+/// peers of the previous process.
 pub(super) struct RandomIds;
 
 impl quinn::ConnectionIdGenerator for RandomIds {
@@ -50,11 +50,11 @@ pub(super) fn bind(address: SocketAddr) -> Result<std::net::UdpSocket, LinkError
     open().map_err(|source| LinkError::Bind { address, source })
 }
 
-/// The peer is asked to acknowledge within this: at 30 packets a second it would wait out its own 25 ms each
-/// time, which looks like a queue in the path.
+/// The peer is asked to acknowledge within this time: at 30 packets a second it would use its own 25 ms each time,
+/// which looks like a queue in the path.
 const ACK_DELAY: Duration = Duration::from_millis(5);
 
-/// Lets holders of a valid certificate in.
+/// The server side: admits holders of a valid certificate.
 pub(super) fn server_config(identity: &Identity) -> Result<ServerConfig, KeyError> {
     let mut config = ServerConfig::with_crypto(Arc::new(identity.server()?));
     config.transport_config(transport());
@@ -62,7 +62,7 @@ pub(super) fn server_config(identity: &Identity) -> Result<ServerConfig, KeyErro
     Ok(config)
 }
 
-/// How QUIC behaves under the link: small buffers, packets that fit any path, nothing held back.
+/// QUIC's transport settings: small buffers, packets that fit any path, nothing delayed.
 pub(super) fn transport() -> Arc<TransportConfig> {
     let mut transport = TransportConfig::default();
     let mut acknowledge = AckFrequencyConfig::default();

@@ -29,7 +29,7 @@ impl RangeSet {
         self.ranges.get(self.at(n)).is_some_and(|&(first, _)| first <= n)
     }
 
-    /// Adds one number; tells whether it was new.
+    /// Adds one number; returns whether it was new.
     pub fn insert(&mut self, n: u32) -> bool {
         if self.contains(n) || n == u32::MAX {
             return false;
@@ -43,7 +43,7 @@ impl RangeSet {
         if first >= end {
             return;
         }
-        // Ranges that touch or overlap the new one melt into it.
+        // Ranges that touch or overlap the new one are merged into it.
         let from = self.ranges.partition_point(|&(_, e)| e < first);
         let to = self.ranges.partition_point(|&(f, _)| f <= end);
         let mut merged = (first, end);
@@ -53,7 +53,7 @@ impl RangeSet {
         self.ranges.splice(from..to, [merged]);
     }
 
-    /// Takes `first..end` away.
+    /// Removes `first..end`.
     pub fn remove_range(&mut self, first: u32, end: u32) {
         if first >= end {
             return;
@@ -69,7 +69,7 @@ impl RangeSet {
         self.ranges.splice(from..to, rest);
     }
 
-    /// What of `first..end` is not in it, ascending.
+    /// The numbers of `first..end` that are not in it, ascending.
     pub fn missing(&self, first: u32, end: u32) -> impl Iterator<Item = (u32, u32)> + '_ {
         let mut at = first;
         let from = self.at(first);

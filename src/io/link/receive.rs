@@ -20,11 +20,11 @@ use windhover_base::time::{MonoTime, Span};
 
 /// Longest a greeting may take.
 const GREETING: Duration = Duration::from_secs(20);
-/// How often it is looked at what is missing.
+/// How often missing numbers are checked.
 const LOOK: Duration = Duration::from_millis(250);
-/// A request is sent again after this long even when nothing changed.
+/// A request is repeated after this time even when nothing changed.
 const ASK_AGAIN: Duration = Duration::from_secs(4);
-/// Channel numbers a payload may use.
+/// Most channel numbers of a payload.
 const CHANNELS: usize = 1_024;
 /// Bytes of all schemas of a payload; those of this program take some tens of kilobytes.
 const SCHEMA_BYTES: usize = 8 << 20;
@@ -40,8 +40,7 @@ struct Receiver {
     flights: Mutex<BTreeMap<u32, Arc<str>>>,
 }
 
-/// Receives from a payload until the connection ends; tells why it did. `up` is called when both have
-/// greeted.
+/// Receives from a payload until the connection ends; returns the reason. `up` is called when both sides have greeted.
 pub(super) async fn receive(
     shared: &Arc<StationShared>,
     state: &Arc<PayloadState>,
@@ -72,7 +71,7 @@ pub(super) async fn receive(
     Ended::conclude(&peer.connection, outcome)
 }
 
-/// Schemas this program has: of its own messages and of Foxglove's.
+/// Schemas that this program has: its own and Foxglove's.
 fn known_schemas() -> Vec<u64> {
     ["windhover", "foxglove"].map(|package| wire::schema_hash(&schema_of_package(package))).to_vec()
 }
@@ -106,7 +105,7 @@ impl Receiver {
     }
 
     fn announce(&self, extent: &pb::Extent) {
-        // A flight's name becomes a directory: nothing else than such a name is taken.
+        // The name of a flight becomes a directory: other names are refused.
         if !is_flight_name(&extent.flight) || extent.first > extent.end {
             return;
         }
@@ -136,8 +135,8 @@ impl Receiver {
         }
     }
 
-    /// Hands a record on if it is new. Channels must be known: numbers of unknown ones are not taken, and
-    /// so are asked for again.
+    /// Passes a record on if it is new. Its channel must be known: numbers of unknown channels are not taken, and are
+    /// so requested again.
     async fn take(&self, record: pb::Record, live: bool) -> Result<(), WireError> {
         let arrived = Instant::now();
         *lock(&self.state.heard) = arrived;
@@ -167,7 +166,7 @@ impl Receiver {
     async fn datagrams(&self) -> Result<(), WireError> {
         loop {
             let bytes = self.connection.read_datagram().await.map_err(|e| WireError::Ended(e.to_string()))?;
-            // A kind of datagram this version does not know is not an error.
+            // An unknown kind of datagram is from a newer version, not an error.
             let Ok(live) = pb::Live::decode(bytes) else { continue };
             for record in live.records {
                 self.take(record, true).await?;
@@ -200,13 +199,13 @@ impl Receiver {
                 let Ok(bytes) = stream.read_to_end(THUMBNAIL_LIMIT).await else { return Ok(()) };
                 if let Ok(thumbnail) = pb::Thumbnail::decode(&bytes[..]) {
                     let payload = Arc::clone(&self.payload);
-                    // A thumbnail is worth no waiting.
+                    // A thumbnail is dropped rather than waited for.
                     let _ = self.shared.records.try_send(FromPayload::Thumbnail { payload, thumbnail });
                 }
                 Ok(())
             }
             _ => {
-                // A newer payload's stream: it is told not to send it.
+                // The stream of a newer payload: it is asked not to send it.
                 let _ = stream.stop(VarInt::from_u32(0));
                 Ok(())
             }
@@ -236,7 +235,7 @@ impl Receiver {
         Ok(())
     }
 
-    /// Asks for what is missing and acknowledges what is on disk.
+    /// Requests missing numbers and acknowledges those on disk.
     async fn speak(&self, mut out: SendStream) -> Result<(), WireError> {
         let mut asked = pb::Want::default();
         let mut asked_at = Instant::now();
@@ -270,8 +269,8 @@ impl Receiver {
     }
 }
 
-/// Whether it is worth asking anew: something is missing that was not asked for, unless the better part
-/// of a long request is still to come.
+/// Whether a new request is useful: a number is missing that was not requested, unless most of a long request is still
+/// to come.
 fn is_news(asked: &pb::Want, want: &pb::Want) -> bool {
     let held =
         |r: &pb::Range| asked.ranges.iter().any(|a| a.run == r.run && a.first <= r.first && r.end <= a.end);
@@ -280,7 +279,7 @@ fn is_news(asked: &pb::Want, want: &pb::Want) -> bool {
     fresh > 0 && (rest < 16 || 2 * fresh > rest)
 }
 
-/// The names flights have: a compact UTC time, or `boot-N`, with an optional `-N`.
+/// The names of flights: a compact UTC time, or `boot-N`, with an optional `-N`.
 fn is_flight_name(name: &str) -> bool {
     let allowed = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
     (1..=64).contains(&name.len()) && name.chars().all(allowed)

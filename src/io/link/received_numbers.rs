@@ -1,18 +1,18 @@
-//! What a station has of a payload: every number at most once, and what is still missing.
+//! A station's numbers of a payload: each at most once, and those that are still missing.
 
 use std::collections::BTreeMap;
 
 use super::ranges::RangeSet;
 use crate::io::proto::link as pb;
 
-/// Ranges asked for at once.
+/// Ranges in one request.
 const WANT_RANGES: usize = 64;
-/// Which of the latest looks it is whose missing numbers are asked for: the last but one.
+/// Which of the latest checks determines the requested numbers: the last but one.
 const SETTLED: usize = OVERDUE_LOOKS - 2;
-/// Looks after which a number that is missing is overdue: two seconds of them. What goes by back-fill only
-/// takes about one.
+/// Checks after which a missing number is overdue: two seconds of them. Records that only go by back-fill take about
+/// one second.
 const OVERDUE_LOOKS: usize = 8;
-/// Runs kept in mind; a payload that announces more is not believed.
+/// Most runs that are tracked; a payload that announces more is ignored.
 const RUNS: usize = 4_096;
 
 /// One run of a payload.
@@ -21,7 +21,7 @@ struct RunNumbers {
     flight: String,
     first: u32,
     end: u32,
-    /// `end` as it was at the latest looks, oldest first: what is younger may still be on its way.
+    /// `end` at the latest checks, oldest first: younger numbers may still be on their way.
     ends: [u32; OVERDUE_LOOKS],
     have: RangeSet,
     gone: RangeSet,
@@ -29,7 +29,7 @@ struct RunNumbers {
 }
 
 impl RunNumbers {
-    /// What is missing below a number.
+    /// The missing numbers below a given one.
     fn missing(&self, end: u32) -> impl Iterator<Item = (u32, u32)> + '_ {
         self.have.missing(self.first.max(self.gone_below()), end)
     }
@@ -38,7 +38,7 @@ impl RunNumbers {
         self.missing(end).map(|(first, end)| u64::from(end - first)).sum()
     }
 
-    /// Everything below this is gone or was never announced.
+    /// Everything below this no longer exists or was never announced.
     fn gone_below(&self) -> u32 {
         self.gone.iter().next().filter(|&(first, _)| first == 0).map_or(0, |(_, end)| end)
     }
@@ -47,16 +47,16 @@ impl RunNumbers {
 /// How complete a station is for one payload.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct Progress {
-    /// Records received, once each.
+    /// Records received, each counted once.
     pub received: u64,
-    /// Records known to exist and not received, those on their way among them.
+    /// Records that exist and are not received, including those on their way.
     pub missing: u64,
-    /// Those of them known for two seconds and more: none is what "nothing missing" means while a flight
-    /// goes on.
+    /// Those of them that have been known for two seconds and more: while a flight continues, "nothing missing" means
+    /// that there are none.
     pub overdue: u64,
     /// Records that no longer exist on board.
     pub gone: u64,
-    /// Records that came again and were dropped.
+    /// Records that arrived again and were dropped.
     pub repeated: u64,
 }
 
@@ -68,7 +68,7 @@ pub struct ReceivedNumbers {
 }
 
 impl ReceivedNumbers {
-    /// The payload tells what it holds of a run. What a station kept of it in earlier lives is asked for
+    /// Handles a payload's announcement of a run. The numbers that earlier runs of the station stored are asked for
     /// once (`recall`, by flight and run).
     pub fn announce(&mut self, extent: &pb::Extent, recall: impl FnOnce(&str, u32) -> RangeSet) {
         if !self.runs.contains_key(&extent.run) {
@@ -90,7 +90,7 @@ impl ReceivedNumbers {
         }
     }
 
-    /// Takes a number; tells whether it is new and the run is known.
+    /// Takes a number; returns whether it is new and the run is known.
     pub fn take(&mut self, run: u32, number: u32) -> bool {
         let Some(run) = self.runs.get_mut(&run) else { return false };
         let fresh = run.have.insert(number);
@@ -123,7 +123,7 @@ impl ReceivedNumbers {
         }
     }
 
-    /// These numbers are not on the station's disk, or not any more: as if they had never come.
+    /// These numbers are not on the station's disk, or no longer: as if they had never arrived.
     pub fn forget(&mut self, run: u32, numbers: &RangeSet) {
         let Some(run) = self.runs.get_mut(&run) else { return };
         for (first, end) in numbers.iter() {
@@ -132,7 +132,7 @@ impl ReceivedNumbers {
         }
     }
 
-    /// What to tell the payload as stored. The ranges of the oldest numbers are enough for its cursor.
+    /// The numbers to report as stored. The ranges of the oldest numbers are enough for the payload's cursor.
     pub fn stored_message(&self) -> pb::Stored {
         let ranges = self.runs.iter().flat_map(|(run, r)| {
             r.stored.iter().take(4).map(|(first, end)| pb::Range { run: *run, first, end })
@@ -140,8 +140,8 @@ impl ReceivedNumbers {
         pb::Stored { ranges: ranges.take(WANT_RANGES).collect() }
     }
 
-    /// What to ask for: everything missing that had time to come by itself, oldest first. Each call is a
-    /// look: what appeared since the last but one is given time.
+    /// The numbers to request: everything missing that had time to arrive by itself, oldest first. Each call is a
+    /// check: numbers that appeared since the last but one are given time.
     pub fn want(&mut self) -> pb::Want {
         for run in self.runs.values_mut() {
             run.ends.rotate_left(1);
@@ -182,10 +182,10 @@ mod tests {
     fn what_is_young_is_given_time_and_what_is_missing_is_asked_for() {
         let mut received = ReceivedNumbers::default();
         received.announce(&extent(0, 10), |_, _| RangeSet::of(0, 3));
-        assert!(ranges(&received.want()).is_empty(), "a first look asks for nothing");
+        assert!(ranges(&received.want()).is_empty(), "a first check requests nothing");
         assert!(received.take(5, 12), "live");
         assert!(!received.take(5, 12), "the same again");
-        assert!(!received.take(5, 1), "stored in an earlier life");
+        assert!(!received.take(5, 1), "stored in an earlier run");
         assert_eq!(ranges(&received.want()), [(3, 10)]);
         assert_eq!(ranges(&received.want()), [(3, 12)]);
         for number in 3..9 {

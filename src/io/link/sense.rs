@@ -1,8 +1,8 @@
-//! What the acknowledgements of a QUIC connection tell about its path.
+//! Path information from the acknowledgements of a QUIC connection.
 //!
-//! QUIC's own congestion window is opened wide: a window that shrinks on loss would hold estimates back
-//! on a lossy radio, and one that fills during a cut would hold them back after it. What is sent is
-//! limited by [`super::governor`] instead, from the round-trip times and losses noted here.
+//! QUIC's own congestion window is opened wide: a window that shrinks on loss would delay estimates on a lossy radio,
+//! and one that fills during a cut would delay them after it. [`super::governor`] limits the rate instead, from the
+//! round-trip times and losses noted here.
 
 use std::any::Any;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use quinn::congestion::{Controller, ControllerFactory};
 
-/// Wide enough never to hold anything back; the pacer of QUIC is idle above 2³² bytes.
+/// Wide enough to delay nothing; QUIC's pacer is inactive above 2³² bytes.
 const WINDOW: u64 = 1 << 40;
 
 /// Classes of packets by size, each of [`CLASS`] bytes: packets of up to 1280 bytes.
@@ -18,12 +18,12 @@ pub const CLASSES: usize = 20;
 /// Bytes.
 const CLASS: u64 = 64;
 
-/// What was noted since the last [`Sense::take`].
+/// Acknowledgements and losses since the last [`Sense::take`].
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct Noted {
     /// Bytes acknowledged.
     pub acked: u64,
-    /// Bytes given up as lost.
+    /// Bytes declared lost.
     pub lost: u64,
     /// Packets acknowledged.
     pub packets: u64,
@@ -32,7 +32,7 @@ pub struct Noted {
 }
 
 impl Noted {
-    /// A packet was acknowledged so long after it was sent.
+    /// A packet was acknowledged this long after it was sent.
     pub fn acknowledge(&mut self, bytes: u64, rtt: Duration) {
         self.acked += bytes;
         self.packets += 1;
@@ -41,7 +41,7 @@ impl Noted {
     }
 }
 
-/// Shared notes of one connection's path.
+/// Shared counters of one connection's path.
 #[derive(Clone, Debug, Default)]
 pub struct Sense(Arc<Mutex<Noted>>);
 
@@ -50,12 +50,12 @@ impl Sense {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What was noted since the last call.
+    /// Acknowledgements and losses since the last call.
     pub fn take(&self) -> Noted {
         std::mem::take(&mut *self.notes())
     }
 
-    /// The notes of a connection's present path.
+    /// The counters of a connection's present path.
     pub fn of(connection: &quinn::Connection) -> Option<Self> {
         let controller = connection.congestion_state().into_any().downcast::<SenseController>().ok()?;
         Some(controller.sense)

@@ -1,4 +1,4 @@
-//! The station's side of the link: payloads come in or are called; records come out, each once.
+//! The station's side of the link: payloads connect or are connected to; records come out, each once.
 
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 use quinn::VarInt;
 use tokio::sync::{mpsc, watch};
 
-use super::door::Door;
+use super::endpoint::LinkEndpoint;
 use super::keys::Role;
 use super::link_events::{Events, LinkError, LinkEvent};
 use super::peer::{Peer, close};
@@ -16,27 +16,27 @@ use super::receive;
 use super::station_shared::{FromPayload, PayloadState, PayloadStatus, Recall, StationShared, lock};
 use super::tls::KeyFiles;
 
-/// What a station's side of the link is made of.
+/// Settings of the station's side of the link.
 #[derive(Clone, Debug)]
 pub struct StationSettings {
     /// Certificates and keys.
     pub files: KeyFiles,
-    /// Where payloads that call reach the station.
+    /// Where payloads reach the station.
     pub listen: Option<SocketAddr>,
-    /// Payloads the station calls.
+    /// Payloads to which the station connects.
     pub dial: Vec<String>,
     /// Whether it wants thumbnails.
     pub thumbnails: bool,
 }
 
-/// Gives the link what it must know of the disk, and tells how it does.
+/// Reports the disk's state to the link, and reads the link's state.
 #[derive(Clone)]
 pub struct StationHandle {
     shared: Arc<StationShared>,
 }
 
 impl StationHandle {
-    /// Numbers of a run are on disk: the payload is told, and may forget them.
+    /// Numbers of a run are on disk: the payload gets the acknowledgement, and may drop them.
     pub fn stored(&self, payload: &str, run: u32, numbers: &RangeSet) {
         let state = lock(&self.shared.payloads).get(payload).cloned();
         if let Some(state) = state {
@@ -45,7 +45,7 @@ impl StationHandle {
         }
     }
 
-    /// Numbers of a run are not on disk, or not any more: they are asked for again.
+    /// Numbers of a run are not on disk, or no longer: they are requested again.
     pub fn forget(&self, payload: &str, run: u32, numbers: &RangeSet) {
         let state = lock(&self.shared.payloads).get(payload).cloned();
         if let Some(state) = state {
@@ -53,12 +53,12 @@ impl StationHandle {
         }
     }
 
-    /// While the disk takes nothing, nothing is asked for again.
+    /// While the disk accepts nothing, nothing is requested again.
     pub fn hold(&self, holding: bool) {
         self.shared.holding.store(holding, Ordering::Relaxed);
     }
 
-    /// Ends the session of a payload that sends what is not kept.
+    /// Ends the session of a payload that exceeds a limit.
     pub fn dismiss(&self, payload: &str, why: &str) {
         let state = lock(&self.shared.payloads).get(payload).cloned();
         if let Some(state) = state {
@@ -67,7 +67,7 @@ impl StationHandle {
         }
     }
 
-    /// How the link to every payload does that was ever connected.
+    /// State of the link to every payload that was ever connected.
     pub fn status(&self) -> Vec<PayloadStatus> {
         let states: Vec<_> = lock(&self.shared.payloads).values().cloned().collect();
         let of = |state: Arc<PayloadState>| {
@@ -85,7 +85,7 @@ impl StationHandle {
         states.into_iter().map(of).collect()
     }
 
-    /// Handshakes refused since the start.
+    /// Number of handshakes refused since the start.
     pub fn refusals(&self) -> u64 {
         self.shared.events.refusals()
     }
@@ -93,13 +93,13 @@ impl StationHandle {
 
 /// The station's side of the link, opened.
 pub struct StationLink {
-    door: Door,
+    link_endpoint: LinkEndpoint,
     dial: Vec<String>,
     shared: Arc<StationShared>,
     arrivals: mpsc::Receiver<Peer>,
 }
 
-/// What [`StationLink::open`] gives: the link to run, its handle, records, events.
+/// Result of [`StationLink::open`]: the link to run, its handle, records, events.
 pub type OpenStation = (StationLink, StationHandle, mpsc::Receiver<FromPayload>, mpsc::Receiver<LinkEvent>);
 
 impl StationLink {
@@ -107,7 +107,8 @@ impl StationLink {
     pub fn open(settings: &StationSettings, recall: Recall) -> Result<OpenStation, LinkError> {
         let (event_sender, event_receiver) = mpsc::channel(256);
         let events = Events::new(event_sender);
-        let (door, arrivals) = Door::open(Role::Station, &settings.files, settings.listen, events.clone())?;
+        let (link_endpoint, arrivals) =
+            LinkEndpoint::open(Role::Station, &settings.files, settings.listen, events.clone())?;
         let (records, record_receiver) = mpsc::channel(1_024);
         let shared = Arc::new(StationShared {
             payloads: Mutex::default(),
@@ -118,23 +119,23 @@ impl StationLink {
             events,
         });
         let handle = StationHandle { shared: Arc::clone(&shared) };
-        let link = Self { door, dial: settings.dial.clone(), shared, arrivals };
+        let link = Self { link_endpoint, dial: settings.dial.clone(), shared, arrivals };
         Ok((link, handle, record_receiver, event_receiver))
     }
 
-    /// The UDP port it has.
+    /// The local UDP address.
     pub fn local_addr(&self) -> std::io::Result<SocketAddr> {
-        self.door.local_addr()
+        self.link_endpoint.local_addr()
     }
 
-    /// Receives until `stop` says so (or its sender is gone).
+    /// Receives until `stop` is set (or its sender is gone).
     pub async fn run(self, stop: watch::Receiver<bool>) {
         let shared = self.shared;
-        self.door.run(self.dial, self.arrivals, stop, |peer| welcome(&shared, peer)).await;
+        self.link_endpoint.run(self.dial, self.arrivals, stop, |peer| welcome(&shared, peer)).await;
     }
 }
 
-/// A session; an older one of the same payload ends.
+/// Runs a session; an older one of the same payload ends.
 fn welcome(shared: &Arc<StationShared>, peer: Peer) -> impl Future<Output = ()> + Send + use<> {
     let (state, shared) = (shared.state_of(&peer), Arc::clone(shared));
     async move {

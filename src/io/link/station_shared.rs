@@ -1,4 +1,4 @@
-//! What the station's handle and its receivers share: the payloads, how each does, what arrives of them.
+//! Shared by the station's handle and its receivers: the payloads, their state, and what arrives from them.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -16,14 +16,14 @@ use super::received_numbers::{Progress, ReceivedNumbers};
 use crate::io::proto::link::Thumbnail;
 use windhover_base::time::MonoTime;
 
-/// Topic and schema of what arrives.
+/// Topic and schema of a record.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Channel {
     /// Topic of the flight.
     pub topic: String,
     /// Name of the schema.
     pub schema_name: String,
-    /// The schema as the payload has it; empty where it is the station's own of this name.
+    /// The payload's schema; empty where it is the station's own of this name.
     pub schema: Vec<u8>,
 }
 
@@ -42,7 +42,7 @@ pub struct Arrival {
     pub channel: Arc<Channel>,
     /// Log clock, the payload's host time.
     pub log_time: MonoTime,
-    /// When it was true, the payload's host time.
+    /// Its time of validity, the payload's host time.
     pub publish_time: MonoTime,
     /// The protobuf message.
     pub data: Vec<u8>,
@@ -52,35 +52,35 @@ pub struct Arrival {
     pub arrived: Instant,
 }
 
-/// What comes out of a station's link.
+/// Output of a station's link.
 #[derive(Clone, Debug)]
 pub enum FromPayload {
-    /// A record, for the first time.
+    /// A record, on its first arrival.
     Record(Arrival),
     /// A thumbnail of a payload's camera image.
     Thumbnail {
         /// Name of the payload.
         payload: Arc<str>,
-        /// It.
+        /// The thumbnail.
         thumbnail: Thumbnail,
     },
 }
 
-/// What of a run the station kept in earlier lives: by payload, flight and run.
+/// The numbers of a run that earlier runs of the station stored: by payload, flight and run.
 pub type Recall = Arc<dyn Fn(&str, &str, u32) -> RangeSet + Send + Sync>;
 
-/// How the link to one payload does.
+/// State of the link to one payload.
 #[derive(Clone, PartialEq, Debug)]
 pub struct PayloadStatus {
     /// Its name.
     pub name: String,
     /// Whether it is connected.
     pub connected: bool,
-    /// Where it is, or was last.
+    /// Its present or last address.
     pub address: SocketAddr,
     /// Round-trip time, ms.
     pub rtt_ms: f64,
-    /// Time since anything was heard.
+    /// Time since anything was received.
     pub silent: Duration,
     /// Bytes received on this connection.
     pub bytes: u64,
@@ -99,7 +99,7 @@ pub(super) struct PayloadState {
     pub(super) status: Mutex<PayloadStatus>,
     pub(super) heard: Mutex<Instant>,
     pub(super) peer: Mutex<Peer>,
-    /// Whether the operator was told that it is up.
+    /// Whether `link_up` was reported.
     pub(super) told: AtomicBool,
 }
 
@@ -107,19 +107,19 @@ pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// What the station's handle and its receivers share.
+/// Shared by the station's handle and its receivers.
 pub(super) struct StationShared {
     pub(super) payloads: Mutex<BTreeMap<String, Arc<PayloadState>>>,
     pub(super) recall: Recall,
     pub(super) records: mpsc::Sender<FromPayload>,
     pub(super) thumbnails: bool,
-    /// Whether the disk takes nothing now.
+    /// Whether the disk accepts nothing now.
     pub(super) holding: AtomicBool,
     pub(super) events: Events,
 }
 
 impl StationShared {
-    /// The state of a payload, made when it first comes; an older connection ends.
+    /// The state of a payload, made at its first connection; an older connection ends.
     pub(super) fn state_of(&self, peer: &Peer) -> Arc<PayloadState> {
         let mut payloads = lock(&self.payloads);
         if let Some(state) = payloads.get(&peer.name) {

@@ -1,4 +1,4 @@
-//! Back-fill out of the store on the data card: earlier runs, and what memory no longer holds.
+//! Back-fill from the store on the data card: earlier runs, and records that are no longer in memory.
 
 use std::time::Duration;
 
@@ -7,21 +7,21 @@ use ring::rand::SecureRandom as _;
 use super::backlog::{Backlog, Extent, Found};
 use crate::io::store::StoreHandle;
 
-/// Name under which the card keeps its identity.
+/// Name under which the card stores its identity.
 const CARD: &str = "link.card";
-/// How long the card may take to tell it: records of meanwhile are sent once the link is open.
+/// How long the card may take to report its identity: records that are made meanwhile are sent once the link is open.
 const WAIT: Duration = Duration::from_secs(5);
 
-/// The store's queue. Its runs count 1, 2, 3, … on each card, so that a card made anew begins again; on the
-/// link they are told apart by a random number that the card carries.
+/// The store's queue. Its runs count 1, 2, 3, … on each card, so a new card starts again at 1; on the link a random
+/// number on the card distinguishes them.
 pub struct StoreBacklog {
     store: StoreHandle,
     card: u32,
 }
 
 impl StoreBacklog {
-    /// Over a store; also gives the identity of the present run on the link and its flight's name. Waits
-    /// for the card up to ten seconds, where there is one.
+    /// A backlog of a store; also returns the identity of the present run on the link and its flight's name. Waits up
+    /// to ten seconds for the card, where there is one.
     pub fn open(store: StoreHandle) -> (Self, u32, String) {
         let session = store.run();
         let index = store.index_within(WAIT);
@@ -29,9 +29,9 @@ impl StoreBacklog {
         let card =
             known.and_then(|blob| Some(u32::from_be_bytes(blob.try_into().ok()?))).unwrap_or_else(|| {
                 let mut fresh = [0; 4];
-                // Without random bytes runs of different cards may be confused, which is all that fails.
+                // Without random bytes only runs of different cards may be confused.
                 let _ = ring::rand::SystemRandom::new().fill(&mut fresh);
-                // A card that did not answer may have one: it keeps that.
+                // A card that did not answer may have an identity: it keeps that.
                 if index.is_some() {
                     store.put_state(CARD, fresh.to_vec());
                 }
@@ -46,7 +46,7 @@ fn boot_name(session: u32) -> String {
     format!("boot-{session}")
 }
 
-/// A run of the card as the link knows it.
+/// A run of the card under its number on the link.
 fn on_link(mut extent: Extent, card: u32) -> Extent {
     if extent.flight.is_empty() {
         extent.flight = boot_name(extent.run);

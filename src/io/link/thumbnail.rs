@@ -1,4 +1,4 @@
-//! Thumbnails of the camera image: small JPEG pictures with what was detected in them.
+//! Thumbnails of the camera image: small JPEG pictures with the detections.
 
 use prost::Message as _;
 
@@ -11,7 +11,7 @@ use windhover_base::msg::{FeatureTrack, FramePayload, GrayImage, MarkerDetection
 /// JPEG quality: a thumbnail of 320 × 256 takes about 8 KB.
 const QUALITY: u8 = 60;
 
-/// A frame offered for the next thumbnail, as the camera gave it.
+/// A frame for the next thumbnail, as the camera delivered it.
 #[derive(Clone, Debug)]
 pub struct Picture {
     /// The frame.
@@ -22,7 +22,7 @@ pub struct Picture {
     pub features: Vec<FeatureTrack>,
 }
 
-/// The mean of blocks of `factor`² pixels; what does not fill a block at the right and bottom is left out.
+/// The mean of blocks of `factor`² pixels; pixels at the right and bottom that do not fill a block are left out.
 fn shrink(image: &GrayImage, factor: usize) -> GrayImage {
     let (width, height) = (image.width / factor, image.height / factor);
     let mut small = GrayImage::new(width, height);

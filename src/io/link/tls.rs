@@ -1,4 +1,4 @@
-//! Who may talk to whom: TLS 1.3 with certificates of one authority on both sides.
+//! Mutual authentication: TLS 1.3 with certificates of one authority on both sides.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -16,7 +16,7 @@ use windhover_base::time::UtcTime;
 /// Protocol name in the TLS handshake; the number is the major version of the message format.
 const ALPN: &[u8] = b"windhover/1";
 
-/// The files one side of the link is made of.
+/// The key files of one side of the link.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct KeyFiles {
     /// Certificate of the authority.
@@ -29,13 +29,13 @@ pub struct KeyFiles {
     pub revoked: Option<PathBuf>,
 }
 
-/// One side's certificate, key, and whom it trusts.
+/// One side's certificate and key, and the authority that it trusts.
 pub struct Identity {
     /// Payload or station.
     pub role: Role,
     /// Its name.
     pub name: String,
-    /// When its certificate ends.
+    /// Last instant at which its certificate is valid.
     pub expires: UtcTime,
     chain: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
@@ -48,7 +48,7 @@ fn unreadable(path: &std::path::Path, what: impl std::fmt::Display) -> KeyError 
 }
 
 impl Identity {
-    /// Reads the files; `role` is what the own certificate must be for.
+    /// Reads the files; `role` is the required role of this side's certificate.
     pub fn load(files: &KeyFiles, role: Role) -> Result<Self, KeyError> {
         let mut roots = RootCertStore::empty();
         let authority =
@@ -59,11 +59,11 @@ impl Identity {
         let name = match peer_of(&certificate) {
             Some((found, name)) if found == role => name,
             Some((found, _)) => {
-                let what = format!("this is a {}'s certificate, not a {}'s", found.name(), role.name());
+                let what = format!("this is the certificate of a {}, not of a {}", found.name(), role.name());
                 return Err(unreadable(&files.certificate, what));
             }
             None => {
-                return Err(unreadable(&files.certificate, "no role in it; make it with `windhover keys`"));
+                return Err(unreadable(&files.certificate, "it has no role; make it with `windhover keys`"));
             }
         };
         let expires = expiry_of(&certificate).unwrap_or_default();
@@ -80,7 +80,7 @@ impl Identity {
         Ok(Self { role, name, expires, chain: vec![certificate], key, roots: Arc::new(roots), lists })
     }
 
-    /// What to accept connections with: only holders of a valid certificate get in.
+    /// Settings for accepting connections: only holders of a valid certificate are admitted.
     pub fn server(&self) -> Result<QuicServerConfig, KeyError> {
         let provider = Arc::new(rustls::crypto::ring::default_provider());
         let verifier = WebPkiClientVerifier::builder_with_provider(Arc::clone(&self.roots), provider.clone())
@@ -100,7 +100,7 @@ impl Identity {
         QuicServerConfig::try_from(config).map_err(|e| KeyError::Crypto(e.to_string()))
     }
 
-    /// What to open connections with: only a peer with a valid certificate of the other role is spoken to.
+    /// Settings for opening connections: only a peer with a valid certificate of the other role is accepted.
     pub fn client(&self) -> Result<QuicClientConfig, KeyError> {
         let provider = Arc::new(rustls::crypto::ring::default_provider());
         let verifier = WebPkiServerVerifier::builder_with_provider(Arc::clone(&self.roots), provider.clone())
@@ -118,28 +118,28 @@ impl Identity {
         QuicClientConfig::try_from(config).map_err(|e| KeyError::Crypto(e.to_string()))
     }
 
-    /// The key under which this side's stateless resets are made. It depends on the private key only, so
-    /// that after a restart the peers of the old process learn at once that it is gone.
+    /// The key for this side's stateless resets. It depends on the private key only, so that after a restart the peers
+    /// of the old process learn at once that it is gone.
     pub fn reset_key(&self) -> ring::hmac::Key {
         let secret = ring::hmac::Key::new(ring::hmac::HMAC_SHA256, self.key.secret_der());
         let derived = ring::hmac::sign(&secret, b"windhover stateless reset");
         ring::hmac::Key::new(ring::hmac::HMAC_SHA256, derived.as_ref())
     }
 
-    /// Whether a certificate stands on the revocation list.
+    /// Whether a certificate is on the revocation list.
     pub fn is_revoked(&self, certificate: &[u8]) -> bool {
         let Some(serial) = serial_of(certificate) else { return true };
         self.lists.iter().any(|list| serials_of_list(list).is_none_or(|serials| serials.contains(&serial)))
     }
 }
 
-/// The certificate the other side of a connection has shown.
+/// The certificate of the other side of a connection.
 pub fn peer_certificate(connection: &quinn::Connection) -> Option<CertificateDer<'static>> {
     let chain = connection.peer_identity()?.downcast::<Vec<CertificateDer<'static>>>().ok()?;
     chain.into_iter().next()
 }
 
-/// Why a connection came to nothing, in words, and whether a certificate was the reason.
+/// The reason why a connection failed, as text, and whether a certificate was the reason.
 pub fn refusal(error: &quinn::ConnectionError) -> (String, bool) {
     use quinn::ConnectionError as E;
     let code = match error {
@@ -150,10 +150,10 @@ pub fn refusal(error: &quinn::ConnectionError) -> (String, bool) {
     // A TLS alert n travels as QUIC error 0x100 + n (RFC 9001, 4.8; alerts: RFC 8446, 6).
     let told = matches!(error, E::ConnectionClosed(_));
     let what = match code.checked_sub(0x100) {
-        Some(42 | 43 | 46) => "certificate not acceptable",
+        Some(42 | 43 | 46) => "certificate not accepted",
         Some(44) => "certificate revoked",
         Some(45) => "certificate expired",
-        Some(48) => "certificate of a foreign authority",
+        Some(48) => "certificate of another authority",
         Some(51) => "certificate's signature is wrong",
         Some(116) => "no certificate",
         Some(120) => "another version of the link",

@@ -1,6 +1,6 @@
 //! Messages on streams: a length as a varint, then the protobuf message.
 //!
-//! Nothing here trusts a length: a message longer than its limit ends the stream.
+//! A message that is longer than its limit ends the stream.
 
 use prost::Message;
 use quinn::{RecvStream, SendStream};
@@ -22,8 +22,8 @@ pub enum WireError {
     /// The stream or its connection ended.
     #[error("the stream ended: {0}")]
     Ended(String),
-    /// A length beyond the limit, or bytes that are no message.
-    #[error("bytes that are no message of the link: {0}")]
+    /// A length beyond the limit, or bytes that are not a message.
+    #[error("bytes that are not a message of the link: {0}")]
     Malformed(String),
 }
 
@@ -35,7 +35,7 @@ pub struct Deframer {
 }
 
 impl Deframer {
-    /// Takes bytes as they come.
+    /// Adds received bytes.
     pub fn push(&mut self, bytes: &[u8]) {
         if self.start > 0 && self.start * 2 > self.buffer.len() {
             self.buffer.drain(..self.start);
@@ -44,7 +44,7 @@ impl Deframer {
         self.buffer.extend_from_slice(bytes);
     }
 
-    /// The next whole message; `None` until there is one.
+    /// The next complete message; `None` until there is one.
     pub fn message<M: Message + Default>(&mut self) -> Result<Option<M>, WireError> {
         let rest = &self.buffer[self.start..];
         let Some((length, used)) = length(rest)? else { return Ok(None) };
@@ -55,7 +55,7 @@ impl Deframer {
     }
 }
 
-/// Length prefix: its value and how many bytes it takes; `None` where it is not whole yet.
+/// Length prefix: its value and its own length in bytes; `None` where it is incomplete.
 fn length(bytes: &[u8]) -> Result<Option<(usize, usize)>, WireError> {
     let mut value = 0_usize;
     for (i, byte) in bytes.iter().take(4).enumerate() {
@@ -80,7 +80,7 @@ pub struct Reader {
 }
 
 impl Reader {
-    /// Over a stream from here on.
+    /// A reader of a stream from here on.
     pub fn new(stream: RecvStream) -> Self {
         Self { stream, deframer: Deframer::default() }
     }
@@ -160,7 +160,7 @@ mod tests {
         fn arbitrary_bytes_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..600)) {
             let mut deframer = Deframer::default();
             deframer.push(&bytes);
-            // Each call uses up at least a byte or ends.
+            // Each call consumes at least a byte or ends.
             while let Ok(Some(_)) = deframer.message::<ToPayload>() {}
             let mut deframer = Deframer::default();
             deframer.push(&bytes);

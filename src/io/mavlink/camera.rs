@@ -1,4 +1,4 @@
-//! The camera as ground stations see it: a component of the helicopter that tracks by itself.
+//! The camera for ground stations: a component of the helicopter that tracks on its own.
 
 use mavlink::MessageData as _;
 use mavlink::dialects::development::*;
@@ -7,10 +7,10 @@ use windhover_base::msg::MarkerDetection;
 use windhover_base::settings::CameraConfig;
 use windhover_base::time::Span;
 
+use super::encoder::CAMERA;
 use super::packet::Sender;
-use super::teller::CAMERA;
 
-/// What is told of the camera.
+/// The content of the camera's messages.
 #[derive(Clone, Debug)]
 pub struct Camera {
     width_px: u32,
@@ -19,7 +19,7 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// Of this configuration.
+    /// The camera of this configuration.
     pub fn new(config: &CameraConfig) -> Self {
         Self { width_px: config.width, height_px: config.height, sequence: 0 }
     }
@@ -31,7 +31,7 @@ impl Camera {
         sequence
     }
 
-    /// The box around markers: left, top, right, bottom as shares of the picture; `None` around none.
+    /// The box around markers: left, top, right, bottom as shares of the picture; `None` without markers.
     pub fn around<'a>(&self, seen: impl Iterator<Item = &'a MarkerDetection>) -> Option<[f32; 4]> {
         let (width, height) = (f64::from(self.width_px.max(1)), f64::from(self.height_px.max(1)));
         let boxed = |seen: &MarkerDetection| {
@@ -52,8 +52,8 @@ impl Camera {
         })
     }
 
-    /// What a command is answered with. Other systems' commands, and what is none, are not.
-    #[expect(deprecated, reason = "ground stations still ask by the commands of before 2019")]
+    /// The answers to a command. Commands to other systems, and other messages, get none.
+    #[expect(deprecated, reason = "ground stations still use the commands from before 2019")]
     pub fn answers(&self, from: Sender, system: u8, message: &MavMessage, now: Span) -> Vec<MavMessage> {
         let MavMessage::COMMAND_LONG(asked) = message else { return Vec::new() };
         if (asked.target_system, asked.target_component) != (system, CAMERA) {
@@ -70,7 +70,7 @@ impl Camera {
             Some(CAMERA_SETTINGS_DATA::ID) => Some(settings(now)),
             _ => None,
         };
-        // The tracking messages come at the rate of positions, whatever interval is asked for.
+        // The tracking messages have the rate of positions, whatever interval is requested.
         let comes_anyway = asked.command == MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL
             && [CAMERA_TRACKING_GEO_STATUS_DATA::ID, CAMERA_TRACKING_IMAGE_STATUS_DATA::ID]
                 .contains(&(asked.param1 as u32));
@@ -116,7 +116,7 @@ fn settings(now: Span) -> MavMessage {
     })
 }
 
-/// A text as a field of fixed length, zeros behind it.
+/// A text as a field of fixed length, padded with zeros.
 fn text<const N: usize>(words: &str) -> [u8; N] {
     let bytes = words.as_bytes();
     std::array::from_fn(|i| bytes.get(i).copied().unwrap_or(0))

@@ -1,5 +1,4 @@
-//! What is said to the helicopter's own autopilot beside the vehicles: that we are there, what time it is, and which
-//! messages are wanted of it.
+//! Messages to the helicopter's own autopilot apart from the vehicles: heartbeat, time, and requests for messages.
 
 use mavlink::MessageData as _;
 use mavlink::dialects::development::*;
@@ -14,7 +13,7 @@ use super::packet::{self, Sender, Signature, SigningKey};
 const COMPANION: u8 = 191;
 /// MAV_COMP_ID_AUTOPILOT1.
 const AUTOPILOT: u8 = 1;
-/// Messages that are used, and how often each is, a second. ArduPilot has SCALED_IMU, PX4 HIGHRES_IMU.
+/// Messages that are used, and the rate of each, a second. ArduPilot has SCALED_IMU, PX4 HIGHRES_IMU.
 const WANTED: [(u32, f32); 6] = [
     (ATTITUDE_QUATERNION_DATA::ID, 25.0),
     (SCALED_IMU_DATA::ID, 50.0),
@@ -24,13 +23,13 @@ const WANTED: [(u32, f32); 6] = [
     (SYSTEM_TIME_DATA::ID, 1.0),
 ];
 
-/// Our side of the link to the autopilot.
+/// Our side of the connection to the autopilot.
 #[derive(Clone, Debug, Default)]
 pub struct Companion {
     wanted: Option<u8>,
     configure: bool,
     system: Option<u8>,
-    /// Another autopilot that was heard and told of.
+    /// Another autopilot that was received and reported.
     another: Option<u8>,
     clock: RemoteClock,
     restarts: u32,
@@ -42,26 +41,26 @@ pub struct Companion {
 }
 
 impl Companion {
-    /// Of this system; of the first autopilot that is heard where `None`.
+    /// For this system; for the first autopilot that is received where `None`.
     pub fn new(wanted: Option<u8>, configure: bool) -> Self {
         Self { wanted, configure, ..Self::default() }
     }
 
-    /// Signs what it says with this key, under this link id.
+    /// Signs its messages with this key, under this link id.
     pub fn signing(self, signed_with: Option<(SigningKey, u8)>) -> Self {
         Self { signed_with, ..self }
     }
 
-    /// Takes a frame that was heard at `t`; whether it is the autopilot's. Appends what it is answered.
+    /// Handles a frame received at `t`; returns whether it is the autopilot's. Appends the answers.
     pub fn heard(&mut self, frame: &MavlinkFrame, t: MonoTime, out: &mut Vec<Vec<u8>>) -> bool {
         if is_autopilot(frame) && self.wanted.is_none_or(|wanted| wanted == frame.system) {
             let system = *self.system.get_or_insert_with(|| {
-                self.notes.push(format!("system {} is followed", frame.system));
+                self.notes.push(format!("system {} is used", frame.system));
                 frame.system
             });
             if system != frame.system && self.another != Some(frame.system) {
                 self.another = Some(frame.system);
-                let words = format!("system {} is an autopilot too, and is not heard", frame.system);
+                let words = format!("system {} is an autopilot too, and is ignored", frame.system);
                 self.notes.push(words);
             }
         }
@@ -88,19 +87,19 @@ impl Companion {
         if self.clock.restarts() != self.restarts {
             self.restarts = self.clock.restarts();
             self.configured = false;
-            self.notes.push("it was started anew, or its clock stepped".into());
+            self.notes.push("it was restarted, or its clock stepped".into());
         }
     }
 
-    /// Its own time is what we say when it asks for ours: then stamps are on one clock, and what it takes for the
-    /// difference is none.
+    /// A time request of the autopilot is answered in its own time: then all stamps are on one clock, and its estimate
+    /// of the difference is zero.
     fn tell_time(&mut self, ts1: i64, t: MonoTime, out: &mut Vec<Vec<u8>>) {
         let Some(remote) = self.clock.remote(t).filter(|_| self.clock.is_exchanged()) else { return };
         let answer = TIMESYNC_DATA { tc1: remote.ns(), ts1, ..TIMESYNC_DATA::DEFAULT };
         self.put(&MavMessage::TIMESYNC(answer), t, out);
     }
 
-    /// What is said once a second: nothing before it was heard.
+    /// Messages sent once a second; none before the autopilot was received.
     pub fn every_second(&mut self, now: MonoTime, out: &mut Vec<Vec<u8>>) {
         let Some(system) = self.system else { return };
         self.put(&messages::heartbeat_of(MavType::MAV_TYPE_ONBOARD_CONTROLLER), now, out);
@@ -119,7 +118,7 @@ impl Companion {
         }
     }
 
-    /// What an operator should know.
+    /// Notes for the operator.
     pub fn notes(&mut self) -> Vec<String> {
         std::mem::take(&mut self.notes)
     }
@@ -137,7 +136,7 @@ impl Companion {
     }
 }
 
-/// The command that asks for a message so often.
+/// The command that requests a message at an interval.
 fn interval(system: u8, id: u32, hz: f32) -> MavMessage {
     MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
         command: MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
@@ -189,7 +188,7 @@ mod tests {
         assert_eq!(said.len(), 2 + WANTED.len());
         assert!(said.iter().all(|frame| (frame.system, frame.component) == (3, COMPANION)));
         let MavMessage::TIMESYNC(question) = &said[1].message else { panic!("{said:?}") };
-        // Its own question is answered in its own time, once that is known.
+        // Its request is answered in its own time, once that is known.
         let mut out = Vec::new();
         let its = MavMessage::TIMESYNC(TIMESYNC_DATA { ts1: 7, ..TIMESYNC_DATA::DEFAULT });
         companion.heard(&of(3, &its), at(1.001), &mut out);

@@ -1,4 +1,4 @@
-//! What is known of the helicopter: its own state lately, and what its autopilot takes for its position and time.
+//! State of the helicopter: its recent states, and its autopilot's position and time.
 
 use std::collections::VecDeque;
 
@@ -8,14 +8,14 @@ use windhover_base::geo::LocalFrame;
 use windhover_base::msg::{AutopilotPosition, Ownship, Stamped};
 use windhover_base::time::{MonoTime, Span};
 
-/// Own states are kept for this long.
+/// How long states are kept.
 const KEPT: Span = Span::from_ns(3_000_000_000);
-/// Between two own states farther apart nothing is known.
+/// Between two states that are farther apart than this, the state is not known.
 const GAP: Span = Span::from_ns(500_000_000);
-/// The difference between the autopilot's position and ours is averaged over so long, s: longer than what noise and
-/// tilt make of it, shorter than receivers take to wander.
+/// Averaging time of the difference between the autopilot's position and ours, s: longer than noise and tilt vary,
+/// shorter than the drift of receivers.
 const AVERAGED_S: f64 = 2.0;
-/// The autopilot's position is known while it was heard so lately.
+/// The autopilot's position is known while it was received within this time.
 const FRESH: Span = Span::from_ns(2_000_000_000);
 
 /// The helicopter at one time.
@@ -31,11 +31,11 @@ pub struct OwnAt {
     pub sigma_down_m: f64,
 }
 
-/// The autopilot's position less ours, and its clock less ours.
+/// The autopilot's position minus ours, and its clock minus ours.
 #[derive(Clone, Copy, PartialEq, Debug)]
 struct Difference {
     at: MonoTime,
-    /// North and east, metres; and altitude above mean sea level less height above the ellipsoid.
+    /// North and east, metres; and altitude above mean sea level minus height above the ellipsoid.
     place_m: Vector3<f64>,
     clock: Span,
 }
@@ -49,7 +49,7 @@ pub struct Helicopter {
 }
 
 impl Helicopter {
-    /// Takes its own state.
+    /// Takes a state.
     pub fn own(&mut self, own: &Ownship, frame: Option<&LocalFrame>) {
         let place = self.own.iter().rposition(|at| at.t_valid <= own.t_valid).map_or(0, |i| i + 1);
         self.own.insert(place, *own);
@@ -60,12 +60,12 @@ impl Helicopter {
         }
     }
 
-    /// Takes where its autopilot takes it to be.
+    /// Takes a position of its autopilot.
     pub fn heard(&mut self, position: &Stamped<AutopilotPosition>) {
         self.heard = Some(*position);
     }
 
-    /// The helicopter at `t`, between the states that are known; as it was last, a little after them.
+    /// The helicopter at `t`, interpolated between states; for a short time after the last, that one.
     pub fn at(&self, t: MonoTime) -> Option<OwnAt> {
         let after = self.own.iter().find(|own| own.t_valid >= t);
         let before = self.own.iter().rev().find(|own| own.t_valid <= t);
@@ -85,7 +85,7 @@ impl Helicopter {
         })
     }
 
-    /// Follows the difference between the autopilot's position and ours, once both are known for the same time.
+    /// Updates the difference between the autopilot's position and ours, once both are known for the same time.
     fn compare(&mut self, frame: &LocalFrame) {
         let Some(heard) = self.heard else { return };
         let known = self.own.back().is_some_and(|last| last.t_valid >= heard.t_valid);
@@ -109,8 +109,8 @@ impl Helicopter {
         self.difference = Some(Difference { at: heard.t_valid, place_m, clock });
     }
 
-    /// The autopilot's position less ours (north, east; altitude above mean sea level less our height above the
-    /// ellipsoid), metres: the last that is known, and whether it was heard just now.
+    /// The autopilot's position minus ours (north, east; altitude above mean sea level minus our height above the
+    /// ellipsoid), metres: the last known difference, and whether it is recent.
     pub fn difference(&self, now: MonoTime) -> Option<(Vector3<f64>, bool)> {
         self.difference.map(|d| (d.place_m, now - d.at <= FRESH))
     }

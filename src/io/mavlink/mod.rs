@@ -1,7 +1,7 @@
-//! MAVLink 2 over UDP: the vehicles as ground stations, and autopilots that follow or land, want them.
+//! MAVLink 2 over UDP: the vehicles for ground stations, and for autopilots that follow or land.
 //!
-//! [`Teller`] makes the frames out of the pipeline's outputs, [`MavlinkSender`] sends them. What comes in is looked at
-//! for three things: commands to the camera, others that use our system ids, and signatures where a key is set.
+//! [`MavlinkEncoder`] makes the frames from the pipeline's outputs, [`MavlinkSender`] sends them. Received frames are checked
+//! for three things: commands to the camera, other systems with our ids, and signatures where a key is set.
 
 mod camera;
 pub mod companion;
@@ -10,12 +10,12 @@ pub mod messages;
 mod motion;
 pub mod packet;
 mod stations;
-mod teller;
-mod told;
+mod encoder;
+mod report;
 mod vehicle;
 
-pub use stations::{Found, Station, StationNews, look_up};
-pub use teller::Teller;
+pub use encoder::MavlinkEncoder;
+pub use stations::{Found, Station, StationChange, look_up};
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
@@ -32,9 +32,9 @@ use stations::Stations;
 
 /// A signature older than this is a replay (message signing guide: one minute).
 const REPLAY_WINDOW: u64 = 6_000_000;
-/// Nothing is sent of a target for so long after another system was heard under its id.
+/// After another system was received under a target's id, nothing is sent of the target for this time.
 const STANDS_BACK: Span = Span::from_ns(10_000_000_000);
-/// Frames of ours that are known again where a router sends them back.
+/// Number of sent frames that are remembered, to recognise them when a router returns them.
 const OWN_FRAMES: usize = 512;
 
 /// Why MAVLink could not be opened.
@@ -51,41 +51,41 @@ pub enum MavlinkError {
     NotAKey(PathBuf),
 }
 
-/// What came in.
+/// Counts of received frames.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct MavlinkCounts {
-    /// Frames heard, and signed where a key is set.
+    /// Frames received, with a valid signature where a key is set.
     pub heard: u64,
-    /// Datagrams refused where a key is set: unsigned, of another key, replayed, no MAVLink.
+    /// Datagrams refused where a key is set: unsigned, of another key, replayed, not MAVLink.
     pub refused: u64,
-    /// Frames of others under a system id of ours.
+    /// Frames of other systems under one of our system ids.
     pub foreign: u64,
 }
 
 impl MavlinkCounts {
-    /// In a few words, where something came that is not believed.
+    /// As text, where any frame was refused or foreign.
     pub fn words(&self) -> Option<String> {
         let Self { heard, refused, foreign } = self;
         (refused + foreign > 0)
-            .then(|| format!("{heard} heard, {refused} refused, {foreign} under ids of ours"))
+            .then(|| format!("{heard} received, {refused} refused, {foreign} under our ids"))
     }
 }
 
-/// Sends the vehicles. Nothing here blocks.
+/// Sends the vehicles. No call blocks.
 pub struct MavlinkSender {
-    teller: Teller,
+    encoder: MavlinkEncoder,
     stations: Stations,
     targets: usize,
     key: Option<SigningKey>,
     heard_stamp: u64,
-    /// Checks of what was sent lately.
+    /// Checksums of recently sent frames.
     sent: VecDeque<u32>,
     frames: Vec<Vec<u8>>,
     counts: MavlinkCounts,
-    news: Vec<StationNews>,
+    news: Vec<StationChange>,
 }
 
-/// The key that messages are signed with, where one is configured. Reads a file.
+/// The configured signing key, if any. Reads a file.
 pub fn signing_key(path: Option<&str>) -> Result<Option<SigningKey>, MavlinkError> {
     let Some(path) = path.map(Path::new) else { return Ok(None) };
     let text = read_private(path)?;
@@ -93,13 +93,19 @@ pub fn signing_key(path: Option<&str>) -> Result<Option<SigningKey>, MavlinkErro
 }
 
 impl MavlinkSender {
-    /// As configured; what goes to the autopilot goes by its own link.
+    /// A sender for this configuration; frames for the autopilot use its own connection.
     pub fn open(config: &Config, to_autopilot: ToAutopilot) -> Result<Self, MavlinkError> {
         let mavlink = &config.mavlink;
         let key = signing_key(mavlink.signing_key.as_deref())?;
         Ok(Self {
             stations: Stations::open(&mavlink.send_to, to_autopilot).map_err(MavlinkError::Socket)?,
-            teller: Teller::new(mavlink, &config.target, &config.ground, &config.camera, key.clone()),
+            encoder: MavlinkEncoder::new(
+                mavlink,
+                &config.target,
+                &config.ground,
+                &config.camera,
+                key.clone(),
+            ),
             targets: config.target.len(),
             key,
             heard_stamp: 0,
@@ -110,48 +116,48 @@ impl MavlinkSender {
         })
     }
 
-    /// Takes what it needs of the pipeline's outputs.
+    /// Takes the outputs that it needs.
     pub fn output(&mut self, output: &Output) {
-        self.teller.output(output);
+        self.encoder.output(output);
     }
 
-    /// What came in so far.
+    /// Counts of received frames so far.
     pub fn counts(&self) -> MavlinkCounts {
         self.counts
     }
 
-    /// Where it goes, and how that goes.
+    /// The stations with the state of sending to them.
     pub fn stations(&self) -> &[Station] {
         self.stations.all()
     }
 
-    /// What became of stations since this was last asked.
-    pub fn news(&mut self) -> Vec<StationNews> {
+    /// Changes of stations since the last call.
+    pub fn news(&mut self) -> Vec<StationChange> {
         let mut news = std::mem::take(&mut self.news);
         news.extend(self.stations.news());
         news
     }
 
-    /// Names of stations that are to be looked up at `now`.
+    /// Names of stations that are to be resolved at `now`.
     pub fn unresolved(&mut self, now: MonoTime) -> Option<Vec<String>> {
         self.stations.unresolved(now)
     }
 
-    /// Takes what names were found to be.
+    /// Takes the results of name resolution.
     pub fn found(&mut self, found: Vec<Found>) {
         self.stations.found(found);
     }
 
-    /// How often [`Self::send`] is to be called.
+    /// Period for calls of [`Self::send`].
     pub fn every(&self) -> Span {
-        self.teller.every()
+        self.encoder.every()
     }
 
-    /// Looks at what came in and sends what is due.
+    /// Handles received frames and sends what is due.
     pub fn send(&mut self, now: MonoTime) {
         let mut frames = std::mem::take(&mut self.frames);
         self.listen(now, &mut frames);
-        self.teller.tell(now, &mut frames);
+        self.encoder.tell(now, &mut frames);
         for frame in frames.drain(..) {
             if self.sent.len() == OWN_FRAMES {
                 self.sent.pop_front();
@@ -162,9 +168,9 @@ impl MavlinkSender {
         self.frames = frames;
     }
 
-    /// Empties the sockets.
+    /// Reads the sockets until they are empty.
     fn listen(&mut self, now: MonoTime, answers: &mut Vec<Vec<u8>>) {
-        let utc = self.teller.utc(now);
+        let utc = self.encoder.utc(now);
         let mut buffer = [0; 2048];
         for _ in 0..64 {
             let Some(length) = self.stations.receive(&mut buffer) else { return };
@@ -199,19 +205,19 @@ impl MavlinkSender {
     }
 
     fn frame(&mut self, frame: &MavlinkFrame, now: MonoTime, answers: &mut Vec<Vec<u8>>) {
-        if let Some(index) = (0..self.targets).find(|&k| self.teller.system_id(k) == frame.system) {
+        if let Some(index) = (0..self.targets).find(|&k| self.encoder.system_id(k) == frame.system) {
             self.counts.foreign += 1;
-            self.teller.stand_back(index, now + STANDS_BACK);
+            self.encoder.stand_back(index, now + STANDS_BACK);
             let fault = format!(
-                "another system uses id {}: nothing is sent of it for {:.0} s; set mavlink.system_id",
+                "another system uses id {}: its target is not sent for {:.0} s; set mavlink.system_id",
                 frame.system,
                 STANDS_BACK.s()
             );
             let name = format!("system {}", frame.system);
-            self.news.push(StationNews { name, fault: Some(fault) });
+            self.news.push(StationChange { name, fault: Some(fault) });
         }
         let from = Sender { system: frame.system, component: frame.component };
-        self.teller.asked(from, &frame.message, now, answers);
+        self.encoder.asked(from, &frame.message, now, answers);
     }
 }
 

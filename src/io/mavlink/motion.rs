@@ -1,4 +1,4 @@
-//! A vehicle's state at another moment than it was estimated for, and its motion as vectors.
+//! A vehicle's state at another time than that of its estimate, and its motion as vectors.
 
 use std::collections::VecDeque;
 
@@ -8,18 +8,18 @@ use windhover_base::geo::wrap_angle;
 use windhover_base::msg::TargetState;
 use windhover_base::time::{MonoTime, Span};
 
-/// Change of speed is fitted over this long.
+/// Time over which the change of speed is fitted.
 const FITTED: Span = Span::from_ns(600_000_000);
-/// Fewer speeds, or a shorter time, tell no change.
+/// Fewest speeds for a fit.
 const FEWEST: usize = 4;
 const SHORTEST_S: f64 = 0.25;
-/// No ground vehicle brakes or accelerates harder, m/s².
+/// Largest acceleration or deceleration of a ground vehicle, m/s².
 const HARDEST_MPS2: f64 = 8.0;
 
-/// How the speed of a vehicle changes: the slope of what was lately estimated.
+/// Rate of a vehicle's speed: the slope of its recent estimates.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct SpeedRate {
-    /// When, speed, its variance.
+    /// Time, speed, its variance.
     lately: VecDeque<(MonoTime, f64, f64)>,
 }
 
@@ -31,12 +31,12 @@ impl SpeedRate {
         self.lately.retain(|(at, ..)| t - *at <= FITTED);
     }
 
-    /// Forgets what was before: the vehicle was out of sight.
+    /// Drops the history: the vehicle was out of sight.
     pub fn clear(&mut self) {
         self.lately.clear();
     }
 
-    /// v̇, m/s². The least-squares slope b of σ_b, as b³/(b² + σ_b²): what is not surer than its noise is hardly told.
+    /// v̇, m/s². The least-squares slope b with sigma σ_b, as b³/(b² + σ_b²): a slope below its noise is nearly zero.
     pub fn mps2(&self) -> f64 {
         let (Some((last, ..)), n) = (self.lately.back(), self.lately.len()) else { return 0.0 };
         let at = |t: MonoTime| (t - *last).s();
@@ -55,9 +55,8 @@ impl SpeedRate {
     }
 }
 
-/// The state `by` later, on an arc whose speed changes by `rate_mps2` until it stands:
-/// `ψ' = ψ + ω Δ`, `v' = v + v̇ Δ`, and the rear axle moves `(v + v')/2 Δ` along the chord of the arc.
-/// Latitude and longitude stay as they were.
+/// The state a time Δ = `by` later, on an arc whose speed changes by `rate_mps2` until it stops: `ψ' = ψ + ω Δ`, `v' =
+/// v + v̇ Δ`, and the rear axle moves `(v + v')/2 Δ` along the chord of the arc. Latitude and longitude stay unchanged.
 pub fn ahead(state: &TargetState, rate_mps2: f64, reference_m: f64, by: Span) -> TargetState {
     let dt = by.s();
     let mut speed = state.speed_mps + rate_mps2 * dt;

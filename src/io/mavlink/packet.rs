@@ -1,4 +1,4 @@
-//! MAVLink 2 frames: put together, signed and verified with the `mavlink` crate.
+//! MAVLink 2 frames: encoded, signed and verified with the `mavlink` crate.
 //!
 //! Source: <https://mavlink.io/en/guide/serialization.html>, <https://mavlink.io/en/guide/message_signing.html>.
 
@@ -9,7 +9,7 @@ use windhover_base::time::UtcTime;
 
 /// First byte of a MAVLink 2 frame.
 const MAGIC: u8 = 0xfd;
-/// Bytes of the header, the magic included.
+/// Bytes of the header, including the magic byte.
 const HEADER: usize = 10;
 /// Bytes of the checksum.
 const CHECKSUM: usize = 2;
@@ -31,7 +31,7 @@ impl std::fmt::Debug for SigningKey {
 }
 
 impl SigningKey {
-    /// From 64 hexadecimal digits; `None` for anything else.
+    /// A key from 64 hexadecimal digits; `None` for anything else.
     pub fn from_hex(text: &str) -> Option<Self> {
         let text = text.trim().as_bytes();
         let mut key = [0; 32];
@@ -53,7 +53,7 @@ impl SigningKey {
     }
 }
 
-/// Who sends.
+/// The sender of a frame.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Sender {
     /// System id.
@@ -67,13 +67,13 @@ pub struct Sender {
 pub struct Signature<'a> {
     /// The secret.
     pub key: &'a SigningKey,
-    /// Link id that goes with it.
+    /// Link id of the signature.
     pub link_id: u8,
     /// Time stamp, units of 10 µs since 2015; each greater than the one before.
     pub time_stamp: u64,
 }
 
-/// Puts a frame together, signed where `signature` says how.
+/// Encodes a frame, signed where `signature` is given.
 pub fn encode(
     sequence: u8,
     sender: Sender,
@@ -100,21 +100,21 @@ pub fn time_stamp(utc: UtcTime) -> u64 {
     u64::try_from((utc.unix_ns() - SIGNATURE_EPOCH_UNIX_NS) / 10_000).unwrap_or(0)
 }
 
-/// Why bytes are no frame to be believed.
+/// Why a frame is refused.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Refused {
     /// Too short, another version, or a length that does not fit.
     Malformed,
     /// Not signed, though a key is set.
     Unsigned,
-    /// The signature is not of our key.
+    /// The signature is of another key.
     WrongKey,
-    /// Not later than one already seen, or a minute old.
+    /// Not later than one already received, or a minute old.
     Replayed,
 }
 
-/// Checks that a datagram is one signed frame; gives its sender, message id and time stamp. The checksum
-/// needs the message's definition and is covered by the signature anyway.
+/// Checks that a datagram is one signed frame; returns its sender, message id and time stamp. The checksum needs the
+/// message's definition and is covered by the signature anyway.
 pub fn verify(datagram: &[u8], key: &SigningKey) -> Result<(Sender, u32, u64), Refused> {
     let &[MAGIC, length, incompatible, ..] = datagram else {
         return Err(Refused::Malformed);

@@ -1,4 +1,4 @@
-//! Where MAVLink goes: addresses by their names, two sockets, and what became of each datagram.
+//! Destinations of MAVLink: addresses by name, two sockets, and the result of each datagram.
 
 use std::io;
 use std::net::{SocketAddr, ToSocketAddrs as _, UdpSocket};
@@ -9,26 +9,26 @@ use crate::config::AUTOPILOT;
 use crate::io::autopilot::ToAutopilot;
 use windhover_base::time::{MonoTime, Span};
 
-/// Names of stations are looked up again after this long where that failed, or where sending fails.
+/// Period of name resolution for stations that do not resolve, or to which sending fails.
 const RESOLVE_EVERY: Span = Span::from_ns(10_000_000_000);
 
-/// One station, and how sending to it goes.
+/// One station, with the state of sending to it.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Station {
     /// `host:port` as configured.
     pub name: String,
-    /// Its address, once found.
+    /// Its address, once resolved.
     pub address: Option<SocketAddr>,
     /// Datagrams sent.
     pub sent: u64,
-    /// Datagrams the system would not take.
+    /// Datagrams that the system refused.
     pub failed: u64,
-    /// Why nothing goes there just now.
+    /// Why nothing is sent there at present.
     pub fault: Option<String>,
 }
 
 impl Station {
-    /// In a few words: how many went there, and why no more do.
+    /// As text: how many datagrams were sent, and why no more are.
     pub fn words(&self) -> String {
         let mut words = format!("{} {} sent", self.name, self.sent);
         if self.failed > 0 {
@@ -41,19 +41,19 @@ impl Station {
     }
 }
 
-/// A change that an operator should know of.
+/// A change of a station, for the operator.
 #[derive(Clone, PartialEq, Eq, Debug)]
-pub struct StationNews {
+pub struct StationChange {
     /// Which station.
     pub name: String,
-    /// What is wrong with it; `None` where it is right again.
+    /// The fault; `None` where it is over.
     pub fault: Option<String>,
 }
 
-/// What a name was found to be: an address, or why there is none.
+/// The result of resolving a name: an address, or why there is none.
 pub type Found = (String, Result<SocketAddr, String>);
 
-/// Addresses of stations by their names, IPv4 first where a name has both. Blocks while they are looked up.
+/// Addresses of stations by their names, IPv4 first where a name has both. Blocks until they are resolved.
 pub fn look_up(names: Vec<String>) -> Vec<Found> {
     let find = |name: &str| -> io::Result<SocketAddr> {
         let all: Vec<SocketAddr> = match name.parse() {
@@ -68,26 +68,26 @@ pub fn look_up(names: Vec<String>) -> Vec<Found> {
         first.copied().ok_or_else(|| io::Error::other("the name has no address"))
     };
     let found = |name: String| {
-        let address = find(&name).map_err(|error| format!("cannot be found: {error}"));
+        let address = find(&name).map_err(|error| format!("cannot be resolved: {error}"));
         (name, address)
     };
     names.into_iter().map(found).collect()
 }
 
-/// All stations, and the sockets by which they are reached.
+/// All stations, and the sockets to reach them.
 #[derive(Debug)]
 pub struct Stations {
     v4: UdpSocket,
-    /// Opened for the first station that has an IPv6 address; `None` before, and on a computer without IPv6.
+    /// Opened for the first station with an IPv6 address; `None` before that, and on a computer without IPv6.
     v6: Option<UdpSocket>,
     to_autopilot: ToAutopilot,
     all: Vec<Station>,
     asked: Option<MonoTime>,
-    news: Vec<StationNews>,
+    news: Vec<StationChange>,
 }
 
 impl Stations {
-    /// With these names, none of them found yet. Datagrams may be broadcast.
+    /// Stations of these names, none of them resolved yet. Datagrams may be broadcast.
     pub fn open(names: &[String], to_autopilot: ToAutopilot) -> io::Result<Self> {
         let v4 = UdpSocket::bind("0.0.0.0:0")?;
         v4.set_broadcast(true)?;
@@ -101,12 +101,12 @@ impl Stations {
         &self.all
     }
 
-    /// What changed since this was last asked.
-    pub fn news(&mut self) -> Vec<StationNews> {
+    /// Changes since the last call.
+    pub fn news(&mut self) -> Vec<StationChange> {
         std::mem::take(&mut self.news)
     }
 
-    /// Names that are to be looked up at `now`: those that have no address, or where sending fails.
+    /// Names that are to be resolved at `now`: those without an address, or where sending fails.
     pub fn unresolved(&mut self, now: MonoTime) -> Option<Vec<String>> {
         let missing = |s: &&Station| s.name != AUTOPILOT && (s.address.is_none() || s.fault.is_some());
         let wanted = self.all.iter().filter(missing);
@@ -118,7 +118,7 @@ impl Stations {
         Some(names)
     }
 
-    /// Takes what names were found to be.
+    /// Takes the results of name resolution.
     pub fn found(&mut self, found: Vec<Found>) {
         for (name, address) in found {
             let Some(station) = self.all.iter_mut().find(|station| station.name == name) else { continue };
@@ -156,18 +156,18 @@ impl Stations {
         }
     }
 
-    /// Takes one datagram out of either socket; its length.
+    /// Receives one datagram from either socket; returns its length.
     pub fn receive(&self, buffer: &mut [u8]) -> Option<usize> {
         let sockets = std::iter::once(&self.v4).chain(&self.v6);
         sockets.into_iter().find_map(|socket| socket.recv_from(buffer).ok()).map(|(length, _)| length)
     }
 }
 
-fn report(station: &mut Station, fault: Option<String>, news: &mut Vec<StationNews>) {
-    // The same kind of fault is no news, and neither is that all is well from the first datagram on.
+fn report(station: &mut Station, fault: Option<String>, news: &mut Vec<StationChange>) {
+    // A repeated fault of the same kind is no change, and neither is success from the first datagram on.
     if station.fault != fault {
         station.fault.clone_from(&fault);
-        news.push(StationNews { name: station.name.clone(), fault });
+        news.push(StationChange { name: station.name.clone(), fault });
     }
 }
 
@@ -186,7 +186,7 @@ mod tests {
     fn to(names: &[&str]) -> Stations {
         let names: Vec<String> = names.iter().map(|&name| name.to_owned()).collect();
         let mut stations = Stations::open(&names, ToAutopilot::default()).expect("sockets");
-        let unresolved = stations.unresolved(MonoTime::default()).expect("all are to be looked up");
+        let unresolved = stations.unresolved(MonoTime::default()).expect("all are to be resolved");
         stations.found(look_up(unresolved));
         stations
     }
@@ -216,7 +216,7 @@ mod tests {
 
     #[test]
     fn a_station_that_cannot_be_reached_is_told_once_and_counted() {
-        // Given a good address, a name that nobody has, and a port that nobody can have.
+        // Given a good address, a name that does not exist, and a port that is never free.
         let mut stations = to(&["127.0.0.1:9", "no-such-host.invalid:14550", "127.0.0.1:0"]);
         for _ in 0..3 {
             stations.send(b"hello");
@@ -225,13 +225,13 @@ mod tests {
         assert_eq!((all[0].sent, all[0].failed, &all[0].fault), (3, 0, &None));
         assert_eq!((all[1].sent, all[1].failed), (0, 0));
         assert!(
-            all[1].fault.as_ref().is_some_and(|fault| fault.starts_with("cannot be found")),
+            all[1].fault.as_ref().is_some_and(|fault| fault.starts_with("cannot be resolved")),
             "{:?}",
             all[1]
         );
         assert_eq!((all[2].sent, all[2].failed), (0, 3));
         assert!(all[2].words().contains("0 sent, 3 failed ("), "{}", all[2].words());
-        // Then each is told once, and asked for again only after a while.
+        // Then each fault is reported once, and the name is resolved again only after a while.
         let told: Vec<String> = stations.news().into_iter().map(|news| news.name).collect();
         assert_eq!(told, ["no-such-host.invalid:14550", "127.0.0.1:0"]);
         assert_eq!(stations.unresolved(MonoTime::default() + Span::from_s(1.0)), None);

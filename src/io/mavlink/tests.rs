@@ -1,4 +1,4 @@
-//! What a receiver on this computer gets of a vehicle that is seen, covered, and of a camera that dies.
+//! What a receiver on this computer gets for a vehicle that is seen, then covered, and for a camera that fails.
 
 use std::net::UdpSocket;
 
@@ -42,7 +42,7 @@ impl Bench {
         config.mavlink = mavlink;
         config.target.push(config.target[0].clone());
         let mut sender = MavlinkSender::open(&config, ToAutopilot::default()).expect("opened");
-        let names = sender.unresolved(START).expect("to be looked up");
+        let names = sender.unresolved(START).expect("to be resolved");
         sender.found(look_up(names));
         sender.output(&Output::Datum(START, DATUM));
         Self { sender, receiver }
@@ -71,7 +71,7 @@ impl Bench {
         self.sender.output(&Output::Estimator(EstimatorOutput::Ownship(own)));
     }
 
-    /// The autopilot takes itself to be at this place of the datum's frame and this altitude.
+    /// The autopilot's position is this place of the datum's frame and this altitude.
     fn autopilot(&mut self, s: f64, north_m: f64, east_m: f64, alt_msl_m: f64) {
         let frame = windhover_base::geo::LocalFrame::new(DATUM);
         let place = frame.geodetic(&Vector3::new(north_m, east_m, 0.0));
@@ -97,7 +97,7 @@ impl Bench {
         frames.into_iter().filter(|frame| frame.system != 43).map(|frame| frame.message).collect()
     }
 
-    /// What is sent at `s`: system, sequence, message, payload.
+    /// The frames sent at `s`: system, sequence, message, payload.
     fn sent(&mut self, s: f64) -> Vec<(u8, u8, u32, Vec<u8>)> {
         self.sender.send(START + Span::from_s(s));
         let mut buffer = [0; 512];
@@ -111,7 +111,7 @@ impl Bench {
     }
 }
 
-/// MAV_STATE of the first target's heartbeat, where there is one, and whether a position of it went out.
+/// MAV_STATE of the first target's heartbeat, where there is one, and whether a position of it was sent.
 fn told(sent: &[(u8, u8, u32, Vec<u8>)]) -> (Option<u8>, bool) {
     let first = |id| sent.iter().find(move |(system, _, kind, _)| (*system, *kind) == (42, id));
     (first(0).map(|(.., payload)| payload[7]), first(33).is_some() && first(144).is_some())
@@ -127,13 +127,13 @@ fn a_dead_camera_ends_the_positions_and_the_heartbeats_tell() {
     assert_eq!(told(&bench.sent(0.0)), (STANDBY, false));
     bench.estimate(1.0, TrackStatus::Tracking, 0.1);
     assert_eq!(told(&bench.sent(1.05)), (ACTIVE, true));
-    // When nothing more comes, then the last state is not sent for ever.
+    // When no more outputs come, then the last state is not sent without end.
     assert_eq!(told(&bench.sent(1.4)), (None, true));
     assert_eq!(told(&bench.sent(2.1)), (STANDBY, false));
     assert_eq!(told(&bench.sent(32.1)), (STANDBY, false));
 }
 
-/// A slow rate is that of positions; whoever listens still hears once a second that we are there.
+/// A slow rate is that of positions; a listener still gets a heartbeat once a second.
 #[test]
 fn a_slow_rate_slows_no_heartbeat() {
     let mut bench = Bench::of(MavlinkConfig { rate_hz: 0.2, ..MavlinkConfig::default() });
@@ -194,7 +194,7 @@ fn after_a_restart_nothing_is_told_before_it_is_known_anew() {
     let mut bench = Bench::new();
     bench.estimate(1.0, TrackStatus::Tracking, 0.1);
     assert_eq!(told(&bench.sent(1.0)), (ACTIVE, true));
-    // When the program starts again, then it stands by, and counts from the first message again.
+    // When the program starts again, then it is on standby, and counts from the first message again.
     let mut again = Bench::new();
     let sent = again.sent(2.0);
     assert_eq!(told(&sent), (STANDBY, false));
@@ -223,7 +223,7 @@ fn after_a_cut_of_the_link_the_present_is_told_and_nothing_of_before() {
     let sent = bench.sent(4.0);
     assert!(told(&sent).1);
     let positions = sent.iter().filter(|(system, _, kind, _)| (*system, *kind) == (42, 33)).count();
-    assert_eq!(positions, 1, "one, of now: {sent:?}");
+    assert_eq!(positions, 1, "one, of the present: {sent:?}");
 }
 
 #[test]
@@ -236,7 +236,7 @@ fn the_state_is_brought_to_the_moment_of_sending() {
         _ => None,
     });
     let position = position.expect("a position");
-    // It stood at (1, 2) and drives at 1 m/s on 0.1 rad.
+    // It was at (1, 2) and drives at 1 m/s on 0.1 rad.
     let frame = windhover_base::geo::LocalFrame::new(DATUM);
     let place = frame.geodetic(&Vector3::new(1.0 + 0.2 * 0.1_f64.cos(), 2.0 + 0.2 * 0.1_f64.sin(), 0.0));
     assert!((f64::from(position.lat) - place.lat_deg * 1e7).abs() < 1.0, "{position:?}");
@@ -247,8 +247,8 @@ fn the_state_is_brought_to_the_moment_of_sending() {
 
 #[test]
 fn what_the_autopilot_takes_for_its_position_is_where_the_vehicle_is_told_from() {
-    // Given an autopilot whose receiver errs by 2 m east against ours, and whose altitude shows the ground 5 m lower than
-    // configured.
+    // Given an autopilot whose receiver differs from ours by 2 m east, and whose altitude shows the ground 5 m lower
+    // than configured.
     let mut bench = Bench::sending(vec![MavlinkMessage::FollowTarget, MavlinkMessage::LandingTarget]);
     for k in 0..10 {
         let s = 0.1 * f64::from(k);
@@ -262,7 +262,7 @@ fn what_the_autopilot_takes_for_its_position_is_where_the_vehicle_is_told_from()
         MavMessage::FOLLOW_TARGET(follow) => Some(follow),
         _ => None,
     });
-    let follow = follow.expect("it is followed");
+    let follow = follow.expect("it is used");
     let frame = windhover_base::geo::LocalFrame::new(DATUM);
     let place = frame.geodetic(&Vector3::new(1.0, 4.0, 0.0));
     assert!((f64::from(follow.lon) - place.lon_deg * 1e7).abs() < 2.0, "2 m farther east: {follow:?}");
@@ -274,8 +274,8 @@ fn what_the_autopilot_takes_for_its_position_is_where_the_vehicle_is_told_from()
         MavMessage::LANDING_TARGET(landing) => Some(landing),
         _ => None,
     });
-    // It is 3 m north of the helicopter, whose nose points east: 3 m to its left, 7.5 m below.
-    let landing = landing.expect("it is told from the helicopter");
+    // It is 3 m north of the helicopter, which points east: 3 m to its left, 7.5 m below.
+    let landing = landing.expect("it is relative to the helicopter");
     let told = Vector3::new(landing.x, landing.y, landing.z);
     assert!((told - Vector3::new(0.0, -3.0, 7.5)).norm() < 1e-3, "{told}");
     assert_eq!((landing.time_usec, landing.frame), (101_000_000, MavFrame::MAV_FRAME_BODY_FRD));
@@ -338,7 +338,7 @@ fn a_ground_station_finds_a_camera_that_tracks() {
     let MavMessage::CAMERA_INFORMATION(information) = &information.message else { panic!("{frames:?}") };
     assert_eq!((information.resolution_h, information.resolution_v), (1280, 1024));
     assert!(information.flags.contains(CameraCapFlags::CAMERA_CAP_FLAGS_HAS_TRACKING_GEO_STATUS));
-    // And what it tracks.
+    // And its tracking status.
     bench.own(1.0);
     bench.estimate(1.0, TrackStatus::Tracking, 0.1);
     let messages = bench.messages(1.0);

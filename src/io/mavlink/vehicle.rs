@@ -1,42 +1,42 @@
-//! What may be said of a vehicle: a state that is fresh, sure, and was seen a moment ago; nothing else.
+//! Which state of a vehicle may be sent: a fresh and accurate one of a vehicle that was seen a moment ago; no other.
 
 use super::motion::SpeedRate;
 use windhover_base::msg::{TargetEstimate, TargetState, TrackStatus};
 use windhover_base::time::{MonoTime, Span};
 
-/// What a state must be to go out as a position.
+/// Limits for sending a state as a position.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Limits {
     /// Greatest age of the estimate.
     pub max_age: Span,
     /// Greatest one-sigma of the position relative to the helicopter, metres.
     pub max_sigma_m: f64,
-    /// Longest that a vehicle out of sight is predicted.
+    /// Longest time that a vehicle out of sight is predicted.
     pub coast: Span,
 }
 
-/// What is said of a vehicle.
+/// The state of a vehicle for its messages.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub enum Said {
-    /// It is seen, and here.
+pub enum Reportable {
+    /// It is seen, in this state.
     Seen(MonoTime, TargetState),
-    /// It was seen a moment ago, and should be here.
+    /// It was seen a moment ago; this state is predicted.
     Predicted(MonoTime, TargetState),
-    /// Nothing: no position goes out.
+    /// No position is sent.
     Nothing,
 }
 
-/// A vehicle as the pipeline last told of it.
+/// The pipeline's last state of a vehicle.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Vehicle {
     latest: Option<TargetEstimate>,
-    /// When it was last seen and settled.
+    /// When it was last seen with a settled estimate.
     seen: Option<MonoTime>,
     rate: SpeedRate,
 }
 
 impl Vehicle {
-    /// Takes an estimate; one that is older than what is known is left.
+    /// Takes an estimate; one that is older than the known one is ignored.
     pub fn take(&mut self, estimate: &TargetEstimate) {
         if self.latest.is_some_and(|latest| estimate.t_valid < latest.t_valid) {
             return;
@@ -51,25 +51,25 @@ impl Vehicle {
         self.latest = Some(*estimate);
     }
 
-    /// How its speed changes, m/s²; 0 while it is not seen.
+    /// Rate of its speed, m/s²; 0 while it is not seen.
     pub fn rate_mps2(&self) -> f64 {
         self.rate.mps2()
     }
 
-    /// What is said of it at `now`.
-    pub fn said(&self, now: MonoTime, limits: &Limits) -> Said {
+    /// Its state for messages at `now`.
+    pub fn reportable(&self, now: MonoTime, limits: &Limits) -> Reportable {
         let Some(TargetEstimate { t_valid, status, state: Some(state), .. }) = self.latest else {
-            return Said::Nothing;
+            return Reportable::Nothing;
         };
         let fresh = (now - t_valid).abs() <= limits.max_age;
-        // What cannot be compared is not sure.
+        // A sigma that cannot be compared does not pass.
         let sure = state.relative_sigma_m.is_some_and(|sigma_m| sigma_m <= limits.max_sigma_m);
         let lately = self.seen.is_some_and(|seen| now.max(t_valid) - seen <= limits.coast);
         match status {
-            _ if !(fresh && sure) => Said::Nothing,
-            TrackStatus::Tracking => Said::Seen(t_valid, state),
-            TrackStatus::Coasting if lately => Said::Predicted(t_valid, state),
-            TrackStatus::Coasting | TrackStatus::Acquiring | TrackStatus::Lost => Said::Nothing,
+            _ if !(fresh && sure) => Reportable::Nothing,
+            TrackStatus::Tracking => Reportable::Seen(t_valid, state),
+            TrackStatus::Coasting if lately => Reportable::Predicted(t_valid, state),
+            TrackStatus::Coasting | TrackStatus::Acquiring | TrackStatus::Lost => Reportable::Nothing,
         }
     }
 }
@@ -85,7 +85,7 @@ pub(super) mod tests {
         MonoTime::default() + Span::from_s(s)
     }
 
-    /// A state at this height, known so well relative to the helicopter.
+    /// A state at this height, with this sigma relative to the helicopter.
     pub(in crate::io::mavlink) fn state_of(height_m: f64, relative_sigma_m: Option<f64>) -> TargetState {
         TargetState {
             north_m: 1.0,
@@ -109,10 +109,10 @@ pub(super) mod tests {
     fn after(estimates: &[TargetEstimate], s: f64) -> &'static str {
         let mut vehicle = Vehicle::default();
         estimates.iter().for_each(|estimate| vehicle.take(estimate));
-        match vehicle.said(at(s), &LIMITS) {
-            Said::Seen(..) => "seen",
-            Said::Predicted(..) => "predicted",
-            Said::Nothing => "nothing",
+        match vehicle.reportable(at(s), &LIMITS) {
+            Reportable::Seen(..) => "seen",
+            Reportable::Predicted(..) => "predicted",
+            Reportable::Nothing => "nothing",
         }
     }
 
@@ -131,7 +131,7 @@ pub(super) mod tests {
         for status in [Acquiring, Lost] {
             assert_eq!(after(&[estimate(1.0, status, Some(0.1))], 1.0), "nothing", "{status:?}");
         }
-        // A state of the future is none of now.
+        // A state of the future is not a present one.
         assert_eq!(after(&tracking, 0.4), "nothing");
     }
 
@@ -141,9 +141,9 @@ pub(super) mod tests {
         let seen = estimate(1.0, Tracking, Some(0.1));
         let coasting = |s| [seen, estimate(s, Coasting, Some(0.2))];
         assert_eq!(after(&coasting(1.9), 1.9), "predicted");
-        assert_eq!(after(&coasting(2.1), 2.1), "nothing", "however sure the filter is of it");
+        assert_eq!(after(&coasting(2.1), 2.1), "nothing", "however small the filter's sigma is");
         assert_eq!(after(&[estimate(1.0, Coasting, Some(0.1))], 1.0), "nothing", "never seen");
-        // What comes late changes nothing.
+        // A late estimate changes nothing.
         assert_eq!(after(&[coasting(1.9)[1], seen], 1.9), "nothing");
     }
 }

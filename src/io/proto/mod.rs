@@ -27,7 +27,7 @@ use windhover_base::time::{MonoTime, NS_PER_S};
 /// Every schema of the program as one descriptor set.
 const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 
-/// The descriptor set of one package with all it imports, as MCAP wants a protobuf schema.
+/// The descriptor set of one package with all its imports, as MCAP requires for a protobuf schema.
 pub fn schema_of_package(package: &str) -> Vec<u8> {
     let all = FileDescriptorSet::decode(DESCRIPTORS).expect("written by the build from the same schemas");
     let file = all.file.iter().filter(|f| f.package() == package || f.package() == "google.protobuf");

@@ -1,4 +1,4 @@
-//! Whether the figures of a message are figures: what a file or a peer says is looked at before anything is made of it.
+//! Plausibility of messages: values from a file or a peer are checked before use.
 
 use super::windhover::{Datum, Ownship, TargetState};
 
@@ -11,7 +11,7 @@ fn are_finite(figures: &[f64]) -> bool {
 }
 
 impl TargetState {
-    /// Whether a state that is known is a place on the Earth and a motion, with a covariance that is one or none.
+    /// Whether a known state is a place on the Earth and a motion, with a valid covariance or none.
     pub fn is_sound(&self) -> bool {
         let motion = [self.north_m, self.east_m, self.heading_rad, self.speed_mps, self.yaw_rate_radps];
         let figures = is_on_earth(self.lat_deg, self.lon_deg) && are_finite(&motion);

@@ -1,4 +1,4 @@
-//! The one codec between events and messages: which topic an event is kept on, as what, and back.
+//! The one codec between events and messages: the topic and schema of each event, in both directions.
 
 use std::sync::Arc;
 
@@ -39,20 +39,20 @@ const RAW_ENCODINGS: [(FrameEncoding, &[&str]); 14] = [
 const COMPRESSED_ENCODINGS: [(FrameEncoding, &[&str]); 2] =
     [(FrameEncoding::Jpeg, &["jpeg", "jpg"]), (FrameEncoding::Png, &["png"])];
 
-/// A message as it was kept, for [`EventDecoder`].
+/// A recorded message, for [`EventDecoder`].
 #[derive(Clone, Copy, Debug)]
 pub struct KeptMessage<'a> {
     /// Its topic.
     pub topic: &'a str,
     /// Full name of its schema.
     pub schema: &'a str,
-    /// The frame's number where the recording tells it ([`super::FRAME_NUMBER_KEY`]).
+    /// The frame's number where the recording has it ([`super::FRAME_NUMBER_KEY`]).
     pub frame_number: Option<u32>,
     /// The protobuf message.
     pub data: &'a [u8],
 }
 
-/// Topic on which an event is kept; `None` for ticks, which are not kept.
+/// Topic of an event; `None` for ticks, which are not recorded.
 pub fn topic_of_event(body: &EventBody) -> Option<&'static str> {
     match body {
         EventBody::Tick => None,
@@ -67,12 +67,12 @@ pub fn topic_of_event(body: &EventBody) -> Option<&'static str> {
     }
 }
 
-/// Whether events are kept on a topic.
+/// Whether a topic contains events.
 pub fn is_event(name: &str) -> bool {
     Source::on_topic(name).is_some() || [topic::SOURCE_EVENT, topic::WARM_START].contains(&name)
 }
 
-/// The record of an event; `None` for ticks, which are not kept.
+/// The record of an event; `None` for ticks, which are not recorded.
 pub fn of_event(event: &Event) -> Option<Record> {
     let t = event.t_recv;
     let (schema, publish_time, data) = match &event.body {
@@ -95,14 +95,14 @@ pub fn of_event(event: &Event) -> Option<Record> {
     Some(Record { topic: topic_of_event(&event.body)?.into(), schema, log_time: t, publish_time, data })
 }
 
-/// Messages back to events, in the order they were kept.
+/// Converts messages back to events, in the order of recording.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct EventDecoder {
     next_frame: u32,
 }
 
 impl EventDecoder {
-    /// The event that a message stands for; `None` where it stands for none.
+    /// The event of a message; `None` where the message is not an event.
     ///
     /// # Errors
     /// The data is not a message of the topic's schema.
@@ -127,7 +127,7 @@ impl EventDecoder {
                 Ok(EventBody::Bytes { source, data })
             }
             Delivery::Frames => {
-                // A frame that does not even decode as a message still counts as one.
+                // A frame whose message does not decode still counts as one.
                 let index = message.frame_number.unwrap_or(self.next_frame);
                 self.next_frame = index.saturating_add(1);
                 to_frame(message, index).map(EventBody::Frame)
@@ -153,7 +153,7 @@ fn to_inertial(message: &windhover::Inertial) -> InertialSample {
     InertialSample { rate_rps: three(&message.rate_rps), force_mps2: three(&message.force_mps2) }
 }
 
-/// An attitude out of its message.
+/// The attitude of a message.
 pub fn to_attitude(message: &windhover::Attitude) -> AttitudeSample {
     let tilt = message.pitch_rad.zip(message.roll_rad).map(|(pitch, roll)| Tilt { pitch, roll });
     AttitudeSample { heading: message.heading_rad, heading_is_true: message.heading_is_true, tilt }
@@ -210,7 +210,7 @@ fn image(frame: &FramePayload) -> (Schema, Vec<u8>) {
     (Schema::CompressedImage, message.encode_to_vec())
 }
 
-/// A frame out of either image schema.
+/// The frame of a message of either image schema.
 fn to_frame(message: &KeptMessage<'_>, index: u32) -> Result<FramePayload, DecodeError> {
     if message.schema == Schema::RawImage.name() {
         let image = foxglove::RawImage::decode(message.data)?;
@@ -296,7 +296,7 @@ mod tests {
     fn every_event_comes_back_from_its_message() {
         for body in every_event() {
             let event = Event { t_recv: MonoTime::from_ns(9), seq: 0, body };
-            let record = of_event(&event).expect("all but ticks are kept");
+            let record = of_event(&event).expect("all but ticks are recorded");
             assert!(is_event(&record.topic), "{}", record.topic);
             let kept = KeptMessage {
                 topic: &record.topic,

@@ -1,4 +1,4 @@
-//! What is kept: events and outputs as protobuf messages on named topics.
+//! Recorded messages: events and outputs as protobuf messages on named topics.
 
 mod event_codec;
 mod output_messages;
@@ -16,24 +16,24 @@ use std::borrow::Cow;
 
 use windhover_base::time::MonoTime;
 
-/// Channel metadata key that says where a frame's number is: with value [`IN_SEQUENCE`] it is the
-/// message's sequence number. Frames that were not kept leave a gap then, and a replay numbers the rest
-/// as the flight did. Without it frames are counted as they come.
+/// Channel metadata key for the place of a frame's number: with value [`IN_SEQUENCE`] it is the message's sequence
+/// number. Frames that are not in the recording then leave a gap, and a replay numbers the others as the flight did.
+/// Without this key frames are counted in order.
 pub const FRAME_NUMBER_KEY: &str = "windhover.frame_number";
 
 /// See [`FRAME_NUMBER_KEY`].
 pub const IN_SEQUENCE: &str = "sequence";
 
-/// One message to be kept or sent.
+/// One message to be recorded or sent.
 #[derive(Clone, Debug)]
 pub struct Record {
     /// Topic.
     pub topic: Cow<'static, str>,
     /// Schema of `data`.
     pub schema: Schema,
-    /// Log clock: when the event that caused it was heard, host time.
+    /// Log clock: reception of the event that caused it, host time.
     pub log_time: MonoTime,
-    /// When it was true, host time.
+    /// Time of validity, host time.
     pub publish_time: MonoTime,
     /// The protobuf message.
     pub data: Vec<u8>,

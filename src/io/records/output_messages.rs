@@ -1,4 +1,4 @@
-//! Protobuf messages of what the pipeline says: our own, and Foxglove's where a schema exists.
+//! Protobuf messages of the pipeline's outputs: our own, and Foxglove's where a schema exists.
 
 use nalgebra::{SMatrix, UnitQuaternion, Vector3};
 use prost_types::Timestamp;
@@ -48,7 +48,7 @@ pub(super) fn rtk(fix: FixKind) -> wh::Rtk {
     }
 }
 
-/// Everything seen in a frame, as a message.
+/// All detections of a frame, as a message.
 pub fn detections(
     frame: u32,
     t: MonoTime,
@@ -88,8 +88,8 @@ fn marker(m: &MarkerDetection) -> wh::Marker {
     }
 }
 
-/// Overlays: tags as outlines with their number, discs as circles, features as points. Foxglove puts
-/// the centre of the top-left pixel at (0.5, 0.5).
+/// Overlays: tags as outlines with their number, discs as circles, features as points. In Foxglove the centre of the
+/// top-left pixel is (0.5, 0.5).
 pub(super) fn annotations(
     t: MonoTime,
     markers: &[MarkerDetection],
@@ -141,7 +141,7 @@ pub(super) fn annotations(
     overlay
 }
 
-/// An attitude as a device put it, true at `t`.
+/// An attitude as a device reported it, valid at `t`.
 pub(super) fn attitude(t: MonoTime, heard: MonoTime, sample: &AttitudeSample) -> wh::Attitude {
     wh::Attitude {
         timestamp: stamp(t),
@@ -153,7 +153,7 @@ pub(super) fn attitude(t: MonoTime, heard: MonoTime, sample: &AttitudeSample) ->
     }
 }
 
-/// Rates and forces as a sensor put them, heard at `t`.
+/// Rates and forces as a sensor reported them, received at `t`.
 pub(super) fn inertial(t: MonoTime, sample: &InertialSample) -> wh::Inertial {
     let figures = |value: Option<Vector3<f64>>| value.map_or(Vec::new(), |v| v.as_slice().to_vec());
     wh::Inertial {
@@ -166,7 +166,7 @@ pub(super) fn inertial(t: MonoTime, sample: &InertialSample) -> wh::Inertial {
 /// A target's place for maps; `frame_id` is its own frame.
 pub fn location(t: MonoTime, frame_id: &str, state: &TargetState) -> fox::LocationFix {
     let covariance = state.covariance.map_or(Vec::new(), |p| {
-        // LocationFix wants east, north, up.
+        // LocationFix has the order east, north, up.
         vec![p[(1, 1)], p[(0, 1)], 0.0, p[(0, 1)], p[(0, 0)], 0.0, 0.0, 0.0, 0.0]
     });
     let known = if covariance.is_empty() {

@@ -1,4 +1,4 @@
-//! Outputs as records: which messages an output makes, and on which topics.
+//! Outputs as records: the messages of an output, and their topics.
 
 use std::collections::BTreeMap;
 
@@ -18,16 +18,16 @@ use windhover_base::msg::{
 use windhover_base::settings::{CameraConfig, TargetConfig};
 use windhover_base::time::MonoTime;
 
-/// What only a daemon knows of itself (card, link, computer), by name.
+/// Values that only a daemon has (card, link, computer), by name.
 #[derive(Clone, Default, PartialEq, Debug)]
 pub struct DaemonFigures {
-    /// Figures; the name tells the unit.
+    /// Numbers; the name contains the unit.
     pub figures: BTreeMap<String, f64>,
-    /// States in a word.
+    /// States as text.
     pub words: BTreeMap<String, String>,
 }
 
-/// Records that every file begins with: intrinsics and the camera's mount.
+/// Records at the start of every file: intrinsics and the camera's mount.
 pub fn opening(camera: &CameraConfig, t: MonoTime) -> Vec<Record> {
     let k = &camera.intrinsics;
     let calibration = fox::CameraCalibration {
@@ -49,15 +49,15 @@ pub fn opening(camera: &CameraConfig, t: MonoTime) -> Vec<Record> {
     ]
 }
 
-/// Turns outputs into records.
+/// Converts outputs to records.
 pub struct OutputEncoder {
     targets: Vec<String>,
-    /// What the next health message tells of the daemon.
+    /// The daemon's values for the next health message.
     pub figures: DaemonFigures,
 }
 
 impl OutputEncoder {
-    /// For outputs of a pipeline with these targets.
+    /// An encoder for a pipeline with these targets.
     pub fn new(targets: &[TargetConfig]) -> Self {
         Self {
             targets: targets.iter().map(|target| target.name.clone()).collect(),
@@ -65,7 +65,7 @@ impl OutputEncoder {
         }
     }
 
-    /// Appends the records of an output; `log` is when the event that caused it was heard.
+    /// Appends the records of an output; `log` is the reception of the event that caused it.
     pub fn output(&mut self, output: &Output, log: MonoTime, out: &mut Vec<Record>) {
         match output {
             Output::Datum(t, datum) => {
@@ -79,7 +79,7 @@ impl OutputEncoder {
             }
             Output::Reading(SensorReading::Gnss(epoch)) => fix(epoch, log, out),
             Output::Reading(SensorReading::Attitude(sample)) => out.push(attitude_record(sample, log)),
-            // What an autopilot says is recorded as its bytes.
+            // Messages of an autopilot are recorded as bytes.
             Output::Reading(_) => {}
             Output::Detections { frame, t_valid, markers, features } => {
                 let whole = detections(*frame, *t_valid, markers, features);
@@ -119,7 +119,7 @@ impl OutputEncoder {
             }
             EstimatorOutput::Smoothed(e) => self.state(topic::target_smoothed(self.name(e)), e, log, out),
             EstimatorOutput::Fusion(result) => out.push(fusion(result, log)),
-            // The pipeline's notice tells of these.
+            // The pipeline's notice reports these.
             EstimatorOutput::Anchored { .. }
             | EstimatorOutput::Reset { .. }
             | EstimatorOutput::TiltFelt { .. }
@@ -136,7 +136,7 @@ impl OutputEncoder {
         out.push(record(topic, Schema::TargetState, log, estimate.t_valid, &message));
     }
 
-    /// Where a target is, for maps and for viewers of transforms.
+    /// A target's place, for maps and for viewers of transforms.
     fn place(&self, estimate: &TargetEstimate, log: MonoTime, out: &mut Vec<Record>) {
         let Some(state) = &estimate.state else { return };
         let name = self.name(estimate);

@@ -1,4 +1,4 @@
-//! The schemas of what is kept.
+//! The schemas of recorded messages.
 
 use crate::io::proto;
 
@@ -105,7 +105,7 @@ impl Schema {
         ALL.into_iter().find(|schema| schema.name() == name)
     }
 
-    /// The descriptor set that goes into a file beside messages of this schema.
+    /// The descriptor set that is stored in a file with messages of this schema.
     pub fn descriptor(self) -> Vec<u8> {
         let package = self.name().split_once('.').map_or("", |(package, _)| package);
         proto::schema_of_package(package)

@@ -1,12 +1,12 @@
-//! Topic names. Those of what sources deliver are in the table of sources ([`windhover_base::msg::Source`]).
+//! Topic names. Topics of sources are in the table of sources ([`windhover_base::msg::Source`]).
 
-/// Losses, arrivals and departures of devices.
+/// Losses, and devices that appeared or disappeared.
 pub const SOURCE_EVENT: &str = "/source/event";
-/// What a restarted daemon continued from.
+/// The state from which a restarted daemon continued.
 pub const WARM_START: &str = "/warm_start";
 /// Position fixes for maps.
 pub const GPS_FIX: &str = "/gps/fix";
-/// GPS epochs, whole.
+/// GPS epochs with all fields.
 pub const GPS_EPOCH: &str = "/gps/epoch";
 /// Compass samples.
 pub const COMPASS_ATTITUDE: &str = "/compass/attitude";
@@ -18,19 +18,19 @@ pub const CAMERA_CALIBRATION: &str = "/camera/calibration";
 pub const CAMERA_VIDEO: &str = "/camera/video";
 /// Overlays for viewers.
 pub const CAMERA_ANNOTATIONS: &str = "/camera/annotations";
-/// Markers and features, whole.
+/// Markers and features with all fields.
 pub const CAMERA_DETECTIONS: &str = "/camera/detections";
 /// Origin of the NED frame.
 pub const DATUM: &str = "/datum";
 /// The helicopter's own state.
 pub const OWNSHIP: &str = "/ownship/state";
-/// What became of each measurement.
+/// The disposition of each measurement.
 pub const FUSION: &str = "/fusion";
 /// Operator's notices.
 pub const LOG: &str = "/log";
-/// The helicopter as a refinement of the whole flight has it.
+/// The helicopter's refined state, from the whole flight.
 pub const OWNSHIP_REFINED: &str = "/ownship/refined";
-/// What a refined flight says of its configuration.
+/// The constants that a refinement found.
 pub const REFINED: &str = "/refined";
 /// Health, once a second.
 pub const HEALTH: &str = "/health";
@@ -40,7 +40,7 @@ pub fn target_location(name: &str) -> String {
     format!("/target/{name}/location")
 }
 
-/// `/target/NAME/state`: as known in real time.
+/// `/target/NAME/state`: in real time.
 pub fn target_state(name: &str) -> String {
     format!("/target/{name}/state")
 }
@@ -50,7 +50,7 @@ pub fn target_coasting(name: &str) -> String {
     format!("/target/{name}/coasting")
 }
 
-/// Whether a topic says where a target is now: of a frame, or predicted while none comes.
+/// Whether a topic contains the present state of a target: of a frame, or predicted while none comes.
 pub fn is_target_now(topic: &str) -> bool {
     topic.starts_with("/target/") && (topic.ends_with("/state") || topic.ends_with("/coasting"))
 }
@@ -82,7 +82,7 @@ pub fn is_refined(topic: &str) -> bool {
     topic == OWNSHIP_REFINED || topic == REFINED || (topic.starts_with("/target/") && of_target())
 }
 
-/// Whether a topic is written by the pipeline itself, and so is made anew by a replay.
+/// Whether a topic is written by the pipeline itself, so that a replay writes it again.
 pub fn is_output(topic: &str) -> bool {
     const OUTPUTS: [&str; 14] = [
         GPS_FIX,

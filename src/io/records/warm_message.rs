@@ -1,4 +1,4 @@
-//! A warm state as a message, exact to the last bit.
+//! A warm state as a message, exact to the bit.
 
 use crate::io::proto::{timestamp, windhover};
 use windhover_base::msg::{WARM_STATES, WarmArrival, WarmFilter, WarmSite, WarmState};
@@ -29,7 +29,7 @@ pub fn message(t: MonoTime, state: &WarmState) -> windhover::WarmState {
     }
 }
 
-/// The state of a message; `None` where it is not one of this program's.
+/// The state of a message; `None` where it is not of this version of the program.
 pub fn state(message: &windhover::WarmState) -> Option<WarmState> {
     if message.arrival_ns.len() != message.offset_ns.len() {
         return None;
@@ -65,7 +65,7 @@ fn filter(message: &windhover::WarmState) -> Option<WarmFilter> {
     })
 }
 
-/// The first, then each less the one before: small numbers take few bytes.
+/// The first value, then the differences: small numbers take few bytes.
 fn steps(values: impl Iterator<Item = i64>) -> Vec<i64> {
     values
         .scan(0i64, |before, value| {
@@ -123,7 +123,7 @@ mod tests {
         let bytes = message(MonoTime::from_ns(7), &state_before).encode_to_vec();
         let read = windhover::WarmState::decode(&bytes[..]).expect("decodes");
         assert_eq!(state(&read), Some(state_before));
-        assert!(bytes.len() < 1024, "{} bytes: last known states are kept in the index", bytes.len());
+        assert!(bytes.len() < 1024, "{} bytes: last known states are stored in the index", bytes.len());
         let nothing = WarmState { arrivals: Vec::new(), filter: None, ..learnt() };
         assert_eq!(state(&message(MonoTime::from_ns(7), &nothing)), Some(nothing));
     }

@@ -1,4 +1,4 @@
-//! A bag as rosbag2 writes it: one MCAP file of profile `ros2`, and `metadata.yaml` beside it.
+//! A bag in the form of rosbag2: one MCAP file of profile `ros2`, and `metadata.yaml` beside it.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -15,14 +15,14 @@ use windhover_base::time::MonoTime;
 
 const DATA: &str = "flight_0.mcap";
 const METADATA: &str = "metadata.yaml";
-/// Who made it, in both files.
+/// The generator, in both files.
 const LIBRARY: &str = concat!("windhover ", env!("CARGO_PKG_VERSION"), " rosbag2");
 const METADATA_MARK: &str = "# made by windhover";
 
-/// The files of a bag, and what each says near its begin.
+/// The files of a bag, each with the text that identifies it near its start.
 pub const FILES: [(&str, &str); 2] = [(DATA, "rosbag2"), (METADATA, METADATA_MARK)];
 
-/// The quality of service of what does not change: kept for who comes late. Figures of time are ROS's "not limited".
+/// The quality of service of constant messages: kept for late subscribers. The times are ROS's value for "not limited".
 const LATCHED: &str = "\
 - history: keep_last
   depth: 1
@@ -49,7 +49,7 @@ struct Topic {
     messages: u32,
 }
 
-/// A bag in the making; both files stand in their places when it is finished.
+/// A bag being written; both files get their names when it is finished.
 pub struct Bag {
     out: PathBuf,
     writer: mcap::Writer<BufWriter<NewFile>>,
@@ -58,10 +58,10 @@ pub struct Bag {
 }
 
 impl Bag {
-    /// Begins a bag in the directory `out`.
+    /// Creates a bag in the directory `out`.
     ///
     /// # Errors
-    /// Its file cannot be made.
+    /// Its file cannot be created.
     pub fn create(out: &Path) -> Result<Self, WriteError> {
         let path = out.join(DATA);
         let file = NewFile::create(&path).map_err(|source| WriteError::Io { path, source })?;
@@ -105,10 +105,10 @@ impl Bag {
         Ok(self.writer.write_to_known_channel(&header, &record.data)?)
     }
 
-    /// Ends the bag; gives its files.
+    /// Ends the bag; returns its files.
     ///
     /// # Errors
-    /// What is left cannot be written.
+    /// The rest cannot be written.
     pub fn finish(mut self) -> Result<Vec<PathBuf>, WriteError> {
         let metadata = self.metadata();
         let (data, description) = (self.out.join(DATA), self.out.join(METADATA));

@@ -1,5 +1,5 @@
-//! Plain CDR, little endian, as ROS 2 serialises messages (OMG DDSI-RTPS 2.5, 10.2; XCDR version 1): every figure aligned to
-//! its own size from the begin of the body.
+//! Plain CDR, little endian, as ROS 2 serialises messages (OMG DDSI-RTPS 2.5, 10.2; XCDR version 1): every value
+//! aligned to its own size from the start of the body.
 
 /// Encapsulation header of little-endian plain CDR.
 const HEADER: [u8; 4] = [0, 1, 0, 0];
@@ -17,7 +17,7 @@ impl CdrWriter {
         self.0
     }
 
-    /// Pads so that what follows stands at a multiple of its size.
+    /// Pads to a multiple of the next value's size.
     fn align(&mut self, size: usize) {
         let body = self.0.len() - HEADER.len();
         self.0.resize(HEADER.len() + body.next_multiple_of(size), 0);
@@ -61,12 +61,13 @@ impl CdrWriter {
         values.iter().for_each(|value| self.f64(*value));
     }
 
-    /// The length of a sequence that follows. No message of ours comes near the limit.
+    /// The length of the sequence that follows. Our messages are far below the limit.
     pub(super) fn length(&mut self, length: usize) {
         self.u32(u32::try_from(length).expect("less than 4 GiB"));
     }
 
-    /// Length with the closing zero, text, zero. A zero inside would end it early for its reader: it is left out.
+    /// Length with the closing zero, text, zero. A zero inside the text would end it early for its reader, so it is
+    /// left out.
     pub(super) fn string(&mut self, text: &str) {
         let bytes = text.bytes().filter(|byte| *byte != 0);
         self.length(bytes.clone().count() + 1);

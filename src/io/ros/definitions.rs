@@ -1,12 +1,13 @@
-//! The types of ROS 2 that are written: names, hashes, definitions.
+//! The types of ROS 2 messages that are written: names, hashes, definitions.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
-/// Every type with what it is made of, `MSG: package/Name` before each.
+/// Every type with the types of its fields, `MSG: package/Name` before each.
 const DEFINITIONS: &str = include_str!("definitions.msg");
 
-/// One row a type: its package, its name, its hash (REP-2016, of the distribution Jazzy; every later one so far).
+/// One row for each type: its package, its name, its hash (REP-2016, of the distribution Jazzy; the same in every later
+/// one so far).
 macro_rules! types {
     ($($(#[$doc:meta])* $kind:ident: $package:literal, $name:literal, $hash:literal;)+) => {
         /// A type of message.
@@ -51,7 +52,7 @@ types! {
     Imu: "sensor_msgs", "Imu", "7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b";
     /// A compressed image.
     CompressedImage: "sensor_msgs", "CompressedImage", "15640771531571185e2efc8a100baf923961a4d15d5569652e6cb6691e8e371a";
-    /// An image.
+    /// An uncompressed image.
     Image: "sensor_msgs", "Image", "d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47";
     /// A lens.
     CameraInfo: "sensor_msgs", "CameraInfo", "b3dfd68ff46c9d56c80fd3bd4ed22c7a4ddce8c8348f2f59c299e73118e7e275";
@@ -59,14 +60,14 @@ types! {
     TfMessage: "tf2_msgs", "TFMessage", "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087";
     /// Markers in an image.
     AprilTagDetectionArray: "apriltag_msgs", "AprilTagDetectionArray", "6016bfe513a7c741ccbdbc6419ed6c4cabfe5f11271a96555fbf26565c6b9826";
-    /// How parts do.
+    /// State of the parts.
     DiagnosticArray: "diagnostic_msgs", "DiagnosticArray", "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e";
     /// A line of the log.
     Log: "rcl_interfaces", "Log", "e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac";
 }
 
 impl RosType {
-    /// Its definition and those of all it is made of, as bags hold them (encoding `ros2msg`).
+    /// Its definition and those of all types of its fields, as bags contain them (encoding `ros2msg`).
     pub fn definition(self) -> String {
         let mut written = BTreeSet::from([self.short_name()]);
         let mut waiting = vec![self.short_name()];

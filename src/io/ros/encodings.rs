@@ -22,7 +22,8 @@ pub fn frame_encoding(name: &str) -> FrameEncoding {
     row.map_or(FrameEncoding::Unknown, |(encoding, _)| *encoding)
 }
 
-/// The name of an encoding; `None` for what is compressed, or has none. Ten and twelve bits go in sixteen.
+/// The name of an encoding; `None` for compressed ones, and for those without a name. Ten and twelve bits are in
+/// sixteen.
 pub fn encoding_name(encoding: FrameEncoding) -> Option<&'static str> {
     let wide = match encoding {
         FrameEncoding::Y10 | FrameEncoding::Y12 => FrameEncoding::Y16,

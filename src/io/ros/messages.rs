@@ -1,5 +1,5 @@
-//! Messages of ROS 2 as values, and their CDR. Fields have ROS's names, units and frames (REP-103); only what is set here
-//! is a field, the rest is written as its default.
+//! Messages of ROS 2 as values, and their CDR. Fields have ROS's names, units and frames (REP-103); only fields that
+//! are set are here, the others are written with their defaults.
 
 use nalgebra::{UnitQuaternion, Vector3};
 
@@ -7,7 +7,7 @@ use super::RosType;
 use super::cdr::CdrWriter;
 use windhover_base::time::{MonoTime, NS_PER_S};
 
-/// What can be serialised.
+/// A message that can be serialised.
 pub trait RosMessage {
     /// Its type.
     const TYPE: RosType;
@@ -15,7 +15,7 @@ pub trait RosMessage {
     #[doc(hidden)]
     fn write(&self, cdr: &mut CdrBody<'_>);
 
-    /// The message in CDR, with its encapsulation header.
+    /// The body of a message being serialised.
     fn to_cdr(&self) -> Vec<u8> {
         let mut cdr = CdrWriter::new();
         self.write(&mut CdrBody(&mut cdr));
@@ -23,7 +23,7 @@ pub trait RosMessage {
     }
 }
 
-/// Where a message writes its fields.
+/// Seconds beyond ROS's 32 bits (after 2038) become the largest that fits.
 pub struct CdrBody<'a>(&'a mut CdrWriter);
 
 impl CdrBody<'_> {
@@ -51,14 +51,14 @@ impl CdrBody<'_> {
 /// `std_msgs/Header`
 #[derive(Clone, PartialEq, Debug)]
 pub struct Header {
-    /// When it was true, host time.
+    /// Time of validity, host time.
     pub stamp: MonoTime,
-    /// Frame of the figures.
+    /// Frame of the values.
     pub frame_id: String,
 }
 
 impl Header {
-    /// Of this instant, in this frame.
+    /// A header of this instant, in this frame.
     pub fn new(stamp: MonoTime, frame_id: impl Into<String>) -> Self {
         Self { stamp, frame_id: frame_id.into() }
     }
@@ -107,11 +107,11 @@ pub struct NavSatFix {
     pub header: Header,
     /// −1 no fix, 0 a fix, 2 a fix with carrier phases.
     pub status: i8,
-    /// Degrees; not a number where not known.
+    /// Degrees; NaN where not known.
     pub latitude: f64,
     /// Degrees.
     pub longitude: f64,
-    /// Above the ellipsoid, metres; not a number where not known.
+    /// Above the ellipsoid, metres; NaN where not known.
     pub altitude: f64,
     /// Of (east, north, up), row by row.
     pub position_covariance: [f64; 9],
@@ -123,7 +123,7 @@ impl RosMessage for NavSatFix {
     const TYPE: RosType = RosType::NavSatFix;
 
     fn write(&self, cdr: &mut CdrBody<'_>) {
-        /// `NavSatStatus::SERVICE_GPS`: which other systems took part is not known.
+        /// `NavSatStatus::SERVICE_GPS`: whether other systems took part is not known.
         const SERVICE_GPS: u16 = 1;
         cdr.header(&self.header);
         cdr.0.i8(self.status);
@@ -134,7 +134,7 @@ impl RosMessage for NavSatFix {
     }
 }
 
-/// `sensor_msgs/Imu`; the first term of a covariance is −1 where there are no such figures.
+/// `sensor_msgs/Imu`; the first term of a covariance is −1 where the values are absent.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Imu {
     /// Stamp, and the sensor's frame.
@@ -249,7 +249,7 @@ impl RosMessage for CameraInfo {
         cdr.0.length(self.d.len());
         cdr.0.f64s(&self.d);
         cdr.0.f64s(&self.k);
-        // One camera: nothing is turned to rectify it.
+        // One camera: no rotation for rectification.
         cdr.0.f64s(&[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
         cdr.0.f64s(&self.p);
         // No binning, the whole image.
@@ -311,7 +311,7 @@ pub struct AprilTag {
 pub struct AprilTagDetectionArray {
     /// Stamp of the image, and the camera's frame.
     pub header: Header,
-    /// What was seen.
+    /// The detections.
     pub detections: Vec<AprilTag>,
 }
 
@@ -325,7 +325,7 @@ impl RosMessage for AprilTagDetectionArray {
             cdr.0.string(&tag.family);
             cdr.0.i32(tag.id);
             cdr.0.i32(tag.hamming);
-            // Goodness, which the library gives no more.
+            // Goodness, which the library no longer provides.
             cdr.0.f32(0.0);
             cdr.0.f32(tag.decision_margin);
             cdr.0.f64s(&tag.centre);
@@ -335,8 +335,9 @@ impl RosMessage for AprilTagDetectionArray {
     }
 }
 
-/// Takes the square of corners (−1, 1), (1, 1), (1, −1), (−1, −1), in this order, to four pixels, row by row; zeros where
-/// three of them lie on a line (Heckbert 1989, §2.2.3, with its unit square moved to this one).
+/// The homography, row by row, that maps the square of corners (−1, 1), (1, 1), (1, −1), (−1, −1), in this order, to
+/// four pixels; zeros where three of them are on a line (Heckbert 1989, §2.2.3, with its unit square mapped to this
+/// one).
 fn homography(corners: &[[f64; 2]; 4]) -> [f64; 9] {
     let [p3, p2, p1, p0] = *corners;
     let (d1, d2) = ([p1[0] - p2[0], p1[1] - p2[1]], [p3[0] - p2[0], p3[1] - p2[1]]);
@@ -357,20 +358,20 @@ fn homography(corners: &[[f64; 2]; 4]) -> [f64; 9] {
 /// `diagnostic_msgs/DiagnosticStatus`
 #[derive(Clone, PartialEq, Debug)]
 pub struct DiagnosticStatus {
-    /// 0 well, 1 a warning, 2 an error, 3 old.
+    /// 0 OK, 1 a warning, 2 an error, 3 stale.
     pub level: u8,
     /// The part.
     pub name: String,
-    /// How it does.
+    /// Its state.
     pub message: String,
-    /// Figures by name.
+    /// Values by name.
     pub values: Vec<(String, String)>,
 }
 
 /// `diagnostic_msgs/DiagnosticArray`
 #[derive(Clone, PartialEq, Debug)]
 pub struct DiagnosticArray {
-    /// When.
+    /// Its time.
     pub header: Header,
     /// The parts.
     pub status: Vec<DiagnosticStatus>,
@@ -399,13 +400,13 @@ impl RosMessage for DiagnosticArray {
 /// `rcl_interfaces/Log`
 #[derive(Clone, PartialEq, Debug)]
 pub struct Log {
-    /// When.
+    /// Its time.
     pub stamp: MonoTime,
     /// 10 debug, 20 info, 30 warning, 40 error, 50 fatal.
     pub level: u8,
-    /// Of what.
+    /// Its source.
     pub name: String,
-    /// The words.
+    /// The message.
     pub message: String,
 }
 

@@ -16,16 +16,16 @@ pub use messages::{
 
 use windhover_base::time::MonoTime;
 
-/// A message on its way out, serialised.
+/// A serialised message to be written.
 #[derive(Clone, PartialEq, Debug)]
 pub struct RosRecord {
     /// Topic, with its leading slash.
     pub topic: String,
     /// Its type.
     pub kind: RosType,
-    /// When it was heard, host time.
+    /// Time of reception, host time.
     pub log_time: MonoTime,
-    /// When it was true, host time.
+    /// Time of validity, host time.
     pub publish_time: MonoTime,
     /// The message in CDR, with its encapsulation header.
     pub data: Vec<u8>,
@@ -43,7 +43,7 @@ impl RosRecord {
         Self { topic: topic.into(), kind: M::TYPE, log_time: log, publish_time: publish, data }
     }
 
-    /// Whether who subscribes late gets the last one still: what does not change while it flies.
+    /// Whether a late subscriber still gets the last message: for constant messages.
     pub fn is_latched(&self) -> bool {
         self.topic == "/tf_static"
     }

@@ -1,38 +1,40 @@
-//! Tells a wrong line speed by what arrives: text read at the wrong speed is not text, and holds no sound sentence.
+//! Detects a wrong line speed from the received bytes: text read at the wrong speed is not text, and has no valid
+//! sentence.
 
 use super::garmin::bodies;
 use windhover_decode::ubx_packets;
 
-/// Counts bytes that have no place in a text protocol, and looks for what only the right speed gives.
+/// Counts bytes that do not occur in a text protocol, and looks for valid sentences or packets, which only the right
+/// speed gives.
 #[derive(Debug, Default)]
 pub(super) struct TextShare {
     heard: Vec<u8>,
-    /// Windows without anything sound since the last that had something.
+    /// Windows without anything valid since the last that had something valid.
     unsound: u32,
-    /// Windows that mixed what is no text with something sound.
+    /// Windows with both binary bytes and something valid.
     mixed: u32,
 }
 
 /// Bytes judged at a time: about a second of NMEA at 4800 baud.
 const WINDOW: usize = 400;
-/// Share of odd bytes above which a window counts as garbled, percent. At half or double the line
-/// speed more than half of the bytes are odd; line noise spoils a few in a hundred.
+/// Share of non-text bytes above which a window counts as garbled, percent. At half or double the line speed more than
+/// half of the bytes are not text; line noise changes a few in a hundred.
 const GARBLED_PERCENT: usize = 25;
-/// Windows that a device which was understood may fill with binary packets of its own between two sentences:
-/// raw measurements of a second.
+/// Windows that a device with valid sentences may fill with its own binary packets between two sentences: raw
+/// measurements of a second.
 const UNSOUND_MAX: u32 = 20;
-/// Mixed windows from which on a device is known to mix: a burst of rubbish after good sentences makes one.
+/// Mixed windows from which on a device is known to send packets too: a burst of noise after good sentences makes one.
 const MIXES: u32 = 2;
-/// Longest that a packet or sentence over the end of a window is waited for.
+/// Longest wait for the rest of a packet or sentence at the end of a window.
 const KEPT: usize = 1_100;
 
 impl TextShare {
-    /// Takes bytes in; at the end of a window gives the share of odd bytes in percent where the window
-    /// is garbled. A device that mixes binary packets into its text is not: a sound sentence or packet
-    /// tells that the speed is right.
+    /// Adds bytes; at the end of a window returns the share of non-text bytes in percent where the window is garbled. A
+    /// device that mixes binary packets into its text is not garbled: a valid sentence or packet shows that the speed
+    /// is right.
     pub(super) fn garbled(&mut self, bytes: &[u8]) -> Option<usize> {
         self.heard.extend_from_slice(bytes);
-        // What may be a device of packets is looked at in pieces that hold a whole one.
+        // The bytes of a device that may send packets are examined in pieces that contain a whole one.
         let window = if self.heard.contains(&0xB5) { WINDOW + KEPT } else { WINDOW };
         if self.heard.len() < window {
             return None;
@@ -56,7 +58,7 @@ fn holds_a_sentence(bytes: &[u8]) -> bool {
     bodies(&String::from_utf8_lossy(bytes)).next().is_some()
 }
 
-/// Whether this is packets of a u-blox receiver: a whole one, or the marks of one beside a sound sentence.
+/// Whether these are packets of a u-blox receiver: a complete one, or the start of one beside a valid sentence.
 fn holds_packets(bytes: &[u8]) -> bool {
     let is_marked = bytes.windows(2).any(|pair| pair == [0xB5, 0x62]);
     is_marked && (ubx_packets(bytes).next().is_some() || holds_a_sentence(bytes))
@@ -92,7 +94,7 @@ mod tests {
         }
     }
 
-    /// A packet of u-blox with a payload that is no text.
+    /// A packet of u-blox with a binary payload.
     fn packet(length: u16) -> Vec<u8> {
         let payload: Vec<u8> = (0..length).map(|n| n.wrapping_mul(91) as u8).collect();
         ubx_framed(1, 7, &payload)
@@ -109,7 +111,7 @@ mod tests {
                     assert_eq!(share.garbled(read), None, "{packets} packets of {length}, {lines} lines");
                 }
             }
-            // The same line at a wrong speed after that is told, once it has lasted.
+            // A wrong speed of the same line afterwards is reported, once it has lasted.
             let noise: Vec<u8> =
                 (0..60_000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 13) as u8).collect();
             assert!(noise.chunks(61).any(|read| share.garbled(read).is_some()));

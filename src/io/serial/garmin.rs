@@ -1,4 +1,4 @@
-//! Configures a Garmin receiver over its line and checks what it answers.
+//! Configures a Garmin receiver over its line and checks its answers.
 //!
 //! Source: Garmin GPS 18x technical specifications, "Received NMEA 0183 sentences". An echo of a
 //! sentence means accepted; an echo with other values means refused.
@@ -16,7 +16,7 @@ const SENTENCES: [(&str, bool); 7] = [
     ("PGRMC1,1,1,1,,,,2", true),
     ("PGRMO,GPRMC,1", false),
     ("PGRMO,GPGGA,1", false),
-    // GSA alone tells a two-dimensional fix, whose GGA still carries an altitude.
+    // Only GSA reports a two-dimensional fix; its GGA still has an altitude.
     ("PGRMO,GPGSA,1", false),
     ("PGRMO,PGRME,1", false),
     ("PGRMO,PGRMV,1", false),
@@ -36,7 +36,7 @@ impl GarminSetup {
         Self { next: 0, asked: None, heard: Vec::new(), accepted: 0 }
     }
 
-    /// Takes in what the receiver sends.
+    /// Adds bytes that the receiver sent.
     pub(super) fn heard(&mut self, bytes: &[u8]) {
         const KEEP: usize = 2048;
         self.heard.extend_from_slice(bytes);
@@ -75,8 +75,8 @@ impl GarminSetup {
         self.asked = None;
     }
 
-    /// Whether the receiver echoed `body` (with more fields at its end is fine), with other values,
-    /// or not at all (`None`).
+    /// Whether the receiver echoed `body` (more fields at its end are accepted), with other values, or not at all
+    /// (`None`).
     fn answer(&self, body: &str) -> Option<bool> {
         let text = String::from_utf8_lossy(&self.heard);
         let name = body.split(',').next().unwrap_or(body);
@@ -89,12 +89,12 @@ impl GarminSetup {
     }
 }
 
-/// A sentence as it goes over the line.
+/// A sentence as it is sent.
 pub(super) fn sentence(body: &str) -> String {
     framed(body) + "\r\n"
 }
 
-/// Bodies of the sentences in a text whose checksums are right.
+/// Bodies of the sentences in a text with correct checksums.
 pub(super) fn bodies(text: &str) -> impl Iterator<Item = &str> {
     text.match_indices('$').filter_map(|(at, _)| {
         let rest = &text[at..];

@@ -1,29 +1,29 @@
-//! Brings a Garmin receiver to the line speed of the configuration: finds the speed it speaks, tells it the
-//! other, restarts it. One that was left in its binary mode answers no sentence: it is told to speak NMEA first.
+//! Brings a Garmin receiver to the line speed of the configuration: finds its present speed, sends the configured one,
+//! restarts it. A receiver in binary mode answers no sentence: it is switched to NMEA first.
 //!
 //! Source: Garmin GPS 18x technical specifications, "Sensor Configuration Information (PGRMC)": field 10 is
 //! the line speed, which takes effect after a reset (`PGRMI`, field 7 = R).
 
 use std::borrow::Cow;
 
+use super::dialogue::Dialogue;
 use super::garmin::{bodies, sentence};
-use super::talk::Talk;
 use crate::io::device::Fault;
 
-/// Speeds a receiver may speak and their codes in PGRMC, factory settings first.
+/// Speeds that a receiver may have and their codes in PGRMC, factory settings first.
 const SPEEDS: [(u32, u8); 4] = [(19_200, 5), (4_800, 3), (38_400, 8), (9_600, 4)];
 
-/// Asks for the present configuration: also a receiver whose sentences are all off answers.
+/// Queries the present configuration: a receiver also answers when all its sentences are off.
 const QUERY: &str = "PGRMCE";
 
-/// Ends the binary mode: Garmin's packet 10 (line command) that asks for NMEA, between its frame's bytes.
+/// Ends the binary mode: Garmin's packet 10 (line command) that requests NMEA, with its frame bytes.
 const SPEAK_NMEA: [u8; 8] = [0x10, 0x0A, 0x02, 0x26, 0x00, 0xCE, 0x10, 0x03];
 
 /// Restarts the receiver.
 const RESET: &str = "PGRMI,,,,,,,R";
 
-/// Leaves the line at the configured speed, and the receiver too where it can be brought there.
-pub(super) async fn settle(mut talk: Talk<'_>) -> Result<(), Fault> {
+/// Sets the line, and where possible the receiver, to the configured speed.
+pub(super) async fn settle(mut talk: Dialogue<'_>) -> Result<(), Fault> {
     let wanted = talk.settings.baud;
     if speaks(&mut talk).await? {
         return Ok(());
@@ -39,16 +39,16 @@ pub(super) async fn settle(mut talk: Talk<'_>) -> Result<(), Fault> {
         send(&mut talk, &format!("PGRMC,,,,,,,,,,{code}")).await?;
         let heard = talk.listen(|bytes| answered(&text(bytes), code)).await?;
         send(&mut talk, RESET).await?;
-        // Its echo still comes at the old speed; the new one holds after the reset.
+        // The echo still has the old speed; the new one takes effect after the reset.
         talk.listen(|bytes| bodies(&text(bytes)).any(|body| body.starts_with("PGRMI"))).await?;
-        talk.note(heard, format!("the receiver spoke at {speed} baud and was told to speak at {wanted}"));
+        talk.note(heard, format!("the receiver used {speed} baud and was set to {wanted}"));
         break;
     }
     talk.line.set_speed(wanted).await
 }
 
-/// Whether sentences arrive at the line's present speed, also after the way out of binary mode.
-async fn speaks(talk: &mut Talk<'_>) -> Result<bool, Fault> {
+/// Whether sentences arrive at the line's present speed, also after leaving binary mode.
+async fn speaks(talk: &mut Dialogue<'_>) -> Result<bool, Fault> {
     send(talk, QUERY).await?;
     if talk.listen(|bytes| holds_a_sentence(&text(bytes))).await? {
         return Ok(true);
@@ -57,12 +57,12 @@ async fn speaks(talk: &mut Talk<'_>) -> Result<bool, Fault> {
     send(talk, QUERY).await?;
     let speaks = talk.listen(|bytes| holds_a_sentence(&text(bytes))).await?;
     if speaks {
-        talk.note(true, "the receiver was in binary mode and was told to speak NMEA".to_owned());
+        talk.note(true, "the receiver was in binary mode and was switched to NMEA".to_owned());
     }
     Ok(speaks)
 }
 
-async fn send(talk: &mut Talk<'_>, body: &str) -> Result<(), Fault> {
+async fn send(talk: &mut Dialogue<'_>, body: &str) -> Result<(), Fault> {
     talk.send(sentence(body).as_bytes()).await
 }
 

@@ -1,4 +1,4 @@
-//! An open line, waited for by readiness.
+//! An open line, read when it is ready.
 
 use std::io::{ErrorKind as IoKind, Read, Write};
 use std::path::Path;
@@ -20,18 +20,18 @@ const WRITING: Duration = Duration::from_millis(100);
 // SAFETY: a port owns its descriptor and closes it when it is dropped.
 unsafe impl OwnsDescriptor for TTYPort {}
 
-/// A line that this program alone has open.
+/// A line that only this program has open.
 #[derive(Debug)]
 pub(in crate::io) struct Line {
     device: String,
-    /// Empty where it is on the network, and while the port is on a thread for work that blocks.
+    /// Empty for a network address, and while the port is on a thread for blocking work.
     port: Option<Opened<AsyncFd<TTYPort>>>,
     network: Option<Network>,
 }
 
 impl Line {
-    /// Opens the line for this program alone. A device that is busy, missing, forbidden or no serial
-    /// line is told apart.
+    /// Opens the line exclusively. The error distinguishes a busy, missing or forbidden device and one that is not a
+    /// serial line.
     pub(in crate::io) async fn open(settings: &SerialSettings) -> Result<Self, Fault> {
         let SerialSettings { device, baud, framing, .. } = settings.clone();
         if is_network(&device) {
@@ -51,7 +51,7 @@ impl Line {
         }
     }
 
-    /// Waits for bytes and reads them; how many. Nothing is lost where the future is dropped.
+    /// Waits for bytes and reads them; returns how many. Nothing is lost where the future is dropped.
     pub(in crate::io) async fn read(&mut self, buffer: &mut [u8]) -> Result<usize, Fault> {
         if let Some(network) = &mut self.network {
             return network.read(&self.device, buffer).await;
@@ -95,7 +95,7 @@ impl Line {
         }
     }
 
-    /// Changes the line's speed once what was written has been sent at the old one; what had arrived is dropped.
+    /// Changes the line's speed after all output was sent at the old one; received bytes are dropped.
     pub(super) async fn set_speed(&mut self, baud: u32) -> Result<(), Fault> {
         use serialport::SerialPort as _;
         let lost = || unplugged(&self.device);
@@ -113,14 +113,14 @@ impl Line {
 
     fn register(&mut self, port: TTYPort) -> Result<(), Fault> {
         let port = register(port, Interest::READABLE | Interest::WRITABLE).map_err(|error| {
-            Fault::new(FaultKind::Unsuitable, &self.device, format!("cannot be waited for: {error}"))
+            Fault::new(FaultKind::Unsuitable, &self.device, format!("cannot be polled: {error}"))
         })?;
         self.port = Some(Opened::new(port));
         Ok(())
     }
 }
 
-/// The library waits for its time-out, which is zero here, where another program would see `EAGAIN`.
+/// The library waits for its time-out, which is zero here, where another program would get `EAGAIN`.
 fn not_ready(error: std::io::Error) -> std::io::Error {
     if error.kind() == IoKind::TimedOut { IoKind::WouldBlock.into() } else { error }
 }
@@ -129,7 +129,7 @@ fn open(device: &str, baud: u32, framing: Framing) -> Result<TTYPort, Fault> {
     if baud == 0 {
         return Err(Fault::new(FaultKind::Unsuitable, device, "line speed 0 hangs up; set baud"));
     }
-    // The serial library folds several errors into one; the plain system calls tell them apart.
+    // The serial library has one error for several causes; the system calls distinguish them.
     std::fs::metadata(device).map_err(|e| Fault::from_io(device, &e))?;
     let data_bits = if framing.data_bits == 7 { DataBits::Seven } else { DataBits::Eight };
     let stop_bits = if framing.stop_bits == 2 { StopBits::Two } else { StopBits::One };
@@ -147,10 +147,10 @@ fn fault_from_open(device: &str, baud: u32, error: &serialport::Error) -> Fault 
     use serialport::ErrorKind;
     match error.kind() {
         ErrorKind::NoDevice => {
-            Fault::new(FaultKind::Busy, device, "another program holds the port; stop that program")
+            Fault::new(FaultKind::Busy, device, "another program uses the port; stop that program")
         }
         ErrorKind::Io(IoKind::NotFound) => {
-            Fault::new(FaultKind::Missing, device, "not there; is it plugged in?")
+            Fault::new(FaultKind::Missing, device, "does not exist; is it plugged in?")
         }
         ErrorKind::Io(IoKind::PermissionDenied) => Fault::new(
             FaultKind::Denied,
@@ -158,10 +158,10 @@ fn fault_from_open(device: &str, baud: u32, error: &serialport::Error) -> Fault 
             "permission denied; add this user to the group that owns it (dialout)",
         ),
         _ if !Path::new(device).exists() => {
-            Fault::new(FaultKind::Missing, device, "not there; is it plugged in?")
+            Fault::new(FaultKind::Missing, device, "does not exist; is it plugged in?")
         }
         ErrorKind::InvalidInput => {
-            Fault::new(FaultKind::Unsuitable, device, format!("{error}; does it do {baud} baud?"))
+            Fault::new(FaultKind::Unsuitable, device, format!("{error}; is {baud} baud possible?"))
         }
         _ => Fault::new(FaultKind::Failed, device, format!("cannot be opened as a serial line: {error}")),
     }

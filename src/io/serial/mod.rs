@@ -1,12 +1,12 @@
-//! One line as a task: open, wait for bytes, report them, and open again when the line went away. It may be a
-//! serial line, a connection (`tcp://HOST:PORT`, gpsd too) or a port that listens (`udp://ADDRESS:PORT`).
+//! One line as a task: open, wait for bytes, report them, and reopen when the line disappeared. It may be a serial
+//! line, a connection (`tcp://HOST:PORT`, also to gpsd) or a listening port (`udp://ADDRESS:PORT`).
 
 mod garbled;
 mod garmin;
 mod garmin_speed;
 mod line;
 mod network;
-mod talk;
+mod dialogue;
 mod ublox;
 mod ublox_speed;
 
@@ -15,27 +15,27 @@ use std::time::Duration;
 
 use super::clock::HostClock;
 use super::device::{Backoff, Fault, FaultKind, NoteKind, Report, Reports, wait_for};
+use dialogue::Dialogue;
 use garbled::TextShare;
 use garmin::GarminSetup;
 pub(super) use line::Line;
-use talk::Talk;
 use ublox::UbloxSetup;
 use windhover_base::settings::Framing;
 use windhover_base::time::{MonoTime, Span};
 
-/// What a line is and how it is set.
+/// A line and its settings.
 #[derive(Clone, PartialEq, Debug)]
 pub struct SerialSettings {
-    /// Path of the device, or its address on the network; opened anew by this name each time, so a `by-id` path
-    /// survives renumbering.
+    /// Path of the device, or its address on the network; reopened by this name each time, so a `by-id` path survives
+    /// renumbering.
     pub device: String,
     /// Line speed, bits a second.
     pub baud: u32,
-    /// Whether what arrives is text: then bytes that are not tell of a wrong line speed.
+    /// Whether the protocol is text: then other bytes indicate a wrong line speed.
     pub text: bool,
     /// Data bits, parity and stop bits.
     pub framing: Framing,
-    /// How what is at its other end is configured each time the line is opened.
+    /// How the receiver at the other end is configured each time the line is opened.
     pub setup: Option<Setup>,
 }
 
@@ -44,22 +44,22 @@ pub struct SerialSettings {
 pub enum Setup {
     /// A Garmin receiver.
     Garmin,
-    /// A u-blox receiver: so many solutions a second, its sentences off unless they are kept.
+    /// A u-blox receiver: its rate of solutions; its NMEA sentences are switched off unless they are kept.
     Ublox {
         /// Solutions a second.
         rate_hz: f64,
-        /// Whether sentences stay as they are.
+        /// Whether NMEA sentences stay as they are.
         keep_text: bool,
     },
 }
 
-/// Bytes one read can return; a line at 2 Mbit/s fills it in 20 ms.
+/// Most bytes of one read; a line at 2 Mbit/s fills it in 20 ms.
 const READ_BYTES: usize = 4096;
 
-/// How long a receiver has to answer what configures it.
+/// How long a receiver has to answer its configuration.
 const ANSWER: Span = Span::from_ns(1_500_000_000);
 
-/// Reads the line for ever; dropping the future closes it.
+/// Reads the line without end; dropping the future closes it.
 pub async fn run(settings: &SerialSettings, clock: HostClock, reports: Reports<'_>) -> Infallible {
     let mut backoff = Backoff::new();
     loop {
@@ -84,7 +84,7 @@ pub async fn run(settings: &SerialSettings, clock: HostClock, reports: Reports<'
     }
 }
 
-/// An open line and what is needed to read it.
+/// An open line and the state for reading it.
 struct Reader<'a> {
     line: Line,
     settings: &'a SerialSettings,
@@ -98,7 +98,7 @@ impl Reader<'_> {
         let mut setup = None;
         if let Some(kind) = self.settings.setup {
             let (settings, clock, reports) = (self.settings, self.clock, self.reports);
-            let talk = Talk { line: &mut self.line, settings, clock, reports };
+            let talk = Dialogue { line: &mut self.line, settings, clock, reports };
             setup = Some(match kind {
                 Setup::Garmin => {
                     garmin_speed::settle(talk).await?;
@@ -138,20 +138,22 @@ impl Reader<'_> {
         tokio::time::timeout(left, read).await.ok().transpose()
     }
 
-    /// Reports where text that arrives is no text.
+    /// Reports received bytes that are not text on a text line.
     fn judge(&self, share: &mut TextShare, bytes: &[u8]) {
         if self.settings.text
             && !network::is_network(&self.settings.device)
             && let Some(percent) = share.garbled(bytes)
         {
             let (device, baud) = (&self.settings.device, self.settings.baud);
-            let text =
-                format!("{percent} % of what {device} sends is no text; is its line speed {baud} baud?");
+            let text = format!(
+                "{percent} % of the bytes from {device} are not text; is its line speed {baud} baud?"
+            );
             (self.reports)(Report::Note(NoteKind::Garbled, 1, text));
         }
     }
 
-    /// Goes on with a receiver's configuration; until when its answer is waited for, `None` where it is through.
+    /// Continues a receiver's configuration; returns the time limit of its answer, `None` where the configuration has
+    /// ended.
     async fn configure(&mut self, setup: &mut Running) -> Result<Option<MonoTime>, Fault> {
         loop {
             let note = match setup.due(self.clock.now()) {
@@ -171,20 +173,20 @@ impl Reader<'_> {
     }
 }
 
-/// What to do now to configure a receiver.
+/// The next step in configuring a receiver.
 #[derive(Clone, PartialEq, Eq, Debug)]
 enum Step {
-    /// Nothing until the receiver answers, or until this time.
+    /// Wait until the receiver answers, or until this time.
     Wait(MonoTime),
-    /// Write this.
+    /// Write these bytes.
     Send(Vec<u8>),
-    /// All done: so many settings were accepted.
+    /// Complete: this many settings were accepted.
     Accepted(u32),
     /// The receiver refused or ignored a setting.
     Refused(String),
 }
 
-/// A configuration that goes on.
+/// A configuration in progress.
 enum Running {
     Garmin(GarminSetup),
     Ublox(UbloxSetup),
@@ -212,7 +214,7 @@ fn left(limit: MonoTime, clock: HostClock) -> Duration {
 }
 
 fn unplugged(device: &str) -> Fault {
-    Fault::new(FaultKind::Unplugged, device, "the line went away; waiting for it to come back")
+    Fault::new(FaultKind::Unplugged, device, "the line disappeared; waiting for it to return")
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! A line that is no serial line: a receiver or compass behind TCP or UDP, or gpsd.
+//! A line that is not a serial line: a receiver or compass over TCP or UDP, or gpsd.
 
 use std::io::ErrorKind;
 use std::net::SocketAddr;
@@ -11,20 +11,20 @@ use tokio::time::timeout;
 use super::unplugged;
 use crate::io::device::{Fault, FaultKind};
 
-/// Longest that a connection may take to come about.
+/// Longest time to connect.
 const CONNECTING: Duration = Duration::from_secs(5);
-/// A peer that sends nothing for so long is gone: the connection is made anew.
+/// After this silence of a peer the connection is made again.
 const SILENT: Duration = Duration::from_secs(30);
-/// Longest that bytes may take to be accepted.
+/// Longest time until bytes are accepted.
 const WRITING: Duration = Duration::from_secs(1);
-/// What gpsd says first, and what it is asked for: the sentences of its devices.
+/// gpsd's first message, and the request to it: the sentences of its devices.
 const GPSD_HELLO: &[u8] = br#"{"class":"VERSION""#;
 const GPSD_WATCH: &[u8] = b"?WATCH={\"enable\":true,\"json\":false,\"nmea\":true};\n";
 
 /// A device on the network.
 #[derive(Debug)]
 pub(super) enum Network {
-    /// Connected to a server; whether nothing was heard yet.
+    /// Connected to a server; whether nothing was received yet.
     Tcp(TcpStream, bool),
     /// Bound to a port of this machine.
     Udp(UdpSocket),
@@ -50,13 +50,13 @@ impl Network {
         Ok(Self::Udp(UdpSocket::bind(&addresses[..]).await.map_err(fault)?))
     }
 
-    /// Waits for bytes and reads them; how many. Nothing is lost where the future is dropped.
+    /// Waits for bytes and reads them; returns how many. Nothing is lost where the future is dropped.
     pub(super) async fn read(&mut self, device: &str, buffer: &mut [u8]) -> Result<usize, Fault> {
         let lost = |error: std::io::Error| refused(device, &error);
         match self {
             Self::Tcp(stream, is_new) => {
                 let Ok(read) = timeout(SILENT, stream.read(buffer)).await else {
-                    let words = format!("nothing came for {} s; connecting anew", SILENT.as_secs());
+                    let words = format!("nothing was received for {} s; reconnecting", SILENT.as_secs());
                     return Err(Fault::new(FaultKind::Frozen, device, words));
                 };
                 match read.map_err(lost)? {
@@ -73,7 +73,7 @@ impl Network {
                 match socket.recv(buffer).await {
                     Ok(0) => {}
                     Ok(count) => return Ok(count),
-                    // An answer to something sent before, of a peer that is not there.
+                    // An error for an earlier datagram, from a peer that does not exist.
                     Err(error) if error.kind() == ErrorKind::ConnectionRefused => {}
                     Err(error) => return Err(lost(error)),
                 }
@@ -81,7 +81,7 @@ impl Network {
         }
     }
 
-    /// Writes bytes to a server; a port that only listens has nobody to write to.
+    /// Writes bytes to a server; a listening port has no peer to write to.
     pub(super) async fn write(&mut self, device: &str, bytes: &[u8]) -> Result<(), Fault> {
         let Self::Tcp(stream, _) = self else { return Ok(()) };
         match timeout(WRITING, stream.write_all(bytes)).await {
@@ -93,13 +93,15 @@ impl Network {
 
 fn refused(device: &str, error: &std::io::Error) -> Fault {
     let (kind, words) = match error.kind() {
-        ErrorKind::ConnectionRefused => (FaultKind::Missing, "nothing listens there; is its server running?"),
+        ErrorKind::ConnectionRefused => {
+            (FaultKind::Missing, "no program listens there; is its server running?")
+        }
         ErrorKind::TimedOut | ErrorKind::HostUnreachable | ErrorKind::NetworkUnreachable => {
-            (FaultKind::Missing, "no answer from there; is the network up?")
+            (FaultKind::Missing, "there is no answer; is the network up?")
         }
         ErrorKind::AddrInUse => (FaultKind::Busy, "another program listens on this port; stop that program"),
         ErrorKind::AddrNotAvailable => {
-            (FaultKind::Unsuitable, "is no address of this machine; use udp://0.0.0.0:PORT")
+            (FaultKind::Unsuitable, "is not an address of this machine; use udp://0.0.0.0:PORT")
         }
         ErrorKind::ConnectionReset | ErrorKind::BrokenPipe => return unplugged(device),
         _ => return Fault::new(FaultKind::Failed, device, error.to_string()),

@@ -1,4 +1,4 @@
-//! The line over pseudo-terminals: what arrives, what goes away, what comes back.
+//! The line over pseudo-terminals: bytes, disappearance and return of the device.
 
 use std::fs::File;
 use std::io::{Read, Write};
@@ -54,7 +54,7 @@ impl Line {
         Self { reports, stop, thread: Some(thread) }
     }
 
-    /// The first report that `wanted` takes, within three seconds.
+    /// The first report that `wanted` accepts, within three seconds.
     fn wait<T>(&self, wanted: impl Fn(Report) -> Option<T>) -> T {
         for _ in 0..300 {
             if let Ok(report) = self.reports.recv_timeout(Duration::from_millis(100))
@@ -79,7 +79,7 @@ impl Drop for Line {
     fn drop(&mut self) {
         self.stop.cancel();
         if let Some(thread) = self.thread.take() {
-            thread.join().expect("the line's thread ends by itself");
+            thread.join().expect("the line's thread ended");
         }
     }
 }
@@ -91,20 +91,20 @@ fn bytes_arrive_and_a_lost_line_comes_back() {
     let (mut far, name) = pty();
     std::os::unix::fs::symlink(&name, &link).expect("linked");
 
-    // Given a line by a stable name, when bytes are sent, then they are told.
+    // Given a line by a stable name, when bytes are sent, then they are reported.
     let line = Line::start(&link.to_string_lossy(), false);
     line.up();
     far.write_all(b"$GPRMC").expect("sent");
     let heard = line.wait(|r| if let Report::Bytes(_, bytes) = r { Some(bytes) } else { None });
     assert_eq!(heard, b"$GPRMC");
 
-    // When the far end goes away, then it is unplugged, then missing.
+    // When the far end disappears, then the fault is unplugged, then missing.
     std::fs::remove_file(&link).expect("unlinked");
     drop(far);
     assert_eq!(line.fault().kind, FaultKind::Unplugged);
     assert_eq!(line.fault().kind, FaultKind::Missing);
 
-    // When it comes back under another number, then it is used again.
+    // When it returns under another number, then it is used again.
     let (mut far, name) = pty();
     std::os::unix::fs::symlink(&name, &link).expect("linked");
     line.up();
@@ -141,7 +141,7 @@ fn noise_tells_of_a_wrong_speed() {
     assert!(text.contains("38400 baud"), "{text}");
 }
 
-/// What arrives at the far end of a line, read by a thread of its own.
+/// The bytes that arrive at the far end of a line, read by a separate thread.
 fn received_at(far: &File) -> Receiver<Vec<u8>> {
     let mut reader = far.try_clone().expect("a second handle");
     let (sender, received) = channel();
@@ -156,13 +156,13 @@ fn received_at(far: &File) -> Receiver<Vec<u8>> {
     received
 }
 
-/// The speed at which a line is driven, bits/s; zero where it cannot be known.
+/// The present speed of a line, bits/s; zero where it cannot be known.
 fn speed(line: &File) -> u32 {
     rustix::termios::tcgetattr(line).map_or(0, |line| line.output_speed())
 }
 
-/// A Garmin receiver at the far end of a line, which is deaf and speaks noise at any speed but its own. In its
-/// binary mode it knows packets only.
+/// A Garmin receiver at the far end of a line, which receives nothing and sends noise at any speed but its own. In
+/// binary mode it handles packets only.
 fn garmin_at(mut far: File, mut own: u32, mut binary: bool) {
     let asked = received_at(&far);
     std::thread::spawn(move || {
@@ -203,7 +203,7 @@ fn garmin_at(mut far: File, mut own: u32, mut binary: bool) {
     });
 }
 
-/// What a receiver's configuration came to.
+/// The result of a receiver's configuration.
 fn configured(report: Report) -> Option<String> {
     match report {
         Report::Note(NoteKind::Configured, _, text) => Some(text),
@@ -218,7 +218,7 @@ fn a_receiver_at_another_speed_is_brought_to_the_configured_one() {
     let line = Line::start(&name, true);
     line.up();
     let text = line.wait(configured);
-    assert!(text.contains("spoke at 19200 baud"), "{text}");
+    assert!(text.contains("used 19200 baud"), "{text}");
     assert_eq!(line.wait(configured), "7 settings accepted", "then it is configured at the new speed");
     line.wait(|r| matches!(r, Report::Bytes(_, bytes) if bytes.starts_with(b"$GPRMC")).then_some(()));
 }
@@ -234,7 +234,7 @@ fn a_receiver_left_in_binary_mode_is_told_to_speak_nmea() {
     line.wait(|r| matches!(r, Report::Bytes(_, bytes) if bytes.starts_with(b"$GPRMC")).then_some(()));
 }
 
-/// A u-blox receiver at the far end of a line, at its own speed. Of keys, or of messages and ports.
+/// A u-blox receiver at the far end of a line, at its own speed; configured by keys, or by messages and ports.
 fn ublox_at(mut far: File, mut own: u32, has_keys: bool) {
     let asked = received_at(&far);
     std::thread::spawn(move || {
@@ -282,13 +282,13 @@ fn a_ublox_receiver_is_found_and_configured() {
     for (line, settings) in lines {
         line.up();
         let text = line.wait(configured);
-        assert!(text.contains("spoke at 9600 baud"), "{text}");
+        assert!(text.contains("used 9600 baud"), "{text}");
         assert_eq!(line.wait(configured), format!("{settings} accepted"));
         line.wait(|r| matches!(r, Report::Bytes(_, bytes) if bytes.starts_with(&[0xB5, 0x62])).then_some(()));
     }
 }
 
-/// A pseudo-terminal has eight data bits whatever is asked of it, and keeps the rest.
+/// A pseudo-terminal always has eight data bits, and keeps the other settings.
 #[test]
 fn a_line_is_framed_as_configured() {
     use rustix::termios::ControlModes;
@@ -306,7 +306,7 @@ fn a_line_is_framed_as_configured() {
     }
 }
 
-/// What a line hears, in one piece.
+/// The bytes that a line reports, in one piece.
 fn heard(line: &Line, count: usize) -> Vec<u8> {
     let mut all = Vec::new();
     while all.len() < count {
@@ -332,7 +332,7 @@ fn a_device_behind_tcp_is_read_and_connected_anew() {
     assert_eq!(heard(&line, 5), b"again");
     drop((peer, server));
     assert_eq!(line.fault().kind, FaultKind::Unplugged);
-    assert_eq!(line.fault().kind, FaultKind::Missing, "nothing listens there any more");
+    assert_eq!(line.fault().kind, FaultKind::Missing, "no program listens there any more");
 }
 
 #[test]

@@ -1,9 +1,9 @@
-//! Configures a u-blox receiver over its line and checks what it acknowledges.
+//! Configures a u-blox receiver over its line and checks its acknowledgements.
 //!
-//! From the ninth generation on a setting is a key and a value (UBX-CFG-VALSET), refused as a whole where one key is not known:
-//! ports differ between modules, so each has a packet of its own and one of them must be taken. Before, UBX-CFG-RATE and
-//! UBX-CFG-MSG, of the port they come over. Everything goes to the receiver's volatile memory. Source: u-blox's interface
-//! descriptions.
+//! From the ninth generation on a setting is a key and a value (UBX-CFG-VALSET). A packet is refused as a whole where
+//! one of its keys is not known. Ports differ between modules, so each port has its own packet, and one of them must be
+//! accepted. Older receivers use UBX-CFG-RATE and UBX-CFG-MSG, for the port over which they arrive. All settings go to
+//! the receiver's volatile memory. Source: u-blox's interface descriptions.
 
 use super::{ANSWER, Step};
 use windhover_base::time::MonoTime;
@@ -31,14 +31,14 @@ const PORTS: [[u32; 5]; 3] = [
     [0x1078_0001, 0x1078_0002, 0x2091_0009, 0x2091_0086, 0x2091_0090],
 ];
 
-/// What it takes of the receiver.
+/// Whether the receiver must accept a packet.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 enum Need {
-    /// Must be taken.
+    /// It must be accepted.
     Must,
-    /// One of several in a row must be taken.
+    /// One of several consecutive ones must be accepted.
     OneOf,
-    /// May be refused: not every receiver has it.
+    /// It may be refused: not every receiver has the setting.
     May,
 }
 
@@ -56,13 +56,13 @@ struct Request {
 pub(super) struct UbloxSetup {
     rate_hz: f64,
     keep_text: bool,
-    /// Whether it takes keys; the ways of older receivers follow where not.
+    /// Whether it accepts keys; otherwise the messages of older receivers follow.
     has_keys: bool,
     requests: std::vec::IntoIter<Request>,
     asked: Option<(Request, MonoTime)>,
     heard: Vec<u8>,
     accepted: u32,
-    /// Of several of which one must be taken: whether one was.
+    /// For a group of which one must be accepted: whether one was.
     one_of: Option<(bool, &'static str)>,
 }
 
@@ -73,7 +73,7 @@ impl UbloxSetup {
         Self { rate_hz, keep_text, has_keys: true, requests, asked, heard, accepted: 0, one_of }
     }
 
-    /// Takes in what the receiver sends.
+    /// Adds bytes that the receiver sent.
     pub(super) fn heard(&mut self, bytes: &[u8]) {
         const KEEP: usize = 4096;
         self.heard.extend_from_slice(bytes);
@@ -113,13 +113,13 @@ impl UbloxSetup {
         }
     }
 
-    /// The next packet, or the end; `None` where a choice that was made is to be looked at first.
+    /// The next packet, or the end; `None` where the result of a group has to be checked first.
     fn ask(&mut self, now: MonoTime) -> Option<Step> {
         let next = self.requests.next();
         if next.as_ref().is_none_or(|next| next.need != Need::OneOf)
             && let Some((false, what)) = self.one_of.take()
         {
-            return Some(Step::Refused(format!("no port of the receiver takes {what}")));
+            return Some(Step::Refused(format!("no port of the receiver accepts {what}")));
         }
         let Some(request) = next else { return Some(Step::Accepted(self.accepted)) };
         let packet = ubx_framed(CFG, request.identity, &request.payload);
@@ -128,7 +128,7 @@ impl UbloxSetup {
         Some(Step::Send(packet))
     }
 
-    /// Whether the packet just sent was acknowledged, or refused.
+    /// Whether the last packet was acknowledged or refused.
     fn answer(&self, identity: u8) -> Option<bool> {
         let of = |(class, id, payload): (u8, u8, &[u8])| {
             (class == ACK && payload.starts_with(&[CFG, identity])).then_some(id == 1)
@@ -145,7 +145,7 @@ fn period_ms(rate_hz: f64) -> u16 {
 /// By keys: the rate, then each port.
 fn by_keys(rate_hz: f64, keep_text: bool) -> Vec<Request> {
     let valset = |pairs: &[(u32, &[u8])], need, what| {
-        // Version, volatile memory, two bytes to spare.
+        // Version, volatile memory, two reserved bytes.
         let mut payload = vec![0, 1, 0, 0];
         for (key, value) in pairs {
             payload.extend_from_slice(&key.to_le_bytes());
@@ -168,7 +168,7 @@ fn by_keys(rate_hz: f64, keep_text: bool) -> Vec<Request> {
     all
 }
 
-/// By messages of the port that is spoken over.
+/// By messages for the present port.
 fn by_messages(rate_hz: f64, keep_text: bool) -> Vec<Request> {
     let message = |(class, identity): (u8, u8), rate: u8, need, what| Request {
         identity: CFG_MSG,
@@ -177,7 +177,7 @@ fn by_messages(rate_hz: f64, keep_text: bool) -> Vec<Request> {
         what,
     };
     let mut rate = period_ms(rate_hz).to_le_bytes().to_vec();
-    // A solution to each measurement, of UTC.
+    // One solution for each measurement, in UTC.
     rate.extend([1, 0, 0, 0]);
     let mut all = vec![
         Request { identity: CFG_RATE, payload: rate, need: Need::Must, what: "the rate" },
@@ -197,7 +197,7 @@ mod tests {
     use super::*;
     use windhover_base::time::Span;
 
-    /// Runs the setup against a receiver that answers a packet's identity and payload with yes, no or nothing.
+    /// Runs the setup against a receiver that answers a packet's identity and payload with yes, no or not at all.
     fn run(keep_text: bool, answer: impl Fn(u8, &[u8]) -> Option<bool>) -> (Step, Vec<Vec<u8>>) {
         let (mut setup, mut sent) = (UbloxSetup::new(5.0, keep_text), Vec::new());
         for pass in 0..2_000 {
@@ -206,7 +206,7 @@ mod tests {
                 Step::Send(packet) => {
                     let (class, identity, payload) = ubx_packets(&packet).next().expect("a packet");
                     assert_eq!(class, CFG);
-                    // Between solutions, in two reads, after an answer that is not to this.
+                    // Between solutions, in two reads, after an answer to another packet.
                     setup.heard(&ubx_framed(1, 7, &[0; 92]));
                     setup.heard(&ubx_framed(ACK, 1, &[CFG, 0x77]));
                     if let Some(yes) = answer(identity, payload) {

@@ -1,24 +1,25 @@
-//! Brings a u-blox receiver to the line speed of the configuration: finds the speed it speaks and tells it the other.
+//! Brings a u-blox receiver to the line speed of the configuration: finds its present speed and sends the configured
+//! one.
 //!
-//! Over USB any speed is the right one. Source: u-blox's interface descriptions (UBX-CFG-VALSET from the ninth generation on,
-//! UBX-CFG-PRT before).
+//! Over USB any speed is the right one. Source: u-blox's interface descriptions (UBX-CFG-VALSET from the ninth
+//! generation on, UBX-CFG-PRT for older ones).
 
+use super::dialogue::Dialogue;
 use super::garmin::bodies;
-use super::talk::Talk;
 use crate::io::device::Fault;
 use windhover_decode::{ubx_framed, ubx_packets};
 
-/// Speeds a receiver may speak, factory settings first.
+/// Speeds that a receiver may have, factory settings first.
 const SPEEDS: [u32; 8] = [9_600, 38_400, 115_200, 57_600, 230_400, 460_800, 921_600, 19_200];
 /// Class of acknowledgements.
 const ACK: u8 = 0x05;
-/// Asks for the version: also a receiver whose output is all off answers.
+/// Queries the version: a receiver also answers when all its output is off.
 const MON_VER: (u8, u8) = (0x0A, 0x04);
 /// Key of the first serial port's speed.
 const KEY_UART1_BAUDRATE: u32 = 0x4052_0001;
 
-/// Leaves the line at the configured speed, and the receiver too where it can be brought there.
-pub(super) async fn settle(mut talk: Talk<'_>) -> Result<(), Fault> {
+/// Sets the line, and where possible the receiver, to the configured speed.
+pub(super) async fn settle(mut talk: Dialogue<'_>) -> Result<(), Fault> {
     let wanted = talk.settings.baud;
     if speaks(&mut talk).await? {
         return Ok(());
@@ -40,14 +41,14 @@ pub(super) async fn settle(mut talk: Talk<'_>) -> Result<(), Fault> {
                 break;
             }
         }
-        talk.note(is_done, format!("the receiver spoke at {speed} baud and was told to speak at {wanted}"));
+        talk.note(is_done, format!("the receiver used {speed} baud and was set to {wanted}"));
         break;
     }
     talk.line.set_speed(wanted).await
 }
 
-/// Whether a sound packet or sentence arrives at the line's present speed.
-async fn speaks(talk: &mut Talk<'_>) -> Result<bool, Fault> {
+/// Whether a valid packet or sentence arrives at the line's present speed.
+async fn speaks(talk: &mut Dialogue<'_>) -> Result<bool, Fault> {
     talk.send(&ubx_framed(MON_VER.0, MON_VER.1, &[])).await?;
     talk.listen(|bytes| {
         ubx_packets(bytes).next().is_some() || bodies(&String::from_utf8_lossy(bytes)).next().is_some()

@@ -1,4 +1,4 @@
-//! What ground stations missed, read again from the card: the store as the link's deep backlog.
+//! Records for ground stations, read again from the card: the store as the link's deep backlog.
 
 use std::sync::Arc;
 
@@ -8,10 +8,10 @@ use crate::io::link::{Backlog, Extent, Found, Unread};
 use crate::io::records::{Record, Schema};
 use windhover_base::time::MonoTime;
 
-/// What a record takes beside its message.
+/// Memory of a record apart from its message.
 const OVERHEAD: usize = 160;
 
-/// The record as it was handed in; `None` where its schema is another program's.
+/// The record as it was stored; `None` where its schema is of another program.
 fn record_of(queued: QueuedRecord) -> Option<Record> {
     Some(Record {
         schema: Schema::named(&queued.schema)?,
@@ -31,13 +31,13 @@ impl Backlog for StoreHandle {
     }
 
     fn read(&self, run: u32, first: u32, end: u32, max_bytes: usize) -> Found {
-        // Not open yet, or broken: it may answer later.
+        // The index is not open yet, or broken: it may answer later.
         let Some(index) = self.index() else { return Err(Unread { end }) };
         let mut bytes = 0;
         let mut found = Vec::new();
         for entry in index.queued(run, first, end) {
             let Ok((number, queued)) = entry else {
-                // What came before the error is answered; behind it nothing is known.
+                // Records before the error are returned; beyond it nothing is known.
                 return if found.is_empty() { Err(Unread { end }) } else { Ok(found) };
             };
             let Some(record) = record_of(queued) else { continue };

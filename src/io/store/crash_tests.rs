@@ -1,8 +1,8 @@
-//! Power cuts at any point of a recording, with every kind of loss a card may inflict: nothing that
-//! was acknowledged is lost, no start-up fails, no reader fails.
+//! Power cuts at any point of a recording, with every kind of loss that a card may cause: nothing that was acknowledged
+//! is lost, every start-up works, every reader works.
 //!
-//! The journal replays file operations; sled writes its own files, so its database is cut by mixing
-//! pages of what lies on the disk between one acknowledged commit and the next.
+//! The journal replays file operations. sled writes its own files, so its database is cut by mixing pages of the disk's
+//! content between one acknowledged commit and the next.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -24,7 +24,7 @@ use windhover_base::time::UtcTime;
 
 const SECOND_NS: u64 = 1_000_000_000;
 
-/// How far the journal was when so many messages were acknowledged.
+/// Length of the journal when this many messages were acknowledged.
 struct Acknowledged {
     at: usize,
     messages: u32,
@@ -39,8 +39,8 @@ fn channel(topic: &str) -> Arc<ChannelDef> {
     Arc::new(def)
 }
 
-/// A flight of `seconds`, a small message and a frame ten times a second, committed once a second,
-/// rotated every few, renamed in the middle, ended properly where `finished`.
+/// A flight of `seconds`, a small message and a frame ten times a second, committed once a second, rotated every few
+/// seconds, renamed in the middle, ended properly where `finished`.
 fn fly(volume: &Volume, journal: &Journal, seconds: u32, finished: bool) -> Vec<Acknowledged> {
     let session = flight_writer::next_session(volume).unwrap();
     let limits =
@@ -72,7 +72,7 @@ fn fly(volume: &Volume, journal: &Journal, seconds: u32, finished: bool) -> Vec<
     acknowledged
 }
 
-/// What start-up does to the card before it records: then a new flight must begin.
+/// The start-up operations on the card before recording; afterwards a new flight must begin.
 fn start_up(root: &Path) {
     let volume = Volume::new(root);
     flight::sweep(&volume).unwrap();
@@ -84,8 +84,8 @@ fn start_up(root: &Path) {
     FlightWriter::begin(&volume, session, None, Head::default(), limits).unwrap().finish().unwrap();
 }
 
-/// How many of messages 0, 1, 2, … of a topic are there, read twice: by the tolerant reader, and by
-/// the `mcap` crate with every check on.
+/// How many of messages 0, 1, 2, … of a topic exist, read twice: by the tolerant reader, and by the `mcap` crate with
+/// all its checks.
 fn count_whole(root: &Path, topic: &str) -> u32 {
     let mut seen = std::collections::BTreeSet::new();
     for name in flight::flight_names(root).unwrap() {
@@ -108,7 +108,7 @@ fn count_whole(root: &Path, topic: &str) -> u32 {
     (0..).take_while(|i| seen.contains(i)).count() as u32
 }
 
-/// Cuts a recording `cuts` times, each with each kind of loss in turn.
+/// Cuts a recording `cuts` times, with each kind of loss in turn.
 fn cut_recordings(cuts: usize, seed: u64) {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let live = tempfile::tempdir().unwrap();
@@ -128,7 +128,7 @@ fn cut_recordings(cuts: usize, seed: u64) {
     }
 }
 
-/// Cuts the sealing of what a first cut left, then starts up again.
+/// Cuts the sealing after a first cut, then starts up again.
 fn cut_start_ups(cuts: usize, seed: u64) {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let live = tempfile::tempdir().unwrap();
@@ -169,8 +169,8 @@ fn copy_dir(from: &Path, to: &Path) {
     }
 }
 
-/// Lays pages of `later` over `earlier`, each with even chance; files only one has come with even
-/// chance too.
+/// Puts pages of `later` over `earlier`, each with probability one half; files that exist in one only also with
+/// probability one half.
 fn mix_pages(earlier: &Path, later: &Path, random: &mut ChaCha8Rng) {
     for entry in std::fs::read_dir(later).unwrap().flatten() {
         let (source, target) = (entry.path(), earlier.join(entry.file_name()));
@@ -195,8 +195,8 @@ fn mix_pages(earlier: &Path, later: &Path, random: &mut ChaCha8Rng) {
     }
 }
 
-/// Cuts the index between acknowledged commits. What it loses is made again from the segments, so
-/// that the bar is: it opens, or is moved aside and a fresh one opens; what it says is true.
+/// Cuts the index between acknowledged commits. Lost entries are made again from the segments, so the requirement is:
+/// it opens, or is moved aside and a new one opens; its entries are true.
 fn cut_index(commits: u32, images: usize, seed: u64) -> (usize, usize) {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let live = tempfile::tempdir().unwrap();
@@ -231,7 +231,7 @@ fn cut_index(commits: u32, images: usize, seed: u64) -> (usize, usize) {
         match Index::open(&dir) {
             Ok(index) => {
                 let found: Vec<_> = index.queued(1, 0, u32::MAX).flatten().collect();
-                assert!(found.iter().all(|(n, r)| *r == record(*n)), "seed {seed}: never anything untrue");
+                assert!(found.iter().all(|(n, r)| *r == record(*n)), "seed {seed}: no untrue entry");
                 lost += usize::from(found.iter().filter(|(n, _)| *n < due).count() < due as usize);
             }
             Err(IndexError::Unusable { .. }) => {

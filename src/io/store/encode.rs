@@ -1,4 +1,4 @@
-//! The encoding thread: events and outputs in, records out, in the order they came.
+//! The encoding thread: events and outputs in, records out, in the same order.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -13,12 +13,12 @@ use crate::io::records::{self, Record, Schema};
 use windhover_base::msg::{Event, EventBody, Source};
 use windhover_base::time::MonoTime;
 
-/// What waits to be encoded.
+/// An item to be encoded.
 #[derive(Debug)]
 pub(super) enum Work {
-    /// Something heard.
+    /// An event.
     Event(Event),
-    /// Something said, with its number where ground stations get it.
+    /// A record of an output, with its number where ground stations get it.
     Record(Arc<Record>, Option<u32>),
     /// A last known state.
     State(String, Vec<u8>),
@@ -45,7 +45,7 @@ impl Channels {
         Arc::clone(self.0.entry(key).or_insert_with(make))
     }
 
-    /// The record as the store takes it.
+    /// The record in the store's form.
     pub(super) fn raw(&mut self, record: &Record, number: Option<u32>, weight: Weight) -> RawRecord {
         RawRecord {
             channel: self.of(record, number.is_some()),
@@ -58,7 +58,7 @@ impl Channels {
     }
 }
 
-/// MCAP times are unsigned; before zero is zero.
+/// MCAP times are unsigned; negative times become zero.
 pub(super) fn unsigned(t: MonoTime) -> u64 {
     u64::try_from(t.ns()).unwrap_or(0)
 }
@@ -72,8 +72,8 @@ pub(super) fn run(
     now: impl Fn() -> MonoTime,
 ) {
     let mut channels = Channels::default();
-    // Of the newest thing heard: what has no time of its own gets this. The clock's may be seconds ahead where
-    // the pipeline is behind, and readers put messages in order over a second only.
+    // Time of the newest event: items without a time get it. The clock may be seconds ahead where the pipeline is
+    // behind, and readers sort messages over one second only.
     let mut heard_ns = None;
     let states = ChannelDef::json(STATE_TOPIC);
     let states = Arc::new(ChannelDef { message_encoding: "windhover.state".into(), ..(*states).clone() });

@@ -1,4 +1,4 @@
-//! Flights as directories: their names, what marks them, and what is known of them.
+//! Flights as directories: their names, their marks, and their descriptions.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -16,10 +16,10 @@ pub const FLIGHTS: &str = "FLIGHTS";
 /// A file of this name in a flight keeps it from being deleted to make room.
 pub const KEEP: &str = "keep";
 
-/// What is known of a closed flight, so that lists need not open its segments.
+/// Description of a closed flight, so that lists need not open its segments.
 pub const FLIGHT_FILE: &str = "flight.json";
 
-/// A flight on the card. `flight.json` holds it; it can be made again from the segments.
+/// Description of a flight on the card. `flight.json` contains it; it can be made again from the segments.
 #[derive(Clone, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 pub struct FlightInfo {
     /// Number of the daemon's run on this card, counting up.
@@ -27,10 +27,10 @@ pub struct FlightInfo {
     /// Name of the directory.
     #[serde(skip)]
     pub name: String,
-    /// Whether it is kept.
+    /// Whether it is protected from deletion.
     #[serde(skip)]
     pub keep: bool,
-    /// Whether it was closed properly or sealed; a flight that is not is in the air, or was cut.
+    /// Whether it was closed properly or sealed; one that is not is being recorded, or was cut.
     pub closed: bool,
     /// Number of segments.
     pub segments: u32,
@@ -38,7 +38,7 @@ pub struct FlightInfo {
     pub bytes: u64,
     /// Segments that had to be repaired.
     pub repaired: u32,
-    /// Versions of program and models, and what else the head says.
+    /// Versions of program and models, and the other metadata of the head.
     pub metadata: BTreeMap<String, String>,
     /// Counts and times by topic.
     pub topics: BTreeMap<String, TopicStats>,
@@ -67,12 +67,12 @@ impl FlightInfo {
     }
 }
 
-/// Whether a topic carries estimates of a target.
+/// Whether a topic contains estimates of a target.
 pub fn is_estimate(topic: &str) -> bool {
     topic.starts_with("/target/") && topic.ends_with("/state")
 }
 
-/// Whether a directory name is a flight's: `YYYYMMDDTHHMMSSZ`, with `-N` or not, or `boot-N`.
+/// Whether a directory name is a flight's: `YYYYMMDDTHHMMSSZ` with an optional `-N`, or `boot-N`.
 pub fn is_flight_name(name: &str) -> bool {
     let digits = |s: &str| !s.is_empty() && s.bytes().all(|b| b.is_ascii_digit());
     if let Some(number) = name.strip_prefix("boot-") {
@@ -107,7 +107,7 @@ pub fn segment_name(number: u32) -> String {
     format!("{number:06}.mcap")
 }
 
-/// Names of all flights on the card, in no order.
+/// Names of all flights on the card, unsorted.
 pub fn flight_names(root: &Path) -> StoreResult<Vec<String>> {
     let dir = root.join(FLIGHTS);
     let entries = match std::fs::read_dir(&dir) {
@@ -118,7 +118,7 @@ pub fn flight_names(root: &Path) -> StoreResult<Vec<String>> {
     Ok(names.filter(|name| is_flight_name(name)).collect())
 }
 
-/// Makes the directory of a new flight, durably; gives its name.
+/// Makes the directory of a new flight, durably; returns its name.
 pub fn create_flight(volume: &Volume, session: u32, start: Option<UtcTime>) -> StoreResult<String> {
     volume.ensure_dir(FLIGHTS, "")?;
     let base = start.map_or_else(|| format!("boot-{session}"), UtcTime::compact);
@@ -136,9 +136,8 @@ pub fn create_flight(volume: &Volume, session: u32, start: Option<UtcTime>) -> S
     unreachable!("the loop ends by returning")
 }
 
-/// Gives a flight called `boot-N` the name of its start. One rename within one directory: a power
-/// cut leaves the old name or the new one, and open segments stay open. (A link would leave two
-/// names, and vfat has none.)
+/// Gives a flight called `boot-N` the name of its start. One rename within one directory: a power cut leaves the old
+/// name or the new one, and open segments stay open. (A hard link would leave two names, and vfat has none.)
 pub fn name_flight(volume: &Volume, name: &str, start: UtcTime) -> StoreResult<String> {
     let base = start.compact();
     for n in 1..10_000 {
@@ -151,7 +150,7 @@ pub fn name_flight(volume: &Volume, name: &str, start: UtcTime) -> StoreResult<S
     Ok(name.to_owned())
 }
 
-/// What `flight.json` says, or the segments where there is none.
+/// The content of `flight.json`, or of the segments where there is none.
 pub fn flight_info(root: &Path, name: &str) -> StoreResult<FlightInfo> {
     let dir = root.join(FLIGHTS).join(name);
     let told = std::fs::read(dir.join(FLIGHT_FILE)).ok();
@@ -165,7 +164,7 @@ pub fn flight_info(root: &Path, name: &str) -> StoreResult<FlightInfo> {
     Ok(info)
 }
 
-/// What the segments say, without reading messages of sealed ones.
+/// The description from the segments, without reading messages of sealed ones.
 pub fn summarize(dir: &Path) -> StoreResult<FlightInfo> {
     let mut info = FlightInfo { closed: true, ..FlightInfo::default() };
     for name in segment_names(dir) {
@@ -208,12 +207,12 @@ pub fn session_of(dir: &Path) -> Option<u32> {
 
 /// Writes `flight.json`, durably.
 pub fn write_info(volume: &Volume, name: &str, info: &FlightInfo) -> StoreResult<()> {
-    let mut bytes = serde_json::to_vec_pretty(info).expect("maps with string keys are JSON");
+    let mut bytes = serde_json::to_vec_pretty(info).expect("maps with string keys are valid JSON");
     bytes.push(b'\n');
     volume.write_whole(&format!("{FLIGHTS}/{name}"), FLIGHT_FILE, &bytes)
 }
 
-/// Sets or takes away the mark that keeps a flight.
+/// Sets or removes the mark that protects a flight.
 pub fn set_keep(volume: &Volume, name: &str, keep: bool) -> StoreResult<()> {
     let dir = format!("{FLIGHTS}/{name}");
     let mark = format!("{dir}/{KEEP}");
@@ -228,8 +227,8 @@ pub fn set_keep(volume: &Volume, name: &str, keep: bool) -> StoreResult<()> {
     volume.sync_dir(&dir)
 }
 
-/// Deletes a flight, durably. It leaves the list first, by a rename: a power cut in the middle
-/// leaves something [`sweep`] removes, never half a flight.
+/// Deletes a flight, durably. A rename first removes it from the list: a power cut in the middle leaves something that
+/// [`sweep`] removes, never part of a flight.
 pub fn delete(volume: &Volume, name: &str) -> StoreResult<()> {
     let doomed = format!("{FLIGHTS}/{name}.deleted");
     volume.replace(&format!("{FLIGHTS}/{name}"), &doomed)?;
@@ -238,7 +237,7 @@ pub fn delete(volume: &Volume, name: &str) -> StoreResult<()> {
     volume.sync_dir(FLIGHTS)
 }
 
-/// Removes what an interrupted delete, seal or write left.
+/// Removes the remains of an interrupted delete, seal or write.
 pub fn sweep(volume: &Volume) -> StoreResult<()> {
     let dir = volume.path(FLIGHTS);
     for entry in std::fs::read_dir(&dir).into_iter().flatten().flatten() {

@@ -1,4 +1,4 @@
-//! Writing one flight: its directory, its segments one after another, its summary at the end.
+//! Writing one flight: its directory, its segments in order, its description at the end.
 
 use std::collections::BTreeMap;
 
@@ -13,12 +13,12 @@ use windhover_base::time::UtcTime;
 /// File that counts the runs of the daemon on this card.
 const SESSION_FILE: &str = "session";
 
-/// How a flight is cut into segments.
+/// Limits of a segment.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct SegmentLimits {
-    /// Longest, ns of host time.
+    /// Longest duration, ns of host time.
     pub span_ns: u64,
-    /// Largest, bytes.
+    /// Largest size, bytes.
     pub bytes: u64,
     /// How frames are compressed in their chunks.
     pub frame_compression: Compression,
@@ -49,12 +49,12 @@ pub struct FlightWriter {
     finished: FlightInfo,
 }
 
-/// The number of this run of the daemon on this card: one more than the last, durably.
+/// The number of this run of the daemon on this card: one more than the last, stored durably.
 pub fn next_session(volume: &Volume) -> StoreResult<u32> {
     let told = std::fs::read_to_string(volume.path(SESSION_FILE)).ok();
     let last = match told.and_then(|text| text.trim().parse::<u32>().ok()) {
         Some(last) => last,
-        // Lost or never there: the flights tell.
+        // Lost or never there: derived from the flights.
         None => flight::flight_names(volume.root())?
             .iter()
             .filter_map(|name| flight::session_of(&volume.root().join(FLIGHTS).join(name)))
@@ -67,8 +67,8 @@ pub fn next_session(volume: &Volume) -> StoreResult<u32> {
 }
 
 impl FlightWriter {
-    /// Makes the flight's directory and its first segment, durably. `head` is what every segment
-    /// carries; its metadata gets session and segment.
+    /// Makes the flight's directory and its first segment, durably. `head` is written to every segment; its metadata
+    /// gets session and segment.
     pub fn begin(
         volume: &Volume,
         session: u32,
@@ -102,7 +102,7 @@ impl FlightWriter {
         self.session
     }
 
-    /// Whether records can be pushed. After an error, [`Self::resume`] first.
+    /// Whether records can be pushed. After an error, [`Self::resume`] is needed first.
     pub fn is_open(&self) -> bool {
         self.segment.is_some()
     }
@@ -118,7 +118,7 @@ impl FlightWriter {
         let dir = self.dir();
         let name = flight::segment_name(self.number);
         let compression = self.limits.frame_compression;
-        // The number is used up even where creation fails half-way.
+        // The number is used up even where creation fails.
         self.number += 1;
         let segment =
             SegmentWriter::create(&self.volume, (&dir, &name), &head, &self.definitions, compression)?;
@@ -132,7 +132,7 @@ impl FlightWriter {
         segment.push(&mut self.definitions, record)
     }
 
-    /// Makes everything pushed durable, then goes to the next segment where it is time to.
+    /// Makes everything pushed durable, then starts the next segment where it is due.
     pub fn commit(&mut self, now_ns: u64) -> StoreResult<Option<FinishedSegment>> {
         let Some((segment, begun_ns)) = &mut self.segment else { return Ok(None) };
         segment.commit()?;
@@ -166,10 +166,10 @@ impl FlightWriter {
         Ok(Some(FinishedSegment { number: self.number - 1, bytes, topics }))
     }
 
-    /// Leaves the present segment as it is, after an error: it is sealed later.
+    /// Leaves the present segment after an error: it is sealed later.
     pub fn abandon_segment(&mut self) {
         self.segment = None;
-        // What is left must be looked at again, so the flight is not closed here.
+        // The rest must be checked again, so the flight is not closed here.
         self.finished.repaired += 1;
     }
 
@@ -178,8 +178,8 @@ impl FlightWriter {
         self.finish_segment()
     }
 
-    /// Opens the next segment after an error or a pause. Where the directory is gone (another card),
-    /// a new flight begins.
+    /// Opens the next segment after an error or a pause. Where the directory no longer exists (another card), a new
+    /// flight begins.
     pub fn resume(&mut self, now_ns: u64, start: Option<UtcTime>) -> StoreResult<()> {
         if self.volume.path(&self.dir()).is_dir() {
             return self.open_segment(now_ns);
@@ -191,7 +191,7 @@ impl FlightWriter {
         Ok(())
     }
 
-    /// Gives a flight without a date its name; one that has a date keeps it.
+    /// Sets the name of a flight without a date; one that has a date keeps its name.
     pub fn set_start(&mut self, start: UtcTime) -> StoreResult<bool> {
         if !self.name.starts_with("boot-") {
             return Ok(false);

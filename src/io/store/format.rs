@@ -1,8 +1,7 @@
-//! MCAP records as bytes: the few the segment writer needs, to the letter of mcap.dev/spec.
+//! MCAP records as bytes: the few the segment writer needs, exactly as in mcap.dev/spec.
 //!
-//! The `mcap` crate writes whole files; a segment here must be cut into appends that are durable
-//! one by one, say its schemas more than once and be put together again from what is left of it.
-//! Reading goes through [`mcap_record`](crate::io::mcap_record).
+//! The `mcap` crate writes complete files. A segment here consists of appends that are durable one by one, repeats its
+//! schemas, and can be repaired from its remains. Reading uses [`mcap_record`](crate::io::mcap_record).
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -15,16 +14,16 @@ use crate::io::mcap_record::RECORD_HEAD;
 /// First and last bytes of every MCAP file.
 pub const MAGIC: [u8; 8] = [0x89, b'M', b'C', b'A', b'P', 0x30, b'\r', b'\n'];
 
-/// Private record (op codes from 0x80 on are for applications) that fills an append up to a page.
+/// Private record (op codes from 0x80 on are for applications) that pads an append to a page.
 pub const PADDING: u8 = 0xF0;
 
 /// How chunks are compressed.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Compression {
-    /// Not at all.
+    /// Without compression.
     None,
-    /// lz4 frames: cheap, halves text and protobuf, costs nothing on JPEG.
+    /// lz4 frames: fast; halves text and protobuf, and adds nothing to JPEG.
     #[default]
     Lz4,
     /// zstd at level 1: for lossless frames.
@@ -42,7 +41,7 @@ impl Compression {
     }
 }
 
-/// Appends one record; `body` writes what follows its length.
+/// Appends one record; `body` writes the part after its length.
 pub fn put_record(out: &mut Vec<u8>, opcode: u8, body: impl FnOnce(&mut Vec<u8>)) {
     out.push(opcode);
     let at = out.len();
@@ -58,17 +57,17 @@ pub fn put_str(out: &mut Vec<u8>, text: &str) {
     out.extend_from_slice(text.as_bytes());
 }
 
-/// Appends 2 bytes, little end first.
+/// Appends 2 bytes, little-endian.
 pub fn put_u16(out: &mut Vec<u8>, value: u16) {
     out.extend_from_slice(&value.to_le_bytes());
 }
 
-/// Appends 4 bytes, little end first.
+/// Appends 4 bytes, little-endian.
 pub fn put_u32(out: &mut Vec<u8>, value: u32) {
     out.extend_from_slice(&value.to_le_bytes());
 }
 
-/// Appends 8 bytes, little end first.
+/// Appends 8 bytes, little-endian.
 pub fn put_u64(out: &mut Vec<u8>, value: u64) {
     out.extend_from_slice(&value.to_le_bytes());
 }
@@ -152,7 +151,7 @@ pub fn put_metadata(out: &mut Vec<u8>, name: &str, map: &BTreeMap<String, String
     });
 }
 
-/// Appends a Chunk record around `records`, which hold messages from `start_ns` to `end_ns`.
+/// Appends a Chunk record around `records`, with messages from `start_ns` to `end_ns`.
 pub fn put_chunk(
     out: &mut Vec<u8>,
     records: &[u8],
@@ -182,7 +181,7 @@ pub fn put_chunk(
     Ok(header)
 }
 
-/// Appends a Chunk record as it was: header and compressed bytes.
+/// Appends a Chunk record unchanged: header and compressed bytes.
 pub fn put_packed_chunk(out: &mut Vec<u8>, header: &ChunkHeader, packed: &[u8]) {
     put_record(out, op::CHUNK, |b| {
         put_u64(b, header.message_start_time);

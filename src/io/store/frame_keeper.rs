@@ -1,4 +1,4 @@
-//! What is kept of the video: frames as configured, encoded away from the pipeline.
+//! Recorded video: frames as configured, encoded outside of the pipeline.
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use crate::jpeg::{self, Layout};
 use crate::pixels;
 use windhover_base::msg::{FrameEncoding, FramePayload};
 
-/// Grey outside the region that is kept.
+/// Grey level outside the recorded region.
 const BLANK: u8 = 128;
 
 /// A rectangle of an image, pixels; the last column and row are left out.
@@ -22,14 +22,14 @@ pub struct Region {
     pub u0: u32,
     /// First row.
     pub v0: u32,
-    /// Column behind the last.
+    /// Column after the last.
     pub u1: u32,
-    /// Row behind the last.
+    /// Row after the last.
     pub v1: u32,
 }
 
 impl Region {
-    /// The least region around pixels `(u, v)`, widened by `margin_px`; `None` without pixels.
+    /// The smallest region around pixels `(u, v)`, widened by `margin_px`; `None` without pixels.
     pub fn around(pixels: impl IntoIterator<Item = (f64, f64)>, margin_px: u32) -> Option<Self> {
         let mut bounds: Option<(f64, f64, f64, f64)> = None;
         for (u, v) in pixels {
@@ -48,7 +48,7 @@ impl Region {
     }
 }
 
-/// Decides which frames are kept and encodes them.
+/// Selects the recorded frames and encodes them.
 #[derive(Clone, Debug)]
 pub struct FrameKeeper {
     policy: FramePolicy,
@@ -57,12 +57,12 @@ pub struct FrameKeeper {
 }
 
 impl FrameKeeper {
-    /// As configured.
+    /// For this configuration.
     pub fn new(config: &StoreConfig) -> Self {
         Self { policy: config.frames, every: config.frames_every.max(1), quality: config.jpeg_quality }
     }
 
-    /// How chunks of frames are compressed: what is compressed already is not compressed again.
+    /// Compression of chunks of frames: compressed frames are not compressed again.
     pub fn chunk_compression(&self) -> Compression {
         match self.policy {
             FramePolicy::Zstd => Compression::Zstd,
@@ -70,8 +70,8 @@ impl FrameKeeper {
         }
     }
 
-    /// The frame as it is to be stored; `None` where it is not. A frame that cannot be encoded is
-    /// stored as it came.
+    /// The frame as it is to be stored; `None` where it is not stored. A frame that cannot be encoded is stored
+    /// unchanged.
     pub fn keep(&self, frame: &FramePayload, region: Option<Region>) -> Option<FramePayload> {
         if self.policy == FramePolicy::None || !frame.index.is_multiple_of(self.every) {
             return None;
@@ -97,8 +97,8 @@ impl FrameKeeper {
     }
 }
 
-/// Rows without gaps, as the JPEG encoder takes them; `None` for what is compressed already, not
-/// understood, or shorter than it says.
+/// Rows without gaps, as the JPEG encoder needs them; `None` for frames that are already compressed, not supported, or
+/// too short.
 fn packed(frame: &FramePayload) -> Option<(Layout, Cow<'_, [u8]>)> {
     let (layout, channels) = match frame.encoding {
         FrameEncoding::Grey => (Layout::Grey, 1),
@@ -107,7 +107,7 @@ fn packed(frame: &FramePayload) -> Option<(Layout, Cow<'_, [u8]>)> {
         FrameEncoding::Yuyv => return Some((Layout::Yuv422, yuv422(frame, [0, 1, 3])?.into())),
         FrameEncoding::Uyvy => return Some((Layout::Yuv422, yuv422(frame, [1, 0, 2])?.into())),
         FrameEncoding::Nv12 => return Some((Layout::Yuv420, nv12(frame)?.into())),
-        // As the detector saw them: the colours of a mosaic are coarser than its grey.
+        // As the detector uses them: the colours of a mosaic are coarser than its grey.
         FrameEncoding::Bayer(_)
         | FrameEncoding::Y10
         | FrameEncoding::Y12
@@ -134,8 +134,8 @@ fn stride_of(frame: &FramePayload, row: usize) -> Option<usize> {
     (stride >= row && row > 0 && frame.height > 0).then_some(stride)
 }
 
-/// Interleaved 4:2:2 to planes. `order`: where the first Y, U and V are in each group of four; the second
-/// Y is two behind the first.
+/// Interleaved 4:2:2 to planes. `order`: places of the first Y, U and V in each group of four; the second Y is two
+/// after the first.
 fn yuv422(frame: &FramePayload, [y, u, v]: [usize; 3]) -> Option<Vec<u8>> {
     let (width, height) = (frame.width as usize, frame.height as usize);
     let row = width.next_multiple_of(2) * 2;
@@ -219,7 +219,7 @@ mod tests {
         FramePayload { index: 0, t_exposure, encoding, width, height, stride, data: Arc::from(data) }
     }
 
-    /// A smooth picture, so that JPEG keeps it nearly.
+    /// A smooth picture, which JPEG preserves well.
     fn smooth(width: usize, height: usize, stride: usize) -> Vec<u8> {
         let mut data = vec![0; stride * height];
         for v in 0..height {
@@ -282,7 +282,7 @@ mod tests {
         assert!(kept.get_pixel(42, 41).0[0] > 240);
         assert!((i32::from(kept.get_pixel(4, 4).0[0]) - 128).abs() < 4);
         let whole = decoded(&keeper(FramePolicy::Region).keep(&given, None).expect("kept"));
-        assert!(whole.get_pixel(4, 4).0[0] > 240, "no vehicle known: everything is kept");
+        assert!(whole.get_pixel(4, 4).0[0] > 240, "no vehicle is known: everything is recorded");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! The store as the rest of the program sees it: started once, handed things, never waited for.
+//! The store's handle for the rest of the program: started once, takes items, never makes the caller wait.
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, sync_channel};
@@ -23,7 +23,7 @@ use crate::io::records::{self, Record};
 use windhover_base::msg::{Event, EventBody, WarmState};
 use windhover_base::time::{EARLIEST_UTC, UtcTime};
 
-/// How long the link waits for the card to tell the number of the run.
+/// How long the link waits for the card to report the number of the run.
 const WAIT_FOR_RUN: Duration = Duration::from_secs(5);
 
 /// The running store.
@@ -34,7 +34,7 @@ pub struct Store {
     keeper: Option<JoinHandle<()>>,
 }
 
-/// What everybody holds. Nothing here waits for the card, except where it says so.
+/// A handle on the store. No call waits for the card, except where documented.
 #[derive(Clone, Debug)]
 pub struct StoreHandle {
     intake: Arc<Queue<Work>>,
@@ -44,8 +44,8 @@ pub struct StoreHandle {
 }
 
 impl Store {
-    /// Starts recording into a new flight, and tells the operator through the receiver. `config_toml`
-    /// goes into every segment.
+    /// Starts recording into a new flight, with notices for the operator through the receiver. `config_toml` is written
+    /// to every segment.
     pub fn start(
         store: &StoreConfig,
         config_toml: String,
@@ -54,7 +54,7 @@ impl Store {
         Self::start_on(Volume::new(&store.path), store, config_toml, clock)
     }
 
-    /// The same on a volume given.
+    /// The same on a given volume.
     pub fn start_on(
         volume: Volume,
         store: &StoreConfig,
@@ -92,22 +92,20 @@ impl Store {
         (Self { handle, writers: encode.into_iter().chain(write).collect(), keeper }, heard)
     }
 
-    /// A handle to give away.
+    /// A further handle.
     pub fn handle(&self) -> StoreHandle {
         self.handle.clone()
     }
 
-    /// Ends the flight properly: everything handed in is written, the segment is closed. Handles left
-    /// elsewhere lose what they hand in from now on. Waits for the card, and a second at most for the
-    /// index: what it lacks is found at the next start.
+    /// Ends the flight properly: all items are written, the segment is closed. Items of other handles are lost from now
+    /// on. Waits for the card, and at most a second for the index: its missing entries are added at the next start.
     pub fn stop(self) {
         let Self { handle, writers, keeper } = self;
         handle.intake.close();
-        // A thread that panicked has said so; the flight is sealed at the next start.
+        // A thread that panicked has reported it; the flight is sealed at the next start.
         writers.into_iter().for_each(|thread| drop(thread.join()));
         handle.shared.stop();
-        // The keeper may be in the middle of sealing or indexing: what it leaves is found again, and
-        // nothing waits for it.
+        // The keeper may be sealing or indexing: the rest is done at the next start, and nothing waits for it.
         for _ in 0..100 {
             if keeper.as_ref().is_none_or(JoinHandle::is_finished) {
                 break;
@@ -122,7 +120,7 @@ fn spawn(name: &str, work: impl FnOnce() + Send + 'static) -> Option<JoinHandle<
 }
 
 impl StoreHandle {
-    /// Keeps an event as it was heard.
+    /// Stores an event.
     pub fn event(&self, event: &Event) {
         let Some(topic) = records::topic_of_event(&event.body) else { return };
         let (bytes, weight) = match &event.body {
@@ -136,8 +134,8 @@ impl StoreHandle {
         self.intake.push(Entry { value, bytes: bytes + 128, weight, topic: topic.into(), log_ns });
     }
 
-    /// Keeps a record. With a number it also waits, under this run and that number, for ground
-    /// stations; numbers count up by one.
+    /// Stores a record. With a number it is also queued, under this run and that number, for ground stations; numbers
+    /// count up by one.
     pub fn record(&self, record: Arc<Record>, number: Option<u32>) {
         let bytes = record.data.len() + 128;
         let (topic, log_ns) = (record.topic.clone(), encode::unsigned(record.log_time));
@@ -146,8 +144,8 @@ impl StoreHandle {
         self.intake.push(Entry { value, bytes, weight, topic, log_ns });
     }
 
-    /// Keeps a last known state under a name, for the next start: an opaque blob that should begin
-    /// with a version. Once a second or less.
+    /// Stores a last known state under a name, for the next start: an opaque blob that should begin with a version. At
+    /// most once a second.
     pub fn put_state(&self, name: &str, blob: Vec<u8>) {
         let bytes = blob.len() + 128;
         let value = Work::State(name.to_owned(), blob);
@@ -165,7 +163,7 @@ impl StoreHandle {
         self.wait_for(wait, || self.shared.index())
     }
 
-    /// Waits for what the card is to tell, as long as there is one to record on.
+    /// Waits for information from the card, as long as there is a card to record on.
     fn wait_for<T>(&self, wait: Duration, told: impl Fn() -> Option<T>) -> Option<T> {
         const STEP: Duration = Duration::from_millis(10);
         for _ in 0..=wait.as_millis() / STEP.as_millis() {
@@ -180,13 +178,13 @@ impl StoreHandle {
         None
     }
 
-    /// The index, where it answers.
+    /// The index, if it is open.
     pub fn index(&self) -> Option<Index> {
         self.shared.index()
     }
 
-    /// Tells when the flight began, once the receiver told UTC; the flight gets its name from it. A
-    /// date that cannot be is not believed.
+    /// Sets the start of the flight, once the receiver reported UTC; the flight is named by it. An impossible date is
+    /// ignored.
     pub fn set_start(&self, start: UtcTime) -> bool {
         let believable = start >= EARLIEST_UTC;
         if believable {
@@ -195,21 +193,21 @@ impl StoreHandle {
         believable
     }
 
-    /// Tells where vehicles are in the image (pixels of anything seen of them), for
-    /// `frames = "region"`; nothing seen keeps whole frames.
+    /// Sets where vehicles are in the image (pixels of their detections), for `frames = "region"`; without any, whole
+    /// frames are stored.
     pub fn watch(&self, pixels: impl IntoIterator<Item = (f64, f64)>) {
         self.shared.set_region(Region::around(pixels, self.region_margin_px));
     }
 
-    /// How the store does.
+    /// State of the store.
     pub fn status(&self) -> StoreStatus {
         let mut status = self.shared.status().clone();
         status.waiting_bytes += self.intake.bytes() as u64;
         status
     }
 
-    /// Identity of this run, under which numbered records are kept. Waits for the card up to five
-    /// seconds; without one it is a number that no card has, and numbered records are not queued.
+    /// Identity of this run, under which numbered records are stored. Waits up to five seconds for the card; without
+    /// one it is a number that no card has, and numbered records are not queued.
     pub fn run(&self) -> u32 {
         let told = self.wait_for(WAIT_FOR_RUN, || self.shared.session());
         told.unwrap_or_else(|| self.shared.settle_session(rand::random::<u32>() | 0x8000_0000))
@@ -217,7 +215,7 @@ impl StoreHandle {
 
     /// A station has every number of a run below `through` on its disk.
     pub fn acknowledge(&self, station: &str, run: u32, through: u32) {
-        // Lost where the keeper is behind: the station says it again when it connects.
+        // Lost where the keeper is behind: the station reports it again when it connects.
         let _ = self.keeper.try_send(Message::Cursor(station.to_owned(), run, through));
     }
 }

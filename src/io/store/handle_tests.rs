@@ -1,4 +1,4 @@
-//! The whole store on a directory: what goes in comes out, and a failing card stops nothing else.
+//! The whole store on a directory: items in, files out; a failing card stops nothing else.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -70,7 +70,7 @@ fn expect_notice(notices: &Receiver<StoreNotice>, name: &str) -> StoreNotice {
     }
 }
 
-/// Waits until the card took something this often, up to ten seconds.
+/// Waits until the card has had this many commits, up to ten seconds.
 fn wait_for_commits(handle: &StoreHandle, times: usize) {
     let mut last = handle.status().last_commit_ns;
     let mut seen = 0;
@@ -114,7 +114,7 @@ fn a_flight_is_recorded_named_and_read_again() {
         handle.record(estimate(&clock, n as u32), Some(n as u32));
     }
     handle.put_state("datum", vec![1, 2, 3]);
-    assert!(!handle.set_start(UtcTime::from_unix_ns(315_532_800_000_000_000)), "1980 is not believed");
+    assert!(!handle.set_start(UtcTime::from_unix_ns(315_532_800_000_000_000)), "1980 is not accepted");
     assert!(handle.set_start(UtcTime::from_unix_ns(1_795_000_000_000_000_000)));
     expect_notice(&notices, "flight_named");
     store.stop();
@@ -128,7 +128,7 @@ fn a_flight_is_recorded_named_and_read_again() {
     assert!(info.closed);
     assert_eq!(info.estimates().unwrap().count, 40);
 
-    // The next run finds state and queue of the one before.
+    // The next run finds state and queue of the previous one.
     let (store, _notices) = Store::start_on(volume, &config(dir.path()), String::new(), clock);
     let handle = store.handle();
     assert_eq!(handle.run(), 2);
@@ -141,7 +141,7 @@ fn a_flight_is_recorded_named_and_read_again() {
         (7, &7u32.to_le_bytes()[..], "/target/ugv/state")
     );
 
-    // The link reads them as its backlog: as many as fit, from where it asks.
+    // The link reads them as its backlog: as many as fit, from the requested number on.
     let backlog: &dyn crate::io::link::Backlog = &handle;
     let extents = backlog.extents();
     assert_eq!((extents[0].run, extents[0].first, extents[0].end, &extents[0].flight[..]), (1, 0, 40, name));
@@ -175,7 +175,7 @@ fn a_failing_card_stops_recording_loudly_and_it_resumes() {
         handle.event(&gps(&clock, 1));
         expect_notice(&notices, "recording_stopped");
         assert!(matches!(handle.status().recording, Recording::Stopped(_)), "{fault:?}");
-        // Nothing waits meanwhile: a thousand frames are handed in at once.
+        // Nothing waits meanwhile: a thousand frames are passed at once.
         (0..1000).for_each(|n| handle.event(&frame(&clock, n)));
         std::thread::sleep(Duration::from_millis(300));
         journal.set_fault(None);
@@ -205,7 +205,7 @@ fn without_a_card_everything_else_goes_on() {
     let StoreNotice::Stopped { reason } = expect_notice(&notices, "recording_stopped") else { panic!() };
     assert!(reason.contains("not-there"), "{reason}");
     assert_eq!(handle.state("datum", Duration::ZERO), None);
-    // The card comes.
+    // A card is inserted.
     std::fs::create_dir(&missing).unwrap();
     expect_notice(&notices, "recording_resumed");
     handle.event(&gps(&clock, 3));
@@ -251,14 +251,14 @@ fn what_an_earlier_run_knew_is_told_before_a_slow_card_has_begun_a_flight() {
     store.handle().put_state("warm", vec![1, 2, 3]);
     store.stop();
 
-    // When the next run finds a card that takes its time to begin a flight.
+    // When the next run finds a card that is slow to begin a flight.
     journal.set_held(true);
     let (store, notices) = start();
     let told = store.handle().state("warm", Duration::from_secs(30));
     let begun = store.handle().status().flight;
     journal.set_held(false);
 
-    // Then the state is told meanwhile, and the flight begins all the same; nothing of it is sealed.
+    // Then the state is available meanwhile, and the flight still begins; nothing of it is sealed.
     assert_eq!((told, begun), (Some(vec![1, 2, 3]), String::new()));
     expect_notice(&notices, "index_ready");
     store.handle().event(&gps(&clock, 1));
@@ -272,7 +272,7 @@ fn what_an_earlier_run_knew_is_told_before_a_slow_card_has_begun_a_flight() {
 
 #[test]
 fn a_segment_that_the_index_missed_at_the_end_is_found_at_the_next_start() {
-    // Given a closed flight of whose segments the index knows none, as after a stop that could not wait.
+    // Given a closed flight with no segment in the index, as after a stop that could not wait.
     let dir = tempfile::tempdir().unwrap();
     let clock = HostClock::start();
     let volume = Volume::new(dir.path());
@@ -296,8 +296,8 @@ fn a_segment_that_the_index_missed_at_the_end_is_found_at_the_next_start() {
 
 #[test]
 fn what_a_daemon_far_behind_records_is_read_in_the_order_it_was_handled() {
-    // Given events that are handled seconds after they were heard, as on an overloaded machine, with states
-    // kept between.
+    // Given events that are handled seconds after their reception, as on an overloaded machine, with states stored
+    // between them.
     let dir = tempfile::tempdir().unwrap();
     let clock = HostClock::start();
     let config = StoreConfig { frames: FramePolicy::Zstd, ..config(dir.path()) };
@@ -331,20 +331,20 @@ fn a_flight_that_is_removed_while_it_is_written_is_told_and_begun_anew() {
     handle.event(&gps(&clock, 1));
     wait_for_commits(&handle, 1);
     let flights = dir.path().join(FLIGHTS);
-    // When its directory is removed, then that is told, with the next that is written.
+    // When its directory is removed, then that is reported at the next write.
     std::fs::remove_dir_all(&flights).unwrap();
     handle.event(&gps(&clock, 2));
     let StoreNotice::Stopped { reason } = expect_notice(&notices, "recording_stopped") else {
         unreachable!()
     };
     assert!(reason.contains("removed or replaced"), "{reason}");
-    // Then another flight is begun, and what was lost is counted.
+    // Then another flight begins, and the losses are counted.
     expect_notice(&notices, "recording_resumed");
     handle.event(&gps(&clock, 3));
     wait_for_commits(&handle, 1);
     store.stop();
     let words = handle.status().outcome().expect("the end is on the card");
-    assert!(words.starts_with("written, but for 1 messages"), "{words}");
+    assert!(words.starts_with("written, except for 1 messages"), "{words}");
     let name = flight::flight_names(dir.path()).unwrap().pop().expect("a flight");
     assert_eq!(events_of(&flights.join(name)).0, [b"$GPGGA,3\r\n"]);
 }
@@ -359,10 +359,10 @@ fn an_end_that_reaches_nobody_is_no_end_that_is_written() {
     handle.event(&gps(&clock, 1));
     wait_for_commits(&handle, 1);
     assert_eq!(handle.status().outcome(), Ok("everything is written".into()));
-    // When the flight's files are put elsewhere at the very end.
+    // When the flight's files are moved away at the very end.
     std::fs::rename(dir.path().join(FLIGHTS), dir.path().join("ELSEWHERE")).unwrap();
     handle.event(&gps(&clock, 2));
     store.stop();
-    let why = handle.status().outcome().expect_err("nothing of the end is where it belongs");
+    let why = handle.status().outcome().expect_err("the end is not in its place");
     assert!(why.contains("removed or replaced"), "{why}");
 }

@@ -1,9 +1,9 @@
-//! The sled database beside the segments: an index over them, the back-fill queue and the last known
-//! state. Never the only copy of anything: what is in it can be made again from the segments.
+//! The sled database beside the segments: an index over them, the back-fill queue and the last known state. Never the
+//! only copy of anything: its content can be made again from the segments.
 //!
-//! `flush()` of sled 0.34 calls sync_file_range and no fsync, and loses acknowledged records in a
-//! power cut; with an fsync of its `db` file behind it none were lost (docs/storage.md). Opened on a
-//! full disk it leaves an empty `snap.*.generating` that makes every later open fail.
+//! `flush()` of sled 0.34 calls sync_file_range and no fsync, and loses acknowledged records in a power cut; with an
+//! fsync of its `db` file after it none were lost (docs/storage.md). Opened on a full disk it leaves an empty
+//! `snap.*.generating` that makes every later open fail.
 
 use std::fs::File;
 use std::panic::AssertUnwindSafe;
@@ -16,9 +16,9 @@ use serde::{Deserialize, Serialize};
 /// Directory of the index under the store's path.
 pub const INDEX: &str = "index";
 
-/// Longest that sled may take to open an index; a large one after a power cut takes some seconds.
+/// Longest time for sled to open an index; a large one after a power cut takes some seconds.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// Nice value of the thread that opens it, which may be left behind.
+/// Nice value of the thread that opens it, which may be abandoned.
 const LEAST: i32 = 19;
 
 /// Keys of back-fill records: this byte, run, number.
@@ -46,12 +46,12 @@ pub enum IndexError {
     Unusable {
         /// Its directory.
         path: PathBuf,
-        /// What sled or the system said.
+        /// The error of sled or the system.
         reason: String,
     },
 }
 
-/// What the index holds of a segment.
+/// The index entry of a segment.
 #[derive(Clone, PartialEq, Eq, Debug, Serialize, Deserialize)]
 pub struct SegmentEntry {
     /// Bytes of the file.
@@ -107,9 +107,9 @@ impl QueuedRecord {
 /// One change of the index.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Change {
-    /// A record waits for the ground: run, number.
+    /// A record is queued for the ground: run, number.
     Queue(u32, u32, QueuedRecord),
-    /// Records of a run below a number wait no more.
+    /// Records of a run below a number are no longer queued.
     Unqueue(u32, u32),
     /// A station has every number of a run below this.
     Cursor(String, u32, u32),
@@ -119,7 +119,7 @@ pub enum Change {
     Segment(u32, u32, SegmentEntry),
     /// A run's flight has this name.
     Flight(u32, String),
-    /// A run's flight is gone.
+    /// A run's flight no longer exists.
     Forget(u32),
 }
 
@@ -141,9 +141,9 @@ pub struct Index {
 }
 
 impl Index {
-    /// Opens the index in directory `dir`, or makes an empty one, and reads what is asked of it at every start. A panic
-    /// inside sled is an error, and so is an index over which sled broods for longer than twenty seconds: its thread is left
-    /// behind with the least claim to the processor, and ends with the process.
+    /// Opens the index in directory `dir`, or makes an empty one, and reads the entries that every start needs. A panic
+    /// inside sled is an error, and so is an index that sled does not open within twenty seconds: its thread is
+    /// abandoned with the lowest priority, and ends with the process.
     pub fn open(dir: &Path) -> Result<Self, IndexError> {
         let unusable = |reason: &str| IndexError::Unusable { path: dir.to_owned(), reason: reason.into() };
         let (done, opened) = std::sync::mpsc::sync_channel(1);
@@ -151,7 +151,7 @@ impl Index {
         let work = move || {
             let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), LEAST);
             let index = Self::open_now(&of).and_then(|index| index.check().map(|()| index));
-            // Where nobody waits any more, what was opened is closed again.
+            // Where nothing waits any more, the opened index is closed again.
             let _ = done.send(index);
         };
         std::thread::Builder::new()
@@ -170,7 +170,7 @@ impl Index {
         let unusable = |reason: String| IndexError::Unusable { path: self.dir.clone(), reason };
         let work = || -> sled::Result<()> {
             for kind in [CURSOR, STATE, SEGMENT, FLIGHT] {
-                // sled gives the same error again and again.
+                // sled repeats the same error without end.
                 self.db.range(vec![kind]..vec![kind + 1]).try_for_each(|item| item.map(drop))?;
             }
             Ok(())
@@ -222,7 +222,7 @@ impl Index {
             }
             self.db.apply_batch(batch).map_err(|e| e.to_string())?;
             self.db.flush().map_err(|e| e.to_string())?;
-            // sled's flush ends in sync_file_range, which is no barrier: a second handle gives one.
+            // sled's flush ends in sync_file_range, which is no barrier: fsync through a second handle is one.
             File::open(self.dir.join("db")).and_then(|f| f.sync_all()).map_err(|e| e.to_string())
         };
         match std::panic::catch_unwind(AssertUnwindSafe(work)) {
@@ -248,7 +248,7 @@ impl Index {
             }
             Change::State(name, blob) => batch.insert(key(STATE, &[name.as_bytes()]), &blob[..]),
             Change::Segment(run, n, entry) => {
-                let value = serde_json::to_vec(entry).expect("numbers are JSON");
+                let value = serde_json::to_vec(entry).expect("numbers are valid JSON");
                 batch.insert(key(SEGMENT, &[&run.to_be_bytes(), &n.to_be_bytes()]), value);
             }
             Change::Flight(run, name) => batch.insert(key(FLIGHT, &[&run.to_be_bytes()]), name.as_bytes()),
@@ -263,12 +263,12 @@ impl Index {
     }
 
     fn items(&self, from: Vec<u8>, to: Vec<u8>) -> impl Iterator<Item = (Vec<u8>, Vec<u8>)> {
-        // What cannot be read is as good as none: the segments have it. sled gives its error again and again.
+        // Unreadable entries are treated as absent: the segments have them. sled repeats its error without end.
         self.db.range(from..to).map_while(Result::ok).map(|(k, v)| (k.to_vec(), v.to_vec()))
     }
 
-    /// Queued records `first..end` of a run, ascending, as far as the card can be read. An entry that is
-    /// no record is left out.
+    /// Queued records `first..end` of a run, ascending, as far as the card can be read. An entry that is not a record
+    /// is left out.
     pub fn queued(
         &self,
         run: u32,
@@ -316,7 +316,7 @@ impl Index {
         Some(self.db.get(key(STATE, &[name.as_bytes()])).ok()??.to_vec())
     }
 
-    /// All segments it knows: (run, number) and what it holds of each.
+    /// All segments in the index: (run, number) and entry.
     pub fn segments(&self) -> Vec<((u32, u32), SegmentEntry)> {
         let items = self.items(vec![SEGMENT], vec![SEGMENT + 1]);
         let parsed = items.filter_map(|(k, v)| {
@@ -331,25 +331,25 @@ impl Index {
         String::from_utf8(value.to_vec()).ok()
     }
 
-    /// All flights it knows.
+    /// All flights in the index.
     pub fn flights(&self) -> Vec<(u32, String)> {
         let items = self.items(vec![FLIGHT], vec![FLIGHT + 1]);
         items.filter_map(|(k, v)| Some((number(&k[1..])?, String::from_utf8(v).ok()?))).collect()
     }
 }
 
-/// What sled leaves when it was opened on a full disk.
+/// Removes the file that sled leaves when it was opened on a full disk.
 fn remove_half_snapshots(dir: &Path) {
     for entry in std::fs::read_dir(dir).into_iter().flatten().flatten() {
         let name = entry.file_name().to_string_lossy().into_owned();
         if name.starts_with("snap.") && name.ends_with(".generating") {
-            // Where this fails the open fails too, and says so.
+            // Where this fails the open fails too, and reports it.
             let _ = std::fs::remove_file(entry.path());
         }
     }
 }
 
-/// Moves an unusable index aside, where the one moved before is given up; gives its new place.
+/// Moves an unusable index aside, and deletes the one that was moved before; returns its new place.
 pub fn move_aside(dir: &Path) -> std::io::Result<PathBuf> {
     let aside = dir.with_extension("damaged");
     if aside.exists() {
@@ -366,7 +366,7 @@ mod tests {
 
     use super::*;
 
-    /// Whatever a damaged index says, it says it at once: sled repeats its errors for ever.
+    /// Reading a damaged index ends: sled repeats its errors without end.
     #[test]
     fn a_damaged_index_is_read_to_an_end() {
         let dir = tempfile::tempdir().expect("a folder");
@@ -399,7 +399,7 @@ mod tests {
                         "{counts:?}"
                     );
                 }
-                Err(IndexError::Unusable { .. }) => assert!(round > 0, "it was whole"),
+                Err(IndexError::Unusable { .. }) => assert!(round > 0, "it was complete"),
                 Err(other) => panic!("{other}"),
             }
         }

@@ -1,4 +1,4 @@
-//! Looking at the card without changing it: lists, dropouts, whether somebody records.
+//! Reading the card without changing it: lists, dropouts, whether a process records.
 
 use std::fs::File;
 use std::path::Path;
@@ -35,7 +35,7 @@ impl RecorderLock {
         match flock(&file, FlockOperation::NonBlockingLockExclusive) {
             Ok(()) => Ok(Self { _file: file }),
             Err(rustix::io::Errno::WOULDBLOCK) => {
-                let other = std::io::Error::other("another windhover records there");
+                let other = std::io::Error::other("another windhover process records there");
                 Err(StoreError::new("record to", root, other))
             }
             Err(e) => Err(StoreError::new("lock", &path, e)),
@@ -61,8 +61,8 @@ pub fn in_the_air(root: &Path) -> StoreResult<Option<String>> {
     Ok(open.max_by_key(|name| age_order(root, name)))
 }
 
-/// What is quickly known of a flight: `flight.json`, or for one that is not closed the sizes of its
-/// segments and what the sealed ones say.
+/// A quick description of a flight: `flight.json`, or for one that is not closed the sizes of its segments and the
+/// summaries of the sealed ones.
 pub fn glance(root: &Path, name: &str) -> StoreResult<FlightInfo> {
     let dir = root.join(FLIGHTS).join(name);
     if dir.join(flight::FLIGHT_FILE).exists() {
@@ -85,7 +85,7 @@ pub fn glance(root: &Path, name: &str) -> StoreResult<FlightInfo> {
     Ok(info)
 }
 
-/// All flights, oldest first. Those that cannot be read come as errors beside them.
+/// All flights, oldest first. Those that cannot be read are returned as errors.
 pub fn list(root: &Path) -> StoreResult<(Vec<FlightInfo>, Vec<StoreError>)> {
     let (mut flights, mut errors) = (Vec::new(), Vec::new());
     for name in flight::flight_names(root)? {
@@ -98,7 +98,7 @@ pub fn list(root: &Path) -> StoreResult<(Vec<FlightInfo>, Vec<StoreError>)> {
     Ok((flights, errors))
 }
 
-/// Something the card did not take.
+/// Data that the card did not take.
 #[derive(Clone, PartialEq, Eq, Debug, Serialize, Deserialize)]
 pub struct Dropout {
     /// Log time of the first lost message, ns.
@@ -109,11 +109,11 @@ pub struct Dropout {
     pub bytes: u64,
     /// Messages lost by topic.
     pub messages: std::collections::BTreeMap<String, u64>,
-    /// Why.
+    /// The reason.
     pub reason: String,
 }
 
-/// What a flight says it lost. Only chunks that say so are read.
+/// The losses that a flight records. Only chunks with such records are read.
 pub fn dropouts(root: &Path, name: &str) -> StoreResult<Vec<Dropout>> {
     let dir = root.join(FLIGHTS).join(name);
     let mut found = Vec::new();

@@ -1,23 +1,23 @@
 //! A log of file operations, and the disk as a power cut at any point of it may leave it; also a card
 //! that fails on demand.
 //!
-//! What a card keeps of writes that no barrier followed is its own affair: none, all, the first
-//! ones, or any of their pages. [`Journal::image`] builds each of these from the log, with file
-//! content durable after the file's sync and names durable after the directory's.
+//! Of writes without a later barrier a card may keep none, all, the first ones, or any of their pages.
+//! [`Journal::image`] builds each of these cases from the log; file content is durable after the file's sync, and names
+//! after the directory's.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Mutex;
 
-/// Bytes a card writes or leaves as a whole.
+/// Bytes that a card writes or loses as a unit.
 const PAGE: usize = 4096;
 
 /// One file operation. Paths are relative to the volume.
 #[derive(Clone, Debug)]
 pub enum Op {
-    /// A directory appeared.
+    /// A directory was made.
     CreateDir(String),
-    /// An empty file appeared.
+    /// An empty file was made.
     Create {
         /// Its number.
         file: u64,
@@ -26,16 +26,16 @@ pub enum Op {
     },
     /// Bytes were written.
     Write {
-        /// Into which file.
+        /// The file.
         file: u64,
-        /// Where.
+        /// The offset.
         offset: u64,
-        /// What.
+        /// The bytes.
         bytes: Vec<u8>,
     },
     /// A file was cut to a length.
     Truncate {
-        /// Which.
+        /// The file.
         file: u64,
         /// Its new length.
         length: u64,
@@ -44,25 +44,25 @@ pub enum Op {
     Sync(u64),
     /// A name changed.
     Rename {
-        /// Old.
+        /// The old name.
         from: String,
-        /// New; what had it is gone.
+        /// The new name; its previous file is gone.
         to: String,
     },
-    /// A name went away.
+    /// A name was removed.
     Remove(String),
     /// A directory's entries are durable.
     SyncDir(String),
 }
 
-/// What the card keeps of the operations that no barrier followed.
+/// Which operations without a later barrier the card keeps.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Loss {
     /// None of them.
     FlushedOnly,
     /// All of them.
     Nothing,
-    /// All but the last write, of which the first half of its bytes is there.
+    /// All but the last write, of which the first half of the bytes remains.
     TornTail,
     /// Any of their pages and names, chosen by this seed; the others read as zeros or are absent.
     Subset(u64),
@@ -92,23 +92,22 @@ impl Journal {
         self.log().ops.push(op);
     }
 
-    /// From now on every operation fails like this, or works again.
+    /// From now on every operation fails with this error, or works again.
     pub fn set_fault(&self, fault: Option<std::io::ErrorKind>) {
         self.log().fault = fault;
     }
 
-    /// From now on so much is said to be free, or what really is.
+    /// From now on this much is reported as free, or the true amount.
     pub fn set_free(&self, bytes: Option<u64>) {
         self.log().free_bytes = bytes;
     }
 
-    /// From now on operations wait until they may go on: a card that takes its time.
+    /// From now on operations wait until they are released: a slow card.
     pub fn set_held(&self, held: bool) {
         self.log().held = held;
     }
 
-    /// What an operation comes to before it is done: waits while the card takes its time, fails where it is
-    /// to fail.
+    /// Before an operation: waits while the card is held, fails where a fault is set.
     pub(super) fn fault(&self) -> std::io::Result<()> {
         while self.log().held {
             std::thread::sleep(std::time::Duration::from_millis(1));
@@ -128,7 +127,7 @@ impl Journal {
         file
     }
 
-    /// The number of the file that has this name now; 0 where none has.
+    /// The number of the file that has this name now; 0 where there is none.
     pub(super) fn file_named(&self, path: &str) -> u64 {
         let log = self.log();
         let mut disk = Disk::default();
@@ -138,7 +137,7 @@ impl Journal {
         disk.names.get(path).copied().flatten().unwrap_or(0)
     }
 
-    /// Notes what lies under `root` already, as durable.
+    /// Adds the existing content of `root`, as durable.
     pub fn adopt(&self, root: &Path) -> std::io::Result<()> {
         self.adopt_dir(root, "")
     }
@@ -161,12 +160,12 @@ impl Journal {
         Ok(())
     }
 
-    /// How many operations happened.
+    /// Number of operations.
     pub fn len(&self) -> usize {
         self.log().ops.len()
     }
 
-    /// Whether none happened.
+    /// Whether there was no operation.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -177,7 +176,7 @@ impl Journal {
         self.log().ops.iter().map(written).sum()
     }
 
-    /// Builds under `root` the disk as the power cut after the first `cut` operations leaves it.
+    /// Builds under `root` the disk that a power cut after the first `cut` operations leaves.
     pub fn image(&self, cut: usize, loss: Loss, root: &Path) -> std::io::Result<()> {
         let ops = &self.log().ops[..];
         let ops = &ops[..cut.min(ops.len())];
@@ -192,8 +191,8 @@ impl Journal {
     }
 }
 
-/// Whether a barrier after operation `at` covers it. A name is covered by a sync of its directory;
-/// a journaling file system orders names among themselves, which is not relied on.
+/// Whether a barrier after operation `at` covers it. A name is covered by a sync of its directory; a journaling file
+/// system also orders names, on which nothing here relies.
 fn is_durable(ops: &[Op], at: usize) -> bool {
     let later = &ops[at + 1..];
     let dir_synced = |path: &str| {
@@ -210,7 +209,7 @@ fn is_durable(ops: &[Op], at: usize) -> bool {
     }
 }
 
-/// Decides what stays of operations that are not durable.
+/// Decides which operations remain that are not durable.
 struct Chance(Loss);
 
 impl Chance {
@@ -295,7 +294,7 @@ impl Disk {
         std::fs::create_dir_all(root)?;
         for (name, kind) in &self.names {
             let path = root.join(name);
-            // A name below a directory that did not survive is lost with it.
+            // A name below a lost directory is lost with it.
             if path.parent().is_some_and(|parent| !parent.is_dir()) {
                 continue;
             }
@@ -315,7 +314,7 @@ mod tests {
     use super::super::volume::Volume;
     use super::*;
 
-    /// What a cut leaves of `F/a`, written in two appends of which only the first was synced.
+    /// The content that a cut leaves of `F/a`, written in two appends of which only the first was synced.
     fn left(loss: Loss) -> Vec<u8> {
         let (live, image) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         let journal = Arc::new(Journal::default());

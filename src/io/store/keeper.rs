@@ -1,7 +1,7 @@
-//! The keeper thread: everything that may take long, so that recording never waits for it.
+//! The keeper thread: all operations that may take long, so that recording never waits for them.
 //!
-//! Opens the index (or moves it aside and makes it again), commits its changes, seals what a power
-//! cut left, brings the index up to what lies on the card, and deletes old flights.
+//! It opens the index (or moves it aside and makes a new one), commits its changes, seals segments after a power cut,
+//! updates the index to the content of the card, and deletes old flights.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -22,12 +22,12 @@ use crate::config::StoreConfig;
 use crate::io::clock::HostClock;
 use windhover_base::time::{MonoTime, Span};
 
-/// What the keeper is told.
+/// A message to the keeper.
 #[derive(Debug)]
 pub(super) enum Message {
     /// There is a card to record on; no flight has begun yet.
     CardFound,
-    /// Changes of which the segment is durable.
+    /// Changes from a durable segment.
     Changes(Vec<Change>),
     /// A segment is closed.
     SegmentDone {
@@ -36,7 +36,7 @@ pub(super) enum Message {
         /// The segment.
         segment: FinishedSegment,
     },
-    /// A flight began, or got another name.
+    /// A flight began, or was renamed.
     Begun {
         /// Run.
         session: u32,
@@ -49,7 +49,7 @@ pub(super) enum Message {
     Cursor(String, u32, u32),
 }
 
-/// Work that waits its turn, one flight at a time.
+/// Waiting work, one flight at a time.
 #[derive(Debug)]
 enum Task {
     Sweep,
@@ -61,10 +61,10 @@ enum Task {
 /// How often an index that cannot be opened is tried again.
 const RETRY_INDEX: Span = Span::from_ns(5_000_000_000);
 
-/// How often old flights are looked for.
+/// How often old flights are deleted.
 const RETAIN_EVERY: Span = Span::from_ns(60_000_000_000);
 
-/// Records are taken off the queue this many at a time.
+/// Records are removed from the queue this many at a time.
 const TRIM_STEP: u64 = 1_000;
 
 pub(super) struct Keeper {
@@ -81,7 +81,7 @@ pub(super) struct Keeper {
     /// Whether there ever was a card.
     card_found: bool,
     present: Option<(u32, String)>,
-    /// Whether the index was told to be complete since it was opened.
+    /// Whether the index was reported as complete since it was opened.
     complete: bool,
     /// The file system the index is on.
     device: Option<u64>,
@@ -120,7 +120,7 @@ impl Keeper {
             let wait = if self.tasks.is_empty() { 100 } else { 0 };
             match inbox.recv_timeout(Duration::from_millis(wait)) {
                 Ok(message) => self.hear(message),
-                // The recorder is gone before the store says stop: nothing comes any more.
+                // The recorder is gone before the store stops: no more messages come.
                 Err(_) if self.shared.is_stopping() => break,
                 Err(RecvTimeoutError::Timeout) => self.step(),
                 Err(RecvTimeoutError::Disconnected) => break,
@@ -162,7 +162,7 @@ impl Keeper {
         }
     }
 
-    /// The queue holds so many records; the oldest are taken off a thousand at a time.
+    /// Limits the queue to its number of records; the oldest are removed a thousand at a time.
     fn trim(&mut self) {
         let Some(index) = &self.index else { return };
         if self.queued <= self.config.backfill_records + TRIM_STEP {
@@ -177,7 +177,7 @@ impl Keeper {
 
     fn apply(&mut self) {
         let Some(index) = &self.index else {
-            // Without an index only the newest are held; the segments have them all.
+            // Without an index only the newest are held; the segments have all of them.
             let excess = self.held.len().saturating_sub(20_000);
             self.held.drain(..excess);
             return;
@@ -200,16 +200,15 @@ impl Keeper {
         self.tried_at = Some(self.clock.now());
     }
 
-    /// An index that is open keeps a card that was taken away busy, and is of no use.
+    /// An open index keeps a removed card busy, and is of no use.
     fn leave_lost_card(&mut self) {
         if self.index.is_some() && self.volume.device().ok() != self.device {
             self.close_index();
         }
     }
 
-    /// Opens the index once the card is there, before there is a flight: what an earlier run knew is waited
-    /// for, and a flight begins with several waits for the card. An unusable one is moved aside and made
-    /// again.
+    /// Opens the index once the card is there, before there is a flight: the state of an earlier run is needed at once,
+    /// and a flight begins with several waits for the card. An unusable index is moved aside and made again.
     fn open_index(&mut self) {
         let now = self.clock.now();
         let waiting = self.tried_at.is_some_and(|tried| now - tried < RETRY_INDEX);
@@ -236,7 +235,7 @@ impl Keeper {
                 self.shared.set_index(Some(index.clone()));
                 self.index = Some(index);
                 self.complete = false;
-                // Without a flight in the air nobody knows which one is not to be touched.
+                // Without a current flight it is not known which one must not be touched.
                 if self.present.is_some() {
                     self.tasks.push_back(Task::Look);
                 }
@@ -246,7 +245,7 @@ impl Keeper {
         }
     }
 
-    /// One piece of work; whatever fails is told and tried again at the next start.
+    /// One piece of work; a failure is reported, and the work is tried again at the next start.
     fn step(&mut self) {
         let now = self.clock.now();
         if now - self.retained_at >= RETAIN_EVERY {
@@ -272,16 +271,16 @@ impl Keeper {
         }
     }
 
-    /// Whether this is the flight in the air. Its number tells, whatever its name has become since.
+    /// Whether this is the current flight. Its number decides, whatever its present name.
     fn is_present(&self, name: &str) -> bool {
         self.present.as_ref().is_some_and(|(session, present)| {
             present == name || flight::session_of(&self.volume.path(FLIGHTS).join(name)) == Some(*session)
         })
     }
 
-    /// Compares the directories with the index: what the index does not know whole (a card may have been too
-    /// slow at the end for the last segment), or was not closed, is settled flight by flight, newest first;
-    /// what is gone is forgotten.
+    /// Compares the directories with the index: flights that are incomplete in the index (a card may have been too slow
+    /// at the end for the last segment), or were not closed, are settled one by one, newest first; entries of deleted
+    /// flights are removed.
     fn look(&mut self) -> StoreResult<()> {
         let root = self.volume.root().to_owned();
         let known = self.index.as_ref().map_or(Vec::new(), Index::flights);
@@ -311,7 +310,7 @@ impl Keeper {
         Ok(())
     }
 
-    /// Seals a flight's segments, writes its `flight.json`, puts it into the index.
+    /// Seals a flight's segments, writes its `flight.json`, adds it to the index.
     fn settle(&mut self, name: &str) -> StoreResult<()> {
         if self.is_present(name) || !self.volume.path(&format!("{FLIGHTS}/{name}")).is_dir() {
             return Ok(());
@@ -358,22 +357,22 @@ fn entry_of(segment: &FinishedSegment) -> SegmentEntry {
     SegmentEntry { bytes: segment.bytes, messages, span_ns: (first, last) }
 }
 
-/// What sealing did, in words.
+/// The result of sealing, as text.
 pub fn describe(sealing: &Sealing) -> String {
     match sealing {
         Sealing::Whole => "whole".into(),
         Sealing::Closed { chunks, cut_bytes } => {
-            format!("was cut off; {chunks} chunks kept, {cut_bytes} bytes behind them given up")
+            format!("was cut off; {chunks} chunks kept, {cut_bytes} bytes after them discarded")
         }
         Sealing::Rewritten { chunks, lost_bytes } => {
-            format!("had holes; {chunks} chunks kept, {lost_bytes} bytes given up")
+            format!("had gaps; {chunks} chunks kept, {lost_bytes} bytes discarded")
         }
-        Sealing::Removed => "held no whole chunk and was removed".into(),
+        Sealing::Removed => "had no complete chunk and was removed".into(),
     }
 }
 
-/// Seals all segments of a flight and writes its `flight.json`; a flight without any segment left is
-/// removed (`None`). `told` hears of every segment that was not whole.
+/// Seals all segments of a flight and writes its `flight.json`; a flight without any remaining segment is removed
+/// (`None`). `told` is called for every segment that was not complete.
 pub fn settle_flight(
     volume: &Volume,
     name: &str,

@@ -1,8 +1,8 @@
-//! Flights on the data card: append-only MCAP segments, and beside them what can be rebuilt.
+//! Flights on the data card: append-only MCAP segments, and beside them data that can be rebuilt.
 //!
-//! [`Store`] runs three threads: one encodes (frames to JPEG, values to protobuf), one writes and is
-//! the only one to wait for the card, one keeps house (index, sealing, old flights). Callers hold a
-//! [`StoreHandle`] and never wait. `docs/storage.md` tells the layout and what is guaranteed.
+//! [`Store`] runs three threads: one encodes (frames to JPEG, values to protobuf), one writes and is the only one that
+//! waits for the card, one does maintenance (index, sealing, old flights). Callers hold a [`StoreHandle`] and never
+//! wait. `docs/storage.md` describes the layout and the guarantees.
 
 mod backlog;
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! A bounded queue that never makes its producer wait: when it is full the oldest frames go first,
-//! and what went is counted by topic for the record of it.
+//! A bounded queue that never makes its producer wait: when it is full the oldest frames are dropped first, and the
+//! dropped messages are counted by topic for their record.
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, VecDeque};
@@ -8,14 +8,14 @@ use std::time::Duration;
 
 use super::record::Weight;
 
-/// Something waiting.
+/// A waiting item.
 #[derive(Debug)]
 pub struct Entry<T> {
-    /// What.
+    /// The item.
     pub value: T,
     /// Bytes it holds.
     pub bytes: usize,
-    /// Whether it may be given up early.
+    /// Whether it may be dropped early.
     pub weight: Weight,
     /// Its topic, for the record of drops.
     pub topic: Cow<'static, str>,
@@ -23,7 +23,7 @@ pub struct Entry<T> {
     pub log_ns: u64,
 }
 
-/// What was given up since last asked.
+/// Messages dropped since the last call.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Drops {
     /// Messages by topic.
@@ -35,7 +35,7 @@ pub struct Drops {
 }
 
 impl Drops {
-    /// How many messages.
+    /// Number of messages.
     pub fn count(&self) -> u64 {
         self.messages.values().sum()
     }
@@ -48,7 +48,7 @@ impl Drops {
         self.span_ns = Some((first.min(log_ns), last.max(log_ns)));
     }
 
-    /// Joins others.
+    /// Adds other drops.
     pub fn join(&mut self, other: Self) {
         for (topic, count) in other.messages {
             *self.messages.entry(topic).or_default() += count;
@@ -78,14 +78,14 @@ pub struct Queue<T> {
     limit_bytes: usize,
 }
 
-/// What a consumer got.
+/// The result of a pop.
 #[derive(Debug)]
 pub enum Popped<T> {
     /// An entry.
     Entry(Entry<T>),
-    /// Nothing within the time.
+    /// No entry within the time.
     Nothing,
-    /// Nothing, and nothing will come.
+    /// No entry, and none will come.
     Closed,
 }
 
@@ -101,8 +101,8 @@ impl<T> Queue<T> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Adds an entry; makes room by giving up the oldest frames, or gives up the entry itself.
-    /// After [`Self::close`] everything is given up.
+    /// Adds an entry; makes room by dropping the oldest frames, or drops the entry itself. After [`Self::close`]
+    /// everything is dropped.
     pub fn push(&self, entry: Entry<T>) {
         let mut inner = self.lock();
         while inner.bytes + entry.bytes > self.limit_bytes && inner.frames > 0 {
@@ -141,7 +141,7 @@ impl<T> Queue<T> {
         }
     }
 
-    /// Ends it: what waits is still handed out, nothing is added.
+    /// Closes the queue: waiting entries can still be taken, none is added.
     pub fn close(&self) {
         self.lock().closed = true;
         self.filled.notify_all();
@@ -152,7 +152,7 @@ impl<T> Queue<T> {
         self.lock().bytes
     }
 
-    /// What was given up since last asked.
+    /// Messages dropped since the last call.
     pub fn take_drops(&self) -> Drops {
         std::mem::take(&mut self.lock().drops)
     }

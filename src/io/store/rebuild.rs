@@ -12,10 +12,10 @@ use super::record::{BACKFILL_KEY, STATE_TOPIC};
 use super::scan::{SealedSegment, SegmentFile, for_each_record};
 use super::volume::{StoreError, StoreResult};
 
-/// Changes go to the index this many at a time.
+/// Changes are written to the index this many at a time.
 const BATCH: usize = 500;
 
-/// What the index holds of a sealed segment.
+/// The index entry of a sealed segment.
 pub fn entry_of(segment: &SegmentFile, sealed: &SealedSegment) -> SegmentEntry {
     let first = sealed.topics.values().map(|t| t.first_ns).min().unwrap_or(0);
     let last = sealed.topics.values().map(|t| t.last_ns).max().unwrap_or(0);
@@ -23,9 +23,8 @@ pub fn entry_of(segment: &SegmentFile, sealed: &SealedSegment) -> SegmentEntry {
     SegmentEntry { bytes: segment.len(), messages, span_ns: (first, last) }
 }
 
-/// Puts one closed flight into the index: its name, its segments, at most `room` of its records for
-/// the ground (the newest segments first), and states the index does not have. Gives how many records
-/// were queued.
+/// Adds a closed flight to the index: its name, its segments, at most `room` of its records for the ground (the newest
+/// segments first), and states that the index does not have. Returns how many records were queued.
 pub fn index_flight(root: &Path, name: &str, index: &Index, room: u64) -> StoreResult<u64> {
     let dir = root.join(FLIGHTS).join(name);
     let refused =
@@ -64,7 +63,7 @@ fn queue_of(segment: &SegmentFile, sealed: &SealedSegment, index: &Index) -> Vec
         .filter(|c| c.metadata.contains_key(BACKFILL_KEY) || c.topic == STATE_TOPIC)
         .map(|c| c.id)
         .collect();
-    // Numbers of a run that had no card at its start are not the card's: they stay in the segments.
+    // Numbers of a run without a card at its start are not the card's: they stay in the segments.
     let told = |key: &str| sealed.metadata.get(key).and_then(|v| v.parse::<u32>().ok());
     let run = told("session").filter(|session| told("run").is_none_or(|run| run == *session));
     let mut changes = Vec::new();
@@ -97,19 +96,19 @@ fn queue_of(segment: &SegmentFile, sealed: &SealedSegment, index: &Index) -> Vec
     changes
 }
 
-/// Where index and segments differ.
+/// A difference between index and segments.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Difference {
-    /// The index knows a flight that is gone.
+    /// The index has a flight that no longer exists.
     NotOnCard(String),
-    /// The index does not know a flight or a segment.
+    /// The index lacks a flight or a segment.
     NotInIndex(String),
-    /// The index tells of a segment what is not so.
+    /// The entry of a segment is wrong.
     Otherwise(String),
 }
 
 impl Difference {
-    /// Whether the daemon mends it by itself at its next start.
+    /// Whether the daemon corrects it at its next start.
     pub fn is_finished_at_start(&self) -> bool {
         !matches!(self, Self::Otherwise(_))
     }
@@ -120,7 +119,7 @@ impl std::fmt::Display for Difference {
         match self {
             Self::NotOnCard(name) => write!(f, "{name}: in the index, not on the card"),
             Self::NotInIndex(name) => write!(f, "{name}: on the card, not in the index"),
-            Self::Otherwise(name) => write!(f, "{name}: the index tells otherwise"),
+            Self::Otherwise(name) => write!(f, "{name}: the index has another entry"),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! What the store takes: encoded records of named channels, and the numbers channels get in a flight.
+//! Input of the store: encoded records on named channels, and the numbers of channels in a flight.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use crate::io::records::{FRAME_NUMBER_KEY, IN_SEQUENCE, Schema};
 /// Channel metadata key of records that are also queued for the ground station.
 pub const BACKFILL_KEY: &str = "windhover.backfill";
 
-/// Topic of the store's own records of what it had to drop (JSON).
+/// Topic of the store's own records of dropped messages (JSON).
 pub const DROPOUT_TOPIC: &str = "/store/dropout";
 
 /// Topic of the last known states (see `index`).
@@ -24,13 +24,13 @@ pub struct ChannelDef {
     pub topic: String,
     /// Name of the schema, e.g. `windhover.SerialBytes`; empty where there is none.
     pub schema_name: String,
-    /// How the schema is written, e.g. `protobuf`.
+    /// Encoding of the schema, e.g. `protobuf`.
     pub schema_encoding: String,
     /// The schema, e.g. a `FileDescriptorSet`.
     pub schema: Vec<u8>,
-    /// How messages are written, e.g. `protobuf`.
+    /// Encoding of messages, e.g. `protobuf`.
     pub message_encoding: String,
-    /// Whether its records get sequence numbers and wait in the back-fill queue.
+    /// Whether its records get sequence numbers and are queued for back-fill.
     pub backfill: bool,
     /// Whether a message's sequence number is the number of its camera frame.
     pub frame_numbers: bool,
@@ -51,7 +51,7 @@ impl ChannelDef {
     }
 }
 
-/// What may be given up first when the card cannot keep up.
+/// What is dropped first when the card cannot keep up.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Weight {
     /// A camera frame: dropped first, oldest first.
@@ -70,30 +70,30 @@ impl Weight {
 /// One encoded message.
 #[derive(Clone, Debug)]
 pub struct RawRecord {
-    /// Its channel; the same `Arc` every time spares look-ups.
+    /// Its channel; using the same `Arc` each time saves look-ups.
     pub channel: Arc<ChannelDef>,
-    /// When it was heard or made, host time, ns.
+    /// Time of reception or creation, host time, ns.
     pub log_ns: u64,
-    /// When it was true, host time, ns; `log_ns` where nothing else is known.
+    /// Time of validity, host time, ns; `log_ns` where not known.
     pub publish_ns: u64,
     /// Position in its stream; its number in the
     /// run on back-fill channels, the frame's on those of frames.
     pub sequence: u32,
     /// The message.
     pub data: Arc<[u8]>,
-    /// What may be given up first.
+    /// Whether it is dropped first.
     pub weight: Weight,
 }
 
 impl RawRecord {
-    /// Bytes it takes in memory, near enough to bound queues.
+    /// Memory that it takes, bytes, approximately, for bounding queues.
     pub fn bytes(&self) -> usize {
         self.data.len() + 128
     }
 }
 
-/// Schemas and channels under their numbers. In one flight numbers are never used again, so that a
-/// segment whose definitions were lost can be read with a neighbour's.
+/// Schemas and channels under their numbers. Numbers are never reused within a flight, so that a segment whose
+/// definitions were lost can be read with those of a neighbour.
 #[derive(Clone, Default, PartialEq, Eq, Debug)]
 pub struct Definitions {
     /// Schemas by number, from 1: name, encoding, data.
@@ -150,7 +150,7 @@ impl Definitions {
         id
     }
 
-    /// Takes what is missing here from `other`.
+    /// Adds the definitions of `other` that are missing here.
     pub fn complete_from(&mut self, other: &Self) {
         for (id, schema) in &other.schemas {
             self.schemas.entry(*id).or_insert_with(|| schema.clone());
@@ -160,13 +160,13 @@ impl Definitions {
         }
     }
 
-    /// Whether nothing here is told otherwise in `other`.
+    /// Whether no definition here differs in `other`.
     pub fn agrees_with(&self, other: &Self) -> bool {
         self.schemas.iter().all(|(id, s)| other.schemas.get(id) == Some(s))
             && self.channels.iter().all(|(id, c)| other.channels.get(id) == Some(c))
     }
 
-    /// Takes one schema or channel record; others are left alone.
+    /// Takes one schema or channel record; others are ignored.
     pub fn learn(&mut self, record: &mcap::records::Record<'_>) {
         use mcap::records::Record;
         match record {
@@ -181,7 +181,7 @@ impl Definitions {
         }
     }
 
-    /// Whether channel `id` can be read with what is here.
+    /// Whether channel `id` can be read with these definitions.
     pub fn has(&self, id: u16) -> bool {
         self.channels.get(&id).is_some_and(|c| c.schema_id == 0 || self.schemas.contains_key(&c.schema_id))
     }

@@ -1,8 +1,7 @@
 //! The writer thread: records from the queue to the card, durable once a second.
 //!
-//! It is the only one that waits for the card. When the card is full, gone, read-only or broken,
-//! recording stops and says so, what cannot be written is counted and recorded as a dropout, and
-//! every few seconds it is tried again.
+//! It is the only one that waits for the card. When the card is full, gone, read-only or broken, recording stops with a
+//! notice. What cannot be written is counted and recorded as a dropout, and recording is tried again every few seconds.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -30,13 +29,13 @@ const COMMIT_EVERY: Span = Span::from_ns(1_000_000_000);
 /// How long to wait before the card is tried again after an error.
 const RETRY_EVERY: Span = Span::from_ns(2_000_000_000);
 
-/// Recording goes on when this much more than the floor is free.
+/// Recording continues when this much more than the minimum is free.
 const RESUME_MARGIN_BYTES: u64 = 16 << 20;
 
-/// Changes held for an index that does not answer; the segments have them all the same.
+/// Most changes that are held for an index that does not answer; the segments have them too.
 const MAX_CHANGES: usize = 20_000;
 
-/// What the recorder needs to know.
+/// The recorder's settings.
 #[derive(Clone, Debug)]
 pub(super) struct Settings {
     pub(super) config: StoreConfig,
@@ -93,8 +92,8 @@ impl Recorder {
         }
     }
 
-    /// Runs until the queue is closed and empty, then ends the flight. `upstream` gives what was
-    /// dropped before it came here.
+    /// Runs until the queue is closed and empty, then ends the flight. `upstream` reports messages that were dropped
+    /// before the queue.
     pub(super) fn run(mut self, queue: &Queue<RawRecord>, upstream: impl Fn() -> Drops) {
         self.attempt();
         let mut due = self.clock.now() + COMMIT_EVERY;
@@ -136,7 +135,7 @@ impl Recorder {
         }
     }
 
-    /// What the index gets of a record once it is durable.
+    /// The index entry of a record once it is durable.
     fn note_change(&mut self, record: &RawRecord) {
         let Some(session) = self.flight.as_ref().map(FlightWriter::session) else { return };
         if record.channel.backfill && self.shared.session() == Some(session) {
@@ -210,13 +209,13 @@ impl Recorder {
         }
     }
 
-    /// A file that is open outlives the unmounting of its card: what is written to it then reaches nobody.
+    /// An open file survives the unmounting of its card: what is then written to it is lost.
     fn same_card(&self) -> StoreResult<()> {
         if Some(self.volume.device()?) == self.device {
             return Ok(());
         }
-        let gone = std::io::Error::other("the card was taken away or exchanged");
-        Err(StoreError::new("go on recording to", self.volume.root(), gone))
+        let gone = std::io::Error::other("the card was removed or exchanged");
+        Err(StoreError::new("continue recording to", self.volume.root(), gone))
     }
 
     fn pause_for_space(&mut self, floor: u64) {
@@ -225,11 +224,14 @@ impl Recorder {
             return self.fail(&error);
         }
         let path = self.volume.root().display().to_string();
-        self.stop(format!("{path} has less than {} MB free; delete or take off flights", floor >> 20));
+        self.stop(format!(
+            "{path} has less than {} MB free; delete flights or move them off the card",
+            floor >> 20
+        ));
         self.send(Message::NeedSpace);
     }
 
-    /// Says why nothing is recorded, once.
+    /// Reports why nothing is recorded, once.
     fn stop(&mut self, reason: String) {
         self.retry_at = self.clock.now() + RETRY_EVERY;
         self.shared.status().recording = Recording::Stopped(reason.clone());
@@ -251,7 +253,7 @@ impl Recorder {
         self.stop(error.to_string());
     }
 
-    /// Tries to record: begins the flight, or goes on with it.
+    /// Tries to record: begins the flight, or continues it.
     fn attempt(&mut self) {
         let begins = self.flight.is_none();
         match self.try_open() {
@@ -265,7 +267,7 @@ impl Recorder {
                     Some(_) => StoreNotice::Resumed { flight },
                     None => StoreNotice::Started { flight },
                 });
-                // Told after it: what the index tells follows from this.
+                // Notified afterwards: the index's notices follow from this.
                 if let (true, Some(flight)) = (begins, &self.flight) {
                     let (session, name) = (flight.session(), flight.name().to_owned());
                     self.send(Message::Begun { session, name });
@@ -277,7 +279,7 @@ impl Recorder {
 
     fn try_open(&mut self) -> StoreResult<()> {
         if self.device.is_some() && self.volume.device().ok() != self.device {
-            // A file that stays open, the lock's too, keeps a card that was taken out busy.
+            // An open file, also the lock's, keeps a removed card busy.
             self.lock = None;
         }
         if self.settings.config.require_mount {
@@ -291,7 +293,7 @@ impl Recorder {
             let full = std::io::Error::from(std::io::ErrorKind::StorageFull);
             return Err(StoreError::new("keep a reserve on", self.volume.root(), full));
         }
-        // The lock of a card that was pulled is worth nothing: it is taken anew.
+        // The lock on a removed card has no effect: it is acquired again.
         self.lock = None;
         self.lock = Some(RecorderLock::acquire(self.volume.root())?);
         self.device = Some(self.volume.device()?);
@@ -310,7 +312,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// Gives the flight its date once the receiver told it.
+    /// Names the flight by its date once the receiver has reported it.
     fn rename(&mut self) {
         let (Some(start), Some(flight)) = (self.shared.start(), &mut self.flight) else { return };
         let from = flight.name().to_owned();
@@ -325,7 +327,7 @@ impl Recorder {
         }
     }
 
-    /// Writes down what was lost, in the segment, where a reader finds it.
+    /// Records the losses in the segment, where readers find them.
     fn record_dropout(&mut self, now: MonoTime) {
         let missed = std::mem::take(&mut self.missed);
         let (messages, bytes) = (missed.count(), missed.bytes);
@@ -337,7 +339,7 @@ impl Recorder {
             "messages": missed.messages,
             "reason": self.trouble.as_deref().unwrap_or("the card did not keep up"),
         });
-        // In its place among the others, not ahead of what still waits.
+        // At its place in time among the others, not before waiting records.
         let at = self.heard_ns.unwrap_or(unsigned(now));
         self.take(&RawRecord {
             channel: Arc::clone(&self.dropouts),
@@ -357,7 +359,7 @@ impl Recorder {
         if self.changes.is_empty() {
             return;
         }
-        // Sent, or nobody keeps an index any more; only a keeper that is behind is tried again.
+        // Sent, or there is no keeper any more; only a keeper that is behind is tried again.
         let sent = self.keeper.try_send(Message::Changes(std::mem::take(&mut self.changes)));
         if let Err(TrySendError::Full(Message::Changes(held))) = sent {
             self.changes = held;
@@ -366,7 +368,7 @@ impl Recorder {
         }
     }
 
-    /// What the keeper misses it finds on the card.
+    /// A message that the keeper misses concerns data that it finds on the card.
     fn send(&self, message: Message) {
         let _ = self.keeper.try_send(message);
     }
@@ -392,7 +394,7 @@ impl Recorder {
     }
 }
 
-/// An empty mount point is a directory of the system card: recording there would fill it.
+/// An empty mount point is a directory of the system disk: recording there would fill that.
 fn require_mount(volume: &Volume) -> StoreResult<()> {
     let root = volume.root();
     let parent = root.parent().unwrap_or(root);
@@ -403,7 +405,7 @@ fn require_mount(volume: &Volume) -> StoreResult<()> {
     Ok(())
 }
 
-/// Metadata every segment of this program carries.
+/// Metadata that this program writes to every segment.
 pub(super) fn program_metadata() -> BTreeMap<String, String> {
     BTreeMap::from([
         ("version".to_owned(), env!("CARGO_PKG_VERSION").to_owned()),

@@ -1,4 +1,4 @@
-//! Making room: which flights go, oldest first; never the one in the air, never one marked `keep`.
+//! Making room: which flights are deleted, oldest first; never the current one, never one marked `keep`.
 
 use std::path::Path;
 
@@ -7,8 +7,8 @@ use super::volume::{StoreResult, Volume};
 use crate::config::StoreConfig;
 use windhover_base::time::UtcTime;
 
-/// Orders flights by age: by run of the daemon, which counts up whatever the clock says; by name
-/// where the run is not known.
+/// Orders flights by age: by run of the daemon, which counts up independently of the clock; by name where the run is
+/// not known.
 pub fn age_order(root: &Path, name: &str) -> (u32, String) {
     (flight::session_of(&root.join(FLIGHTS).join(name)).unwrap_or(0), name.to_owned())
 }
@@ -27,15 +27,14 @@ pub fn start_of(name: &str) -> Option<UtcTime> {
     })
 }
 
-/// Bytes that shall be free: as configured, but never more than a tenth of the card, so that a small
-/// card is not emptied.
+/// Bytes that must be free: as configured, but at most a tenth of the card, so that a small card is not emptied.
 pub fn wanted_free(config: &StoreConfig, capacity: u64) -> u64 {
     (config.free_target_mb << 20).min(capacity / 10)
 }
 
-/// The flights that must go, oldest first, and why. `free` and `wanted` in bytes; `present` is the run
-/// that must not; ages are against `now`, the
-/// start of the present flight as the receiver told it, or not looked at where it is not known.
+/// The flights to delete, oldest first, with the reasons. `free` and `wanted` in bytes; `present` is the current run,
+/// which is kept; ages are relative to `now`, the start of the current flight by the receiver, and ignored where it is
+/// not known.
 pub fn doomed(
     flights: &[FlightInfo],
     present: Option<u32>,
@@ -67,7 +66,7 @@ pub fn doomed(
     gone
 }
 
-/// Deletes what must go; gives what went and why.
+/// Deletes flights; returns which, and why.
 pub fn make_room(
     volume: &Volume,
     config: &StoreConfig,
@@ -86,7 +85,7 @@ pub fn make_room(
     flights.sort_by(|a, b| (a.session, &a.name).cmp(&(b.session, &b.name)));
     let mut gone = Vec::new();
     for (info, reason) in doomed(&flights, present, config, (free, wanted), now) {
-        // Somebody may have marked it since.
+        // It may have been marked since.
         if flight::flight_info(volume.root(), &info.name).is_ok_and(|now| now.keep) {
             continue;
         }

@@ -1,5 +1,5 @@
-//! Reading segments, whole or damaged: the quick look at a sealed one, and the walk that finds
-//! every whole chunk of one that a power cut tore or holed.
+//! Reading segments, complete or damaged: the quick look at a sealed one, and the search for every complete chunk of
+//! one that a power cut damaged.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -15,7 +15,7 @@ use super::summary::{PlacedChunk, Summary, TopicStats};
 use super::volume::{StoreError, StoreResult};
 use crate::io::mcap_record::{MAX_CHUNK_BYTES, RECORD_HEAD, longest, parse, split, unpack_chunk};
 
-/// What a sealed segment says of itself.
+/// The summary of a sealed segment.
 #[derive(Clone, Debug, Default)]
 pub struct SealedSegment {
     /// Its schemas and channels.
@@ -30,28 +30,28 @@ pub struct SealedSegment {
     pub summary_start: u64,
 }
 
-/// What is whole in a segment.
+/// The complete parts of a segment.
 #[derive(Debug, Default)]
 pub struct Salvage {
-    /// Whether magic, header and definitions at the head are whole.
+    /// Whether magic, header and definitions at the head are complete.
     pub head_whole: bool,
-    /// Configuration, where its attachment is whole.
+    /// Configuration, where its attachment is complete.
     pub config: Option<String>,
-    /// Metadata `windhover`, where whole.
+    /// Metadata `windhover`, where complete.
     pub metadata: Option<BTreeMap<String, String>>,
-    /// Schemas and channels found anywhere; those in chunks, which have checksums, come first.
+    /// Schemas and channels found anywhere; those in chunks, which have checksums, take precedence.
     pub definitions: Definitions,
-    /// Schemas and channels the head says.
+    /// Schemas and channels of the head.
     pub head_definitions: Definitions,
-    /// Whole chunks, in the order of the file.
+    /// Complete chunks, in the order of the file.
     pub chunks: Vec<PlacedChunk>,
     /// The head's part of the summary section.
     pub head: Summary,
-    /// Whether each chunk follows the one before without a hole, message indexes included.
+    /// Whether each chunk follows the previous one without a gap, including message indexes.
     pub contiguous: bool,
     /// Where the last chunk's record ends; the head's end where there is none.
     pub chunks_end: u64,
-    /// Where the last chunk's message indexes and padding end, where these are whole too.
+    /// Where the last chunk's message indexes and padding end, where these are complete too.
     pub last_commit_end: Option<u64>,
     /// Length of the file.
     pub length: u64,
@@ -79,7 +79,7 @@ impl SegmentFile {
         self.length
     }
 
-    /// Whether it holds nothing.
+    /// Whether it is empty.
     pub fn is_empty(&self) -> bool {
         self.length == 0
     }
@@ -90,8 +90,8 @@ impl SegmentFile {
         Ok(bytes)
     }
 
-    /// The bytes of a record at `offset`: op code and body; `None` where none can be there. A page
-    /// the card cannot read counts as damaged.
+    /// A record at `offset`: op code and body; `None` where there cannot be one. A page that the card cannot read
+    /// counts as damaged.
     fn record(&self, offset: u64) -> Option<(u8, Vec<u8>)> {
         let head = self.read(offset, RECORD_HEAD as u64).ok()?;
         let length = u64::from_le_bytes(head[1..].try_into().ok()?);
@@ -174,8 +174,8 @@ impl SegmentFile {
         }
     }
 
-    /// Whether everything `salvage` found of this file is what its summary tells, without a hole
-    /// anywhere that a reader could stumble over.
+    /// Whether everything that `salvage` found in this file agrees with its summary, without a gap that could disturb a
+    /// reader.
     pub fn agrees(&self, sealed: &SealedSegment, salvage: &Salvage) -> bool {
         let Some(end) = salvage.last_commit_end.or(salvage.chunks.is_empty().then_some(salvage.chunks_end))
         else {
@@ -194,8 +194,8 @@ impl SegmentFile {
             && end + data_end.len() as u64 == sealed.summary_start
     }
 
-    /// Finds everything whole. Chunks begin on pages, so after a hole the walk goes on page by page
-    /// until one begins again.
+    /// Finds everything that is complete. Chunks begin on pages, so after a gap the search continues page by page until
+    /// one begins.
     pub fn salvage(&self) -> Salvage {
         let mut salvage = Salvage { length: self.length, contiguous: true, ..Salvage::default() };
         let mut at = self.salvage_head(&mut salvage);
@@ -220,7 +220,7 @@ impl SegmentFile {
         salvage
     }
 
-    /// Reads the head up to its padding; gives where it ends, or where reading had to stop.
+    /// Reads the head up to its padding; returns where it ends, or where reading had to stop.
     fn salvage_head(&self, salvage: &mut Salvage) -> u64 {
         if self.read(0, MAGIC.len() as u64).ok().as_deref() != Some(&MAGIC[..]) {
             return 0;
@@ -229,7 +229,7 @@ impl SegmentFile {
         loop {
             let record = self.record(at).filter(|(code, _)| *code != op::CHUNK);
             let Some((code, body)) = record else {
-                // A head ends on a page; anywhere else it is cut or holed.
+                // A head ends on a page; otherwise it is cut or has a gap.
                 salvage.head_whole = at.is_multiple_of(PAGE);
                 return at;
             };
@@ -258,7 +258,7 @@ impl SegmentFile {
         }
     }
 
-    /// Only what the head says.
+    /// Only the content of the head.
     pub fn salvage_head_only(&self) -> Salvage {
         let mut salvage = Salvage { length: self.length, ..Salvage::default() };
         salvage.chunks_end = self.salvage_head(&mut salvage);
@@ -266,7 +266,7 @@ impl SegmentFile {
     }
 
     fn salvage_chunk(&self, at: u64, definitions: &mut Definitions) -> Option<PlacedChunk> {
-        // Most pages inside chunks are told apart by their first byte.
+        // The first byte excludes most pages inside chunks.
         if self.read(at, 1).ok()? != [op::CHUNK] {
             return None;
         }
@@ -282,7 +282,7 @@ impl SegmentFile {
         Some(PlacedChunk { header, offset: at, length, messages })
     }
 
-    /// Where the message indexes and padding after a chunk end; `None` where they are not whole.
+    /// Where the message indexes and padding after a chunk end; `None` where they are not complete.
     fn indexes_end(&self, chunk: &PlacedChunk) -> Option<u64> {
         let mut at = chunk.offset + chunk.length;
         for (channel, entries) in &chunk.messages {
@@ -303,13 +303,13 @@ impl SegmentFile {
         }
     }
 
-    /// Bytes of the file from `offset`, as they are.
+    /// Bytes of the file from `offset`, unchanged.
     pub(super) fn copy_out(&self, offset: u64, length: u64) -> StoreResult<Vec<u8>> {
         self.read(offset, length)
     }
 }
 
-/// Calls `visit` with each record of an unpacked chunk and its offset.
+/// Calls `visit` with each record of an uncompressed chunk and its offset.
 pub fn for_each_record(records: &[u8], mut visit: impl FnMut(u64, Record<'_>)) {
     let mut rest = records;
     while let Some((code, body, after)) = split(rest) {

@@ -1,5 +1,5 @@
-//! Sealing: a segment that lacks its end, or has holes, becomes one that every reader opens, with
-//! every whole chunk kept.
+//! Sealing: a segment without its end, or with gaps, becomes one that every reader opens, with every complete chunk
+//! kept.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,46 +10,46 @@ use super::summary::{PlacedChunk, Summary};
 use super::volume::{StoreResult, Volume};
 use super::{flight, format};
 
-/// What sealing did.
+/// The result of sealing.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Sealing {
-    /// It was whole already.
+    /// It was already complete.
     Whole,
-    /// Its end was missing and was written behind the last whole chunk.
+    /// Its end was missing and was written after the last complete chunk.
     Closed {
         /// Chunks kept.
         chunks: usize,
-        /// Bytes behind them that were no whole chunk.
+        /// Bytes after them that were not a complete chunk.
         cut_bytes: u64,
     },
-    /// It had holes and was written anew.
+    /// It had gaps and was written again.
     Rewritten {
         /// Chunks kept.
         chunks: usize,
-        /// Bytes given up.
+        /// Bytes discarded.
         lost_bytes: u64,
     },
-    /// It held no whole chunk and was removed.
+    /// It had no complete chunk and was removed.
     Removed,
 }
 
-/// How a segment lies on the card.
+/// Condition of a segment on the card.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Condition {
-    /// Sealed, and as its seal says.
+    /// Sealed, and consistent with its summary.
     Whole,
-    /// Without its end, and whole up to there: what a kill or a power cut leaves.
+    /// Without its end, and complete up to there: the result of a kill or a power cut.
     CutOff {
-        /// Whole chunks.
+        /// Complete chunks.
         chunks: usize,
-        /// Bytes behind them.
+        /// Bytes after them.
         cut_bytes: usize,
     },
-    /// Otherwise than it was written.
+    /// Different from what was written.
     Damaged,
 }
 
-/// Looks at a segment, every byte of it.
+/// Examines every byte of a segment.
 pub fn condition(segment: &SegmentFile) -> Condition {
     let salvage = segment.salvage();
     if let Some(sealed) = segment.sealed() {
@@ -63,11 +63,11 @@ pub fn condition(segment: &SegmentFile) -> Condition {
         && salvage.metadata.is_some()
         && salvage.head_definitions.agrees_with(&salvage.definitions)
         && salvage.contiguous;
-    // The head alone was still being written where there is no chunk.
+    // Where there is no chunk, the head was still being written.
     if is_whole || chunks == 0 { Condition::CutOff { chunks, cut_bytes } } else { Condition::Damaged }
 }
 
-/// Seals one segment of a flight directory. `deep` also reads every chunk of one that looks whole.
+/// Seals one segment of a flight directory. `deep` also reads every chunk of one that looks complete.
 pub fn seal_segment(volume: &Volume, dir: &str, name: &str, deep: bool) -> StoreResult<Sealing> {
     let path = format!("{dir}/{name}");
     let segment = SegmentFile::open(&volume.path(&path))?;
@@ -103,7 +103,7 @@ pub fn seal_segment(volume: &Volume, dir: &str, name: &str, deep: bool) -> Store
     }
 }
 
-/// Numbers are one flight's, so a lost head is found again in the segments beside it.
+/// Numbers are unique in a flight, so a lost head is restored from the neighbouring segments.
 fn complete_from_neighbours(volume: &Volume, dir: &str, name: &str, salvage: &mut Salvage) {
     for other in flight::segment_names(&volume.path(dir)).iter().filter(|other| *other != name) {
         let Ok(file) = SegmentFile::open(&volume.path(&format!("{dir}/{other}"))) else { continue };
@@ -117,8 +117,8 @@ fn complete_from_neighbours(volume: &Volume, dir: &str, name: &str, salvage: &mu
     }
 }
 
-/// Messages of a channel nobody defines any more are kept under a topic of their own, so that no
-/// reader stumbles over them.
+/// Messages of a channel without any definition are kept under a separate topic, so that every reader can read the
+/// file.
 fn invent_missing(salvage: &mut Salvage) -> bool {
     let used: BTreeSet<u16> = salvage.chunks.iter().flat_map(|c| c.messages.keys().copied()).collect();
     let missing: Vec<u16> = used.into_iter().filter(|id| !salvage.definitions.has(*id)).collect();
@@ -141,8 +141,8 @@ fn close_in_place(volume: &Volume, path: &str, salvage: &Salvage) -> StoreResult
     for chunk in earlier {
         summary.chunk(&mut Vec::new(), chunk.offset + chunk.length, chunk);
     }
-    // What was acknowledged ends on a page and is not touched again. Where the last commit is not
-    // whole it was not acknowledged; its chunk is, so its indexes are written again.
+    // Acknowledged data ends on a page and is not changed. Where the last commit is incomplete it was not acknowledged;
+    // its chunk is complete, so its indexes are written again.
     let mut out = Vec::new();
     let end = match salvage.last_commit_end {
         Some(end) => {

@@ -1,4 +1,4 @@
-//! Segments cut and holed at many places, sealed, and read by a reader that forgives nothing.
+//! Segments cut and damaged at many places, sealed, and read by a strict reader.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -26,7 +26,7 @@ fn channel(topic: &str) -> Arc<ChannelDef> {
     })
 }
 
-/// Message `i` of a segment, of a size that makes chunks span pages unevenly.
+/// Message `i` of a segment, of a size that makes chunks cross pages irregularly.
 fn record(channels: &[Arc<ChannelDef>], i: u32) -> RawRecord {
     let data: Vec<u8> = (0..200 + (i as usize * 7919) % 3000).map(|k| (k as u32 ^ (i * 31)) as u8).collect();
     RawRecord {
@@ -39,7 +39,7 @@ fn record(channels: &[Arc<ChannelDef>], i: u32) -> RawRecord {
     }
 }
 
-/// Writes segment `number` with `chunks` chunks; gives its bytes and where each commit ended.
+/// Writes segment `number` with `chunks` chunks; returns its bytes and where each commit ended.
 fn write_segment(volume: &Volume, number: u32, chunks: u32, finish: bool) -> (Vec<u8>, Vec<u64>) {
     let channels = [channel("/gps/serial"), channel("/camera/image"), channel("/target/ugv/state")];
     let mut definitions = Definitions::default();
@@ -68,7 +68,7 @@ fn write_segment(volume: &Volume, number: u32, chunks: u32, finish: bool) -> (Ve
     (std::fs::read(volume.path(&format!("F/{name}"))).unwrap(), ends)
 }
 
-/// Sequence numbers of all messages, read by the `mcap` crate with every check on.
+/// Sequence numbers of all messages, read by the `mcap` crate with all its checks.
 fn read_strictly(path: &Path) -> BTreeSet<u32> {
     let bytes = std::fs::read(path).unwrap();
     let summary = mcap::Summary::read(&bytes).unwrap().expect("has a summary");
@@ -85,7 +85,7 @@ fn read_strictly(path: &Path) -> BTreeSet<u32> {
             }
         }
     }
-    assert_eq!(linear, indexed, "the index tells of the same messages");
+    assert_eq!(linear, indexed, "the index has the same messages");
     assert_eq!(summary.stats.expect("has statistics").message_count, linear.len() as u64);
     for index in &summary.attachment_indexes {
         assert_eq!(mcap::read::attachment(&bytes, index).unwrap().name, "config.toml");
@@ -143,7 +143,7 @@ fn a_segment_holed_anywhere_keeps_every_other_chunk() {
             std::fs::write(&path, &holed).unwrap();
             seal_segment(&volume, "F", "000000.mcap", true).unwrap();
             let read = read_strictly(&path);
-            // The last page of commits is summary; a page hits one commit, or the head.
+            // The last page of commits is summary; a page affects one commit, or the head.
             let hit = ends.iter().filter(|end| (page as u64 * 4096) < **end).count().min(1);
             assert!(
                 read.len() >= (6 - hit) * PER_CHUNK as usize,
@@ -159,7 +159,7 @@ fn a_lost_head_is_found_again_in_the_neighbour() {
     let (_dir, volume) = fresh();
     let (bytes, ends) = write_segment(&volume, 0, 2, false);
     write_segment(&volume, 1, 2, true);
-    // Head and first chunk, and with them every definition in the file, are gone.
+    // Head and first chunk, and with them every definition in the file, are lost.
     let mut holed = bytes;
     holed[..ends[0] as usize].fill(0);
     let path = volume.path("F/000000.mcap");

@@ -1,11 +1,10 @@
 //! Writing one segment: records gather into chunks, a commit appends them and makes them durable.
 //!
-//! Layout of a segment: magic, header, metadata `windhover`, all schemas and channels of the
-//! flight, attachment `config.toml`, padding; then per chunk one append of the chunk, its message
-//! indexes and padding to the next page; at the end data end, summary, footer, magic.
-//! A chunk starts on a page of its own, so that a card which loses power in mid-write can only
-//! damage what was not acknowledged. Definitions are repeated inside the first chunk and every
-//! tenth after it: a segment whose head is lost still reads.
+//! Layout of a segment: magic, header, metadata `windhover`, all schemas and channels of the flight, attachment
+//! `config.toml`, padding; then for each chunk one append of the chunk, its message indexes and padding to the next
+//! page; at the end data end, summary, footer, magic. A chunk starts on a new page, so that a power loss in the middle
+//! of a write can only damage data that were not acknowledged. Definitions are repeated inside the first chunk and
+//! every tenth after it: a segment whose head is lost can still be read.
 
 use std::collections::BTreeMap;
 
@@ -14,19 +13,19 @@ use super::record::{Definitions, RawRecord, Weight};
 use super::summary::{PlacedChunk, Summary, TopicStats};
 use super::volume::{AppendFile, StoreError, StoreResult, Volume};
 
-/// What a card writes as a whole: appends start and end on it.
+/// The unit in which a card writes: appends start and end on it.
 pub const PAGE: u64 = 4096;
 
-/// Definitions are repeated in every chunk of which the number is a multiple of this.
+/// Definitions are repeated in every chunk whose number is a multiple of this.
 const REPEAT_DEFINITIONS: usize = 10;
 
-/// Blocks are asked for this many bytes at a time.
+/// Blocks are reserved this many bytes at a time.
 const RESERVE_STEP: u64 = 16 << 20;
 
-/// Kept reserved beyond the last commit, so that the summary fits even when the card fills up.
+/// Reserved beyond the last commit, so that the summary fits even when the card becomes full.
 const RESERVE_END: u64 = 256 << 10;
 
-/// What every segment of a flight carries at its head.
+/// The head of every segment of a flight.
 #[derive(Clone, Debug, Default)]
 pub struct Head {
     /// The configuration, as attachment `config.toml`.
@@ -37,7 +36,7 @@ pub struct Head {
     pub time_ns: u64,
 }
 
-/// Appends the head to `out`, an empty file's content, and notes it in `summary`.
+/// Appends the head to `out`, the content of an empty file, and enters it in `summary`.
 pub(super) fn put_head(out: &mut Vec<u8>, summary: &mut Summary, head: &Head, definitions: &Definitions) {
     out.extend_from_slice(&format::MAGIC);
     format::put_header(out, concat!("windhover ", env!("CARGO_PKG_VERSION")));
@@ -59,10 +58,10 @@ pub(super) fn put_head(out: &mut Vec<u8>, summary: &mut Summary, head: &Head, de
     format::pad_to_page(out, 0, PAGE);
 }
 
-/// A chunk may span this much log time: readers put messages in order over a second.
+/// A chunk may span this much log time: readers sort messages over one second.
 const CHUNK_SPAN_NS: u64 = 900_000_000;
 
-/// A chunk ends when it holds this many bytes, so that memory stays bounded.
+/// A chunk ends at this many bytes, so that memory stays bounded.
 const CHUNK_BYTES: usize = 8 << 20;
 
 #[derive(Debug, Default)]
@@ -83,8 +82,8 @@ impl Chunk {
     }
 }
 
-/// A segment being written. Frames and everything else go into chunks of their own: what reads only
-/// the latter (lists, back-fill, a replay without frames) then touches a hundredth of the bytes.
+/// A segment being written. Frames and other messages go into separate chunks: operations without frames (lists,
+/// back-fill, a replay without frames) then read a hundredth of the bytes.
 #[derive(Debug)]
 pub struct SegmentWriter {
     file: AppendFile,
@@ -98,8 +97,8 @@ pub struct SegmentWriter {
 }
 
 impl SegmentWriter {
-    /// Creates the file, writes its head and makes both durable. Frames are compressed as told,
-    /// everything else with lz4.
+    /// Creates the file, writes its head and makes both durable. Frames are compressed as configured, everything else
+    /// with lz4.
     pub fn create(
         volume: &Volume,
         (dir, name): (&str, &str),
@@ -127,8 +126,8 @@ impl SegmentWriter {
         })
     }
 
-    /// Adds a record; durable after the next [`Self::commit`]. Chunks that are long enough are
-    /// written on the way; on an error their records are lost.
+    /// Adds a record; durable after the next [`Self::commit`]. Chunks that are long enough are written at once; on an
+    /// error their records are lost.
     pub fn push(&mut self, definitions: &mut Definitions, record: &RawRecord) -> StoreResult<()> {
         let begun = *self.begun_ns.get_or_insert(record.log_ns);
         if record.log_ns.saturating_sub(begun) >= CHUNK_SPAN_NS || self.pending_bytes() >= CHUNK_BYTES {
@@ -169,8 +168,8 @@ impl SegmentWriter {
         self.summary.chunk_count() == 0
     }
 
-    /// Writes what is pending; all of it is durable on return. On an error what is pending is lost,
-    /// what was acknowledged before is not.
+    /// Writes all pending data, durable on return. On an error the pending data are lost, but not what was acknowledged
+    /// before.
     pub fn commit(&mut self) -> StoreResult<()> {
         self.write_chunks()?;
         if std::mem::take(&mut self.unsynced) {
@@ -179,7 +178,7 @@ impl SegmentWriter {
         Ok(())
     }
 
-    /// Writes what is pending without waiting for it to be durable.
+    /// Writes pending data without waiting for durability.
     fn write_chunks(&mut self) -> StoreResult<()> {
         self.pending = 0;
         self.begun_ns = None;
@@ -211,13 +210,13 @@ impl SegmentWriter {
         self.summary.topics(definitions)
     }
 
-    /// Follows a rename of the flight.
+    /// Updates the path after a rename of the flight.
     pub fn set_path(&mut self, path: std::path::PathBuf) {
         self.file.set_path(path);
     }
 
-    /// Commits what is left, writes the summary, gives back reserved blocks; durable on return.
-    /// Gives the length of the file and its number of chunks.
+    /// Commits the rest, writes the summary, returns reserved blocks; durable on return. Returns the length of the file
+    /// and its number of chunks.
     pub fn finish(mut self, definitions: &Definitions) -> StoreResult<(u64, usize)> {
         self.write_chunks()?;
         let mut out = Vec::new();

@@ -1,39 +1,39 @@
-//! What the store tells: state of the card for the health line, and notices for the operator.
+//! Reports of the store: state of the card for the health line, and notices for the operator.
 
 use std::collections::VecDeque;
 use std::fmt;
 
 use serde::Serialize;
 
-/// What the recorder does.
+/// State of the recorder.
 #[derive(Clone, PartialEq, Eq, Debug, Default, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Recording {
-    /// Not yet.
+    /// Not started yet.
     #[default]
     Starting,
-    /// Everything goes to the card.
+    /// Everything is recorded.
     On,
-    /// Nothing goes to the card, because of this; tried again every few seconds.
+    /// Nothing is recorded, for this reason; tried again every few seconds.
     Stopped(String),
     /// Configured off, or ended.
     Off,
 }
 
-/// How the store does.
+/// State of the store.
 #[derive(Clone, PartialEq, Debug, Default, Serialize)]
 pub struct StoreStatus {
-    /// What the recorder does.
+    /// State of the recorder.
     pub recording: Recording,
     /// Name of the flight's directory.
     pub flight: String,
-    /// Megabytes free on the card; `None` where it cannot be asked.
+    /// Megabytes free on the card; `None` where not known.
     pub free_mb: Option<u64>,
-    /// 99th percentile of the last 600 commits (chunk to the card and fdatasync), ms.
+    /// 99th percentile of the last 600 commits (chunk and fdatasync), ms.
     pub fsync_p99_ms: f64,
     /// Longest commit since the start, ms.
     pub fsync_max_ms: f64,
-    /// Times that something was dropped.
+    /// Number of dropouts.
     pub dropouts: u64,
     /// Messages dropped.
     pub dropped_messages: u64,
@@ -43,24 +43,24 @@ pub struct StoreStatus {
     pub waiting_bytes: u64,
     /// Host time of the last commit, ns; 0 before the first.
     pub last_commit_ns: i64,
-    /// Whether the index answers.
+    /// Whether the index is open.
     pub index_ready: bool,
-    /// After the end: why the last of the flight is not on the card; `None` where it is.
+    /// After the end: why the last part of the flight is not on the card; `None` where it is.
     pub unwritten: Option<String>,
 }
 
 impl StoreStatus {
-    /// After the end: what was done, in words, and whether the end of the flight is on the card.
+    /// After the end: the result as text, and whether the end of the flight is on the card.
     pub fn outcome(&self) -> Result<String, String> {
         match (&self.unwritten, self.dropped_messages) {
             (Some(reason), _) => Err(reason.clone()),
             (None, 0) => Ok("everything is written".into()),
-            (None, lost) => Ok(format!("written, but for {lost} messages that were lost on the way")),
+            (None, lost) => Ok(format!("written, except for {lost} messages that were lost before")),
         }
     }
 }
 
-/// Something an operator should know.
+/// A notice for the operator.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum StoreNotice {
     /// A flight began.
@@ -68,52 +68,52 @@ pub enum StoreNotice {
         /// Its name.
         flight: String,
     },
-    /// Nothing goes to the card any more.
+    /// Recording has stopped.
     Stopped {
         /// Why, and what to do.
         reason: String,
     },
-    /// Recording goes on.
+    /// Recording continues.
     Resumed {
-        /// In which flight.
+        /// The flight.
         flight: String,
     },
-    /// The flight has its date.
+    /// The flight was named by its date.
     Named {
         /// Old name.
         from: String,
         /// New name.
         to: String,
     },
-    /// Something was dropped because the card did not keep up.
+    /// Data was dropped because the card did not keep up.
     Dropout {
         /// Messages.
         messages: u64,
         /// Bytes.
         bytes: u64,
     },
-    /// Less is free than wanted, and nothing may be deleted.
+    /// Less space is free than required, and nothing may be deleted.
     AlmostFull {
         /// Megabytes free.
         free_mb: u64,
     },
-    /// A segment that was cut or holed was sealed.
+    /// A segment that was cut or had a gap was sealed.
     Sealed {
         /// Flight and segment.
         segment: String,
         /// What was done.
         what: String,
     },
-    /// A flight was deleted to make room or for its age.
+    /// A flight was deleted for space or for its age.
     Deleted {
         /// Its name.
         flight: String,
-        /// Why.
+        /// The reason.
         reason: String,
     },
-    /// The index was unusable and is being made again.
+    /// The index was unusable and is being rebuilt.
     IndexRebuilding {
-        /// Why.
+        /// The reason.
         reason: String,
     },
     /// The index is complete.
@@ -121,15 +121,15 @@ pub enum StoreNotice {
         /// Flights in it.
         flights: usize,
     },
-    /// Something beside recording failed.
+    /// A part other than recording failed.
     Failed {
-        /// What.
+        /// The failure.
         reason: String,
     },
 }
 
 impl StoreNotice {
-    /// Its fixed name, which people search logs for.
+    /// Its fixed name, by which logs are searched.
     pub const fn name(&self) -> &'static str {
         match self {
             Self::Started { .. } => "recording_started",
@@ -146,7 +146,7 @@ impl StoreNotice {
         }
     }
 
-    /// Whether the operator should do something.
+    /// Whether the operator should act.
     pub const fn is_warning(&self) -> bool {
         matches!(
             self,
@@ -170,11 +170,11 @@ impl fmt::Display for StoreNotice {
                 write!(f, "the card does not keep up: {messages} messages ({} kB) dropped", bytes / 1000)
             }
             Self::AlmostFull { free_mb } => {
-                write!(f, "{free_mb} MB free and no flight may be deleted; take flights off the card")
+                write!(f, "{free_mb} MB free and no flight may be deleted; move flights off the card")
             }
             Self::Sealed { segment, what } => write!(f, "{segment}: {what}"),
             Self::Deleted { flight, reason } => write!(f, "flight {flight} deleted: {reason}"),
-            Self::IndexRebuilding { reason } => write!(f, "{reason}; making it again from the segments"),
+            Self::IndexRebuilding { reason } => write!(f, "{reason}; rebuilding it from the segments"),
             Self::IndexReady { flights } => write!(f, "index complete: {flights} flights"),
             Self::Failed { reason } => write!(f, "{reason}"),
         }
@@ -191,7 +191,7 @@ pub struct Durations {
 impl Durations {
     const KEPT: usize = 600;
 
-    /// Notes one.
+    /// Adds one.
     pub fn add(&mut self, ms: f64) {
         if self.last.len() == Self::KEPT {
             self.last.pop_front();

@@ -1,4 +1,4 @@
-//! What the store's threads and its handles share.
+//! Shared by the store's threads and its handles.
 
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::mpsc::SyncSender;
@@ -9,16 +9,16 @@ use super::index::Index;
 use super::status::{StoreNotice, StoreStatus};
 use windhover_base::time::UtcTime;
 
-/// What the store's threads and its handles share.
+/// Shared by the store's threads and its handles.
 #[derive(Debug)]
 pub(super) struct StoreShared {
     status: Mutex<StoreStatus>,
     notices: SyncSender<StoreNotice>,
     index: RwLock<Option<Index>>,
-    /// Start of the flight, once it is known and not yet used.
+    /// Start of the flight, once it is known, until it is used.
     start: Mutex<Option<UtcTime>>,
     region: Mutex<Option<Region>>,
-    /// Number of the run; 0 until the card told it.
+    /// Number of the run; 0 until the card reported it.
     session: AtomicU32,
     stopping: AtomicBool,
 }
@@ -40,7 +40,7 @@ impl StoreShared {
         }
     }
 
-    /// Tells the operator. Where nobody reads, the oldest notices count more: this one is let go.
+    /// Sends a notice to the operator. Where nothing reads, the oldest notices are worth more: this one is dropped.
     pub(super) fn notice(&self, notice: StoreNotice) {
         let _ = self.notices.try_send(notice);
     }
@@ -78,7 +78,7 @@ impl StoreShared {
         Some(self.session.load(Ordering::Acquire)).filter(|s| *s != 0)
     }
 
-    /// Settles the number of the run; the first call counts.
+    /// Sets the number of the run; only the first call counts.
     pub(super) fn settle_session(&self, session: u32) -> u32 {
         match self.session.compare_exchange(0, session, Ordering::AcqRel, Ordering::Acquire) {
             Ok(_) => session,

@@ -1,5 +1,5 @@
-//! What is known of a segment without reading its messages: the MCAP summary section, and the
-//! counts, times and gaps `store show` tells.
+//! Description of a segment without reading its messages: the MCAP summary section, and the counts, times and gaps for
+//! `store show`.
 
 use std::collections::BTreeMap;
 
@@ -12,15 +12,15 @@ use super::record::Definitions;
 /// Messages of one topic.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 pub struct TopicStats {
-    /// How many.
+    /// Their number.
     pub count: u64,
     /// Log time of the first, ns.
     pub first_ns: u64,
     /// Log time of the last, ns.
     pub last_ns: u64,
-    /// Longest silence between two, ns.
+    /// Longest gap between two, ns.
     pub gap_ns: u64,
-    /// Log time at which that silence began, ns.
+    /// Log time at which that gap began, ns.
     pub gap_from_ns: u64,
 }
 
@@ -40,7 +40,7 @@ impl TopicStats {
         self.last_ns = self.last_ns.max(log_ns);
     }
 
-    /// Joins what comes later.
+    /// Adds the statistics of a later part.
     pub fn join(&mut self, later: &Self) {
         if later.count == 0 {
             return;
@@ -62,7 +62,7 @@ impl TopicStats {
     }
 }
 
-/// One chunk where it lies, with its messages per channel: (log time ns, offset in the chunk).
+/// One chunk at its place in the file, with its messages by channel: (log time ns, offset in the chunk).
 #[derive(Clone, Debug)]
 pub struct PlacedChunk {
     /// Its header.
@@ -75,7 +75,7 @@ pub struct PlacedChunk {
     pub messages: BTreeMap<u16, Vec<(u64, u64)>>,
 }
 
-/// The summary of a segment while it grows.
+/// The summary of a segment that is being written.
 #[derive(Clone, Debug, Default)]
 pub struct Summary {
     chunks: Vec<ChunkIndex>,
@@ -85,7 +85,7 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// Notes an attachment record of `length` bytes at `offset`.
+    /// Enters an attachment record of `length` bytes at `offset`.
     pub fn attachment(
         &mut self,
         (offset, length): (u64, u64),
@@ -104,12 +104,12 @@ impl Summary {
         });
     }
 
-    /// Notes a metadata record.
+    /// Enters a metadata record.
     pub fn metadata(&mut self, (offset, length): (u64, u64), name: &str) {
         self.metadata.push(MetadataIndex { offset, length, name: name.into() });
     }
 
-    /// Writes the message indexes that follow `chunk` in the file, and notes both.
+    /// Writes the message indexes that follow `chunk` in the file, and enters both.
     pub fn chunk(&mut self, out: &mut Vec<u8>, out_start: u64, chunk: &PlacedChunk) {
         let index_start = out_start + out.len() as u64;
         let mut offsets = BTreeMap::new();
@@ -132,7 +132,7 @@ impl Summary {
         });
     }
 
-    /// How many chunks were noted.
+    /// Number of chunks.
     pub fn chunk_count(&self) -> usize {
         self.chunks.len()
     }
@@ -148,8 +148,8 @@ impl Summary {
         topics
     }
 
-    /// Writes the end of a file of which `out_start + out.len()` bytes come before: data end,
-    /// summary, summary offsets, footer and magic.
+    /// Writes the end of a file after its first `out_start + out.len()` bytes: data end, summary, summary offsets,
+    /// footer and magic.
     pub fn put_end(&self, out: &mut Vec<u8>, out_start: u64, definitions: &Definitions) {
         format::put_record(out, op::DATA_END, |b| format::put_u32(b, 0));
         let summary = out.len();

@@ -1,6 +1,5 @@
-//! The file operations of the data card: every write, rename and sync of the store goes through
-//! here, can fail with a message that names it, and can be logged so that a power cut at any point
-//! can be replayed (`journal`).
+//! The file operations of the data card. Every write, rename and sync of the store goes through here. It can fail with
+//! a message that names it, and it can be logged so that a power cut at any point can be replayed (`journal`).
 
 use std::fs::{File, OpenOptions};
 use std::io::ErrorKind;
@@ -16,16 +15,16 @@ use super::journal::{Journal, Op};
 #[derive(Debug, thiserror::Error)]
 #[error("cannot {operation} {}: {source}", path.display())]
 pub struct StoreError {
-    /// What was tried.
+    /// The operation.
     pub operation: &'static str,
-    /// On what.
+    /// Its path.
     pub path: PathBuf,
-    /// What the system said.
+    /// The system's error.
     pub source: std::io::Error,
 }
 
 impl StoreError {
-    /// Wraps what the system said.
+    /// Wraps the system's error.
     pub fn new(operation: &'static str, path: &Path, source: impl Into<std::io::Error>) -> Self {
         Self { operation, path: path.to_owned(), source: source.into() }
     }
@@ -58,12 +57,12 @@ impl Volume {
         Self { root: root.into(), journal: None }
     }
 
-    /// The same, with every operation noted in `journal`.
+    /// The same, with every operation logged in `journal`.
     pub fn journaled(root: impl Into<PathBuf>, journal: Arc<Journal>) -> Self {
         Self { root: root.into(), journal: Some(journal) }
     }
 
-    /// Where it is.
+    /// Its root directory.
     pub fn root(&self) -> &Path {
         &self.root
     }
@@ -73,7 +72,7 @@ impl Volume {
         self.root.join(relative)
     }
 
-    /// The file system that is there now: a card that was taken away or exchanged is another.
+    /// The file system that is there now: a removed or exchanged card gives another one.
     pub fn device(&self) -> StoreResult<u64> {
         device_of(&self.root)
     }
@@ -88,7 +87,7 @@ impl Volume {
         }
     }
 
-    /// Makes a directory; one that is there already is an error.
+    /// Makes a directory; an existing one is an error.
     pub fn create_dir(&self, relative: &str) -> StoreResult<()> {
         let path = self.path(relative);
         self.fault()
@@ -127,8 +126,8 @@ impl Volume {
             &new,
             RenameFlags::NOREPLACE,
         ) {
-            // A file system without the flag (vfat, some FUSE): look, then rename. Nobody else
-            // names flights while the card is ours.
+            // A file system without the flag (vfat, some FUSE): check, then rename. No other process names flights
+            // while the lock is held.
             Err(rustix::io::Errno::INVAL | rustix::io::Errno::NOSYS) if !new.exists() => {
                 std::fs::rename(&old, &new)
             }
@@ -142,7 +141,7 @@ impl Volume {
         Ok(true)
     }
 
-    /// Renames over what has the new name.
+    /// Renames and replaces a file of the new name.
     pub fn replace(&self, from: &str, to: &str) -> StoreResult<()> {
         let old = self.path(from);
         self.fault()
@@ -152,7 +151,7 @@ impl Volume {
         Ok(())
     }
 
-    /// Removes a file; one that is not there is fine.
+    /// Removes a file; a missing one is no error.
     pub fn remove_file(&self, relative: &str) -> StoreResult<()> {
         let path = self.path(relative);
         match self.fault().and_then(|()| std::fs::remove_file(&path)) {
@@ -180,7 +179,7 @@ impl Volume {
         Ok(())
     }
 
-    /// Makes an empty file to append to; one of that name is an error.
+    /// Makes an empty file for appending; an existing one is an error.
     pub fn create(&self, relative: &str) -> StoreResult<AppendFile> {
         let path = self.path(relative);
         let file = self
@@ -191,7 +190,7 @@ impl Volume {
         Ok(AppendFile { file, path, id, journal: self.journal.clone(), length: 0, reserved: 0 })
     }
 
-    /// Opens a file to go on after its first `length` bytes; what follows them is cut off.
+    /// Opens a file to continue after its first `length` bytes; the rest is cut off.
     pub fn reopen(&self, relative: &str, length: u64) -> StoreResult<AppendFile> {
         let path = self.path(relative);
         let file = OpenOptions::new()
@@ -204,7 +203,7 @@ impl Volume {
         Ok(AppendFile { file, path, id, journal: self.journal.clone(), length, reserved: 0 })
     }
 
-    /// Puts a whole small file in place so that a reader finds the old or the new one, never half.
+    /// Writes a complete small file so that a reader finds the old or the new content, never a part.
     pub fn write_whole(&self, dir: &str, name: &str, bytes: &[u8]) -> StoreResult<()> {
         let whole = if dir.is_empty() { name.to_owned() } else { format!("{dir}/{name}") };
         let temporary = format!("{whole}.tmp");
@@ -216,7 +215,7 @@ impl Volume {
         self.sync_dir(dir)
     }
 
-    /// Bytes that may still be written by this process, and the size of the file system.
+    /// Bytes that this process may still write, and the size of the file system.
     pub fn space(&self) -> StoreResult<(u64, u64)> {
         let stat = rustix::fs::statvfs(&self.root)
             .map_err(|e| StoreError::new("ask free space of", &self.root, e))?;
@@ -225,7 +224,7 @@ impl Volume {
     }
 }
 
-/// Whether an open file is still the file of its path: its device and inode, and a name at all.
+/// Whether an open file still has its path: the same device and inode, and any name at all.
 pub fn same_file(file: &File, path: &Path) -> std::io::Result<()> {
     let open = file.metadata()?;
     let named = std::fs::metadata(path);
@@ -235,7 +234,7 @@ pub fn same_file(file: &File, path: &Path) -> std::io::Result<()> {
     Err(std::io::Error::other("it was removed or replaced while it was written"))
 }
 
-/// A file that only grows. After a failed append it is as long as before it.
+/// A file that only grows. A failed append leaves its length unchanged.
 #[derive(Debug)]
 pub struct AppendFile {
     file: File,
@@ -257,12 +256,12 @@ impl AppendFile {
         self.length == 0
     }
 
-    /// Where it was created; a renamed directory is not followed.
+    /// Its path at creation; a renamed directory is not followed.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Follows a rename of the directory it is in, for messages.
+    /// Updates its path after a rename of its directory, for messages.
     pub fn set_path(&mut self, path: PathBuf) {
         self.path = path;
     }
@@ -271,7 +270,7 @@ impl AppendFile {
     pub fn append(&mut self, bytes: &[u8]) -> StoreResult<()> {
         let fault = self.journal.as_ref().map_or(Ok(()), |journal| journal.fault());
         if let Err(source) = fault.and_then(|()| self.file.write_all_at(bytes, self.length)) {
-            // Half an append is cut off again so that the file ends on a whole record.
+            // A partial append is cut off again so that the file ends on a complete record.
             let _ = self.file.set_len(self.length);
             return Err(StoreError::new("write", &self.path, source));
         }
@@ -282,8 +281,8 @@ impl AppendFile {
         Ok(())
     }
 
-    /// Asks for blocks up to `beyond` bytes past the end, `step` at a time, without changing the
-    /// size. A file system that cannot is fine.
+    /// Reserves blocks up to `beyond` bytes after the end, `step` at a time, without changing the size. A file system
+    /// that cannot do this is accepted.
     pub fn reserve(&mut self, beyond: u64, step: u64) -> StoreResult<()> {
         if self.length + beyond <= self.reserved {
             return Ok(());
@@ -297,18 +296,18 @@ impl AppendFile {
         Ok(())
     }
 
-    /// Makes everything appended durable. A file that is no longer the one of its path is an error: what is written to
-    /// it then reaches nobody, whatever the system says.
+    /// Makes everything appended durable. A file that no longer has its path is an error: what is written to it is
+    /// lost, even if the system reports success.
     pub fn sync(&mut self) -> StoreResult<()> {
         self.file.sync_data().map_err(|e| StoreError::new("sync", &self.path, e))?;
-        same_file(&self.file, &self.path).map_err(|e| StoreError::new("go on writing", &self.path, e))?;
+        same_file(&self.file, &self.path).map_err(|e| StoreError::new("continue writing", &self.path, e))?;
         if let Some(journal) = &self.journal {
             journal.note(Op::Sync(self.id));
         }
         Ok(())
     }
 
-    /// Gives back blocks reserved and not used.
+    /// Returns blocks that were reserved and not used.
     pub fn release(&mut self) -> StoreResult<()> {
         self.file.set_len(self.length).map_err(|e| StoreError::new("trim", &self.path, e))?;
         self.reserved = 0;

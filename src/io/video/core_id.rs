@@ -1,13 +1,13 @@
-//! Whose images they are: MISB ST 1204's core identifier.
+//! Identity of the images' source: MISB ST 1204's core identifier.
 
 use ring::digest::{Context, SHA1_FOR_LEGACY_USE_ONLY};
 
-/// Version of ST 1204, and what follows: a sensor and a platform, both known by a made-up ("virtual") identifier.
+/// Version of ST 1204, and the content: a sensor and a platform, both with a generated ("virtual") identifier.
 const HEAD: [u8; 2] = [1, 0x50];
 /// Our namespace of identifiers (RFC 9562, version 5).
 const NAMESPACE: [u8; 16] = *b"windhover core i";
 
-/// The identifier of a camera and its platform: the same wherever the words that describe the camera are the same.
+/// The identifier of a camera and its platform: equal for equal descriptions of the camera.
 pub fn core_id(camera: &str) -> [u8; 34] {
     let mut id = [0; 34];
     id[..2].copy_from_slice(&HEAD);
@@ -16,7 +16,7 @@ pub fn core_id(camera: &str) -> [u8; 34] {
     id
 }
 
-/// A UUID made of a name (RFC 9562, 5.5).
+/// A UUID from a name (RFC 9562, 5.5).
 fn named(parts: &[&str]) -> [u8; 16] {
     let mut hash = Context::new(&SHA1_FOR_LEGACY_USE_ONLY);
     hash.update(&NAMESPACE);

@@ -9,9 +9,9 @@ use openh264::formats::YUVBuffer;
 
 use windhover_base::msg::{GrayImage, RgbImage};
 
-/// Steps of quantisation (0 none, 51 coarsest): a film for looking at the ground, not for measuring in it.
+/// Quantisation steps (0 none, 51 coarsest): for viewing the ground, not for measuring in it.
 const QUALITY: QpRange = QpRange::new(20, 28);
-/// A frame that can be begun with comes so often, seconds.
+/// Period of key frames, seconds.
 const KEY_EVERY_S: f64 = 2.0;
 /// Access unit delimiter: any kind of slice follows.
 const DELIMITER: [u8; 6] = [0, 0, 0, 1, 9, 0xf0];
@@ -28,14 +28,16 @@ pub struct H264Encoder {
 }
 
 impl H264Encoder {
-    /// For frames of this size at about this rate; a last odd row or column is left out.
+    /// An encoder for frames of this size at about this rate; a last odd row or column is left out.
     ///
     /// # Errors
-    /// The encoder takes no such frames.
+    /// The encoder does not accept such frames.
     pub fn new(width: usize, height: usize, fps: f64) -> Result<Self, VideoError> {
         let size = (width & !1, height & !1);
         if size.0 < 16 || size.1 < 16 || size.0 > 4096 || size.1 > 4096 {
-            return Err(VideoError(format!("{width} by {height} pixels are no size for it (16 to 4096)")));
+            return Err(VideoError(format!(
+                "{width} by {height} pixels are not a possible size (16 to 4096)"
+            )));
         }
         let config = EncoderConfig::new()
             .max_frame_rate(FrameRate::from_hz(fps as f32))
@@ -52,7 +54,7 @@ impl H264Encoder {
         Ok(Self { encoder, size })
     }
 
-    /// The access unit of a frame, and whether it can be begun with.
+    /// The access unit of a frame, and whether it is a key frame.
     ///
     /// # Errors
     /// The frame is of another size, or the encoder fails.
@@ -89,7 +91,7 @@ fn planes(gray: &GrayImage, rgb: Option<&RgbImage>, width: usize, height: usize)
     let Some(rgb) = rgb else { return planes };
     for (row, (blue, red)) in blue.chunks_mut(width / 2).zip(red.chunks_mut(width / 2)).enumerate() {
         for column in 0..width / 2 {
-            // The top-left pixel of each four stands for them.
+            // The top-left pixel represents each block of four.
             let at = 3 * (2 * row * rgb.width + 2 * column);
             let [r, g, b] = [0, 1, 2].map(|k| f64::from(rgb.data[at + k]));
             let limited = |x: f64| (x + 128.0).round().clamp(16.0, 240.0) as u8;

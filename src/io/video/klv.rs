@@ -1,6 +1,6 @@
-//! Keys, lengths and figures of KLV (SMPTE ST 336, MISB ST 0107, ST 1201).
+//! KLV keys, lengths and values (SMPTE ST 336, MISB ST 0107, ST 1201).
 
-/// A local set in the making.
+/// A local set being written.
 #[derive(Clone, Debug, Default)]
 pub(super) struct LocalSet(pub Vec<u8>);
 
@@ -12,7 +12,7 @@ impl LocalSet {
         self.0.extend_from_slice(value);
     }
 
-    /// Adds an item that is known.
+    /// Adds an item where its value is known.
     pub(super) fn known<const N: usize>(&mut self, tag: u32, value: Option<[u8; N]>) {
         if let Some(value) = value {
             self.item(tag, &value);
@@ -42,14 +42,14 @@ pub(super) fn oid(number: u32, out: &mut Vec<u8>) {
     out.push((number & 0x7f) as u8);
 }
 
-/// An unsigned figure in as few bytes as hold it.
+/// An unsigned number in the fewest bytes.
 pub(super) fn shortest(number: u64) -> Vec<u8> {
     let bytes = number.to_be_bytes();
     let from = bytes.iter().position(|byte| *byte != 0).unwrap_or(bytes.len() - 1);
     bytes[from..].to_vec()
 }
 
-/// `low..=high` over all values of N bytes; `None` outside.
+/// Maps `low..=high` to all values of N bytes; `None` outside.
 pub(super) fn unsigned<const N: usize>(figure: f64, low: f64, high: f64) -> Option<[u8; N]> {
     let most = 2f64.powi(8 * N as i32) - 1.0;
     let share = (figure - low) / (high - low);
@@ -59,7 +59,7 @@ pub(super) fn unsigned<const N: usize>(figure: f64, low: f64, high: f64) -> Opti
     last_bytes(((share * most).round() as u64).to_be_bytes())
 }
 
-/// `-limit..=limit` over the values of N bytes but the least, which means an error; `None` outside.
+/// Maps `-limit..=limit` to the values of N bytes except the least, which means an error; `None` outside.
 pub(super) fn signed<const N: usize>(figure: f64, limit: f64) -> Option<[u8; N]> {
     let most = 2f64.powi(8 * N as i32 - 1) - 1.0;
     let share = figure / limit;
@@ -73,8 +73,8 @@ fn last_bytes<const N: usize>(bytes: [u8; 8]) -> Option<[u8; N]> {
     bytes[8 - N..].try_into().ok()
 }
 
-/// ST 1201's mapping IMAPB(low, high, N): a step is a power of two, zero is met exactly; outside, and for what is no number, the
-/// special value "not a number".
+/// ST 1201's mapping IMAPB(low, high, N): a step is a power of two, zero is exact; outside, and for NaN, the special
+/// value "not a number".
 pub(super) fn imapb<const N: usize>(figure: f64, low: f64, high: f64) -> [u8; N] {
     let bits = 8 * N as i32 - 1;
     let scale = 2f64.powi(bits - (high - low).log2().ceil() as i32);
@@ -87,7 +87,8 @@ pub(super) fn imapb<const N: usize>(figure: f64, low: f64, high: f64) -> [u8; N]
     last_bytes(value.to_be_bytes()).expect("N bytes of eight")
 }
 
-/// Key, length, the set, and last its checksum: the sum of all words before it, the checksum's own tag and length among them.
+/// Key, length, the set, and at the end its checksum: the sum of all preceding words, including the checksum's own tag
+/// and length.
 pub(super) fn sealed(key: &[u8; 16], set: LocalSet) -> Vec<u8> {
     let mut packet = key.to_vec();
     length(set.0.len() + 4, &mut packet);
@@ -112,7 +113,7 @@ mod tests {
         assert_eq!(signed(60.176822966978335, 90.0), Some([0x55, 0x95, 0xb6, 0x6d]));
         assert_eq!(unsigned(14190.7195, -900.0, 19000.0), Some([0xc2, 0x21]));
         assert_eq!(signed::<4>(90.1, 90.0), None);
-        // ST 1201: IMAPB(−900, 19000, 2): steps of half a metre; zero is met.
+        // ST 1201: IMAPB(−900, 19000, 2): steps of half a metre; zero is exact.
         assert_eq!(imapb(-900.0, -900.0, 19000.0), [0, 0]);
         assert_eq!(imapb(0.0, -900.0, 19000.0), [0x03, 0x84]);
         assert_eq!(imapb(f64::NAN, 0.0, 650.0), [0xd0, 0]);

@@ -14,22 +14,23 @@ const KLV_TYPE: u8 = 0x15;
 const VIDEO_STREAM_ID: u8 = 0xe0;
 /// Metadata stream.
 const KLV_STREAM_ID: u8 = 0xfc;
-/// A player's clock runs so far behind what it shows, ticks of 90 kHz: 200 ms.
+/// How far a player's clock is behind the displayed time, ticks of 90 kHz: 200 ms.
 const BEHIND: u64 = 18_000;
-/// The clock comes at least so often (ST 1402: 100 ms), and the tables with it (250 ms).
+/// Largest interval of the clock (ST 1402: 100 ms), and of the tables with it (250 ms).
 const CLOCK_EVERY: u64 = 7_200;
-/// A longer pause is not filled, ticks: a minute.
+/// Longest pause that is filled, ticks: a minute.
 const LONGEST_PAUSE: u64 = 60 * 90_000;
-/// What KLV is, for decoders (metadata descriptor): general application, format identifier, service 0, no configuration.
+/// Description of KLV for decoders (metadata descriptor): general application, format identifier, service 0, no
+/// configuration.
 const METADATA: [u8; 11] = [0x26, 9, 1, 0, 0xff, b'K', b'L', b'V', b'A', 0, 0x0f];
-/// What it takes (metadata STD descriptor): 4 Mbit/s in, 32 KiB, no rate out, for it is synchronous.
+/// Its buffer model (metadata STD descriptor): 4 Mbit/s in, 32 KiB, no rate out, because it is synchronous.
 const METADATA_STD: [u8; 11] = [0x27, 9, 0xc0, 0x27, 0x10, 0xc0, 0, 0x20, 0xc0, 0, 0];
 const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_MPEG_2);
 
-/// What is carried.
+/// A carried unit.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Unit {
-    /// An access unit of H.264, with its delimiter; whether it can be begun with.
+    /// An access unit of H.264, with its delimiter, and whether decoding can start at it.
     Video {
         /// An instantaneous refresh.
         key: bool,
@@ -44,12 +45,13 @@ pub struct TransportStream {
     counters: [u8; 4],
     /// Numbers KLV.
     sequence: u8,
-    /// When the clock was last told.
+    /// Time of the last clock.
     clock: Option<u64>,
 }
 
 impl TransportStream {
-    /// Appends what stands before a frame that is shown at `pts`: the tables, and the clock over the time since the last one.
+    /// Appends the packets before a frame that is shown at `pts`: the tables, and the clock over the time since the
+    /// last one.
     pub fn before(&mut self, pts: u64, out: &mut Vec<u8>) {
         let now = pts.saturating_sub(BEHIND);
         if let Some(last) = self.clock.filter(|last| now.saturating_sub(*last) < LONGEST_PAUSE) {
@@ -57,7 +59,7 @@ impl TransportStream {
                 self.tables(out);
                 let mut field = clock_field(pcr, false);
                 field.resize(PACKET - 5, 0xff);
-                // Without payload nothing is counted.
+                // A packet without payload is not counted.
                 out.extend([
                     SYNC,
                     (VIDEO_PID >> 8) as u8,
@@ -82,7 +84,7 @@ impl TransportStream {
     }
 
     fn section(&mut self, pid: u16, counter: usize, table: u8, body: &[u8], out: &mut Vec<u8>) {
-        // Table, length from behind itself with the checksum, number 1, version 0 and current, section 0 of 0.
+        // Table, length from after itself including the checksum, number 1, version 0 and current, section 0 of 0.
         let length = body.len() + 9;
         let mut section = vec![table, 0xb0 | (length >> 8) as u8, length as u8, 0, 1, 0xc1, 0, 0];
         section.extend_from_slice(body);
@@ -108,8 +110,8 @@ impl TransportStream {
             Unit::Video { .. } => (VIDEO_PID, 2, VIDEO_STREAM_ID),
             Unit::Klv => (KLV_PID, 3, KLV_STREAM_ID),
         };
-        // A video's length may be left open, and must be where it does not fit. KLV is one whole cell: service 0, its number,
-        // whole and can be begun with, its length.
+        // A video's length may be left open, and must be where it does not fit. KLV is one complete cell: service 0,
+        // its number, complete and a random access point, its length.
         let (length, cell) = match unit {
             Unit::Video { .. } => (0, Vec::new()),
             Unit::Klv => {
@@ -119,7 +121,7 @@ impl TransportStream {
             }
         };
         let mut pes = vec![0, 0, 1, stream_id, (length >> 8) as u8, length as u8];
-        // Aligned to the unit's begin; a presentation time and no other follows.
+        // Aligned to the unit's start; only a presentation time follows.
         pes.extend([0x84, 0x80, 5]);
         pes.extend(time_stamp(pts));
         pes.extend(cell);
@@ -137,7 +139,8 @@ impl TransportStream {
         }
     }
 
-    /// Appends one packet; gives what of the payload is left. The field grows where the payload does not fill the packet.
+    /// Appends one packet; returns the rest of the payload. The adaptation field grows where the payload does not fill
+    /// the packet.
     fn packet<'a>(
         &mut self,
         pid: u16,

@@ -1,4 +1,4 @@
-//! One packet a frame: MISB ST 0601.19, the platform, the sensor, what it looks at.
+//! One packet for each frame: MISB ST 0601.19, the platform, the sensor, the ground in view.
 
 use super::klv::{LocalSet, sealed, signed, unsigned};
 use windhover_base::geo::Geodetic;
@@ -11,7 +11,7 @@ const VERSION: u8 = 19;
 const HEIGHT: (f64, f64) = (-900.0, 19_000.0);
 /// Slant ranges, metres.
 const RANGE: (f64, f64) = (0.0, 5_000_000.0);
-/// Widths of what is seen, metres.
+/// Widths of the area in view, metres.
 const WIDTH: (f64, f64) = (0.0, 10_000.0);
 
 /// A frame as the camera sees it. Angles are degrees, heights above the ellipsoid.
@@ -25,7 +25,7 @@ pub struct SensorView {
     pub unix_us: u64,
     /// Heading, pitch, roll of the platform, where known.
     pub platform_deg: Option<[f64; 3]>,
-    /// Where the camera is.
+    /// Position of the camera.
     pub sensor: Option<Geodetic>,
     /// Angles of view, across and down.
     pub field_deg: Option<[f64; 2]>,
@@ -33,22 +33,22 @@ pub struct SensorView {
     pub relative_deg: [f64; 3],
     /// Distance to the ground along the optical axis.
     pub slant_m: Option<f64>,
-    /// Width of what the middle row of the frame sees.
+    /// Width of the ground along the middle row of the frame.
     pub width_m: Option<f64>,
     /// The ground at the middle of the frame.
     pub center: Option<Geodetic>,
     /// The ground at the corners: top left, top right, bottom right, bottom left.
     pub corners: [Option<Geodetic>; 4],
-    /// The ellipsoid under the sea, metres, where the receiver told it.
+    /// The ellipsoid relative to the sea, metres, where the receiver reported it.
     pub geoid_m: Option<f64>,
 }
 
-/// The letters of a name that the standard takes, and no more than it takes.
+/// The characters of a name that the standard allows, up to its limit.
 fn ascii(name: &str) -> Vec<u8> {
     name.bytes().filter(|byte| (0x20..0x7f).contains(byte)).take(127).collect()
 }
 
-/// Within a turn; what is next to a whole one is none.
+/// An angle within one turn; just below a whole turn becomes zero.
 fn turn_deg(angle: f64) -> f64 {
     let within = angle.rem_euclid(360.0);
     if within > 360.0 - 1e-7 { 0.0 } else { within }

@@ -1,4 +1,4 @@
-//! Targets in a frame: MISB ST 0903.6, a packet of its own beside that of ST 0601 (readers that know 0601 alone skip it).
+//! Targets in a frame: MISB ST 0903.6, a separate packet beside that of ST 0601 (readers that know only 0601 skip it).
 
 use super::klv::{LocalSet, imapb, length, oid, sealed, shortest};
 
@@ -11,12 +11,12 @@ const HEIGHT: (f64, f64) = (-900.0, 19_000.0);
 const SIGMA: (f64, f64) = (0.0, 650.0);
 const SPEED: (f64, f64) = (-900.0, 900.0);
 
-/// What becomes of a target, as ST 0903 counts it.
+/// State of a target, in ST 0903's numbers.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum TargetLife {
-    /// Seen, and it moves.
+    /// Seen and moving.
     Moving = 1,
-    /// Seen, and it stands.
+    /// Seen and stationary.
     Stopped = 3,
     /// Not seen for a moment; predicted.
     Coasting = 4,
@@ -27,9 +27,9 @@ pub enum TargetLife {
 pub struct SeenTarget {
     /// Number, from 1.
     pub id: u32,
-    /// What becomes of it.
+    /// Its state.
     pub life: TargetLife,
-    /// Where it is in the image, pixels from the centre of the top-left one; absent outside.
+    /// Its pixel, from the centre of the top-left one; absent outside the image.
     pub pixel: Option<(f64, f64)>,
     /// Degrees.
     pub lat_deg: f64,
@@ -45,8 +45,8 @@ pub struct SeenTarget {
     pub velocity_sigma: Option<(f64, f64, f64)>,
 }
 
-/// The packet of the targets in a frame of that time, size and angles of view (across and down, degrees), of the camera with that
-/// core identifier, with its checksum.
+/// The packet of the targets in a frame, with its checksum: time, size and angles of view of the frame (across and
+/// down, degrees), and the core identifier of the camera.
 pub fn targets_packet(
     unix_us: u64,
     targets: &[SeenTarget],
@@ -116,7 +116,7 @@ fn pack(target: &SeenTarget, width: u32, height: u32) -> Vec<u8> {
     set.0
 }
 
-/// One-sigmas of east, north, up and the correlations east-north, east-up, north-up. What is up is not estimated.
+/// One-sigmas of east, north, up and the correlations east-north, east-up, north-up. The vertical is not estimated.
 fn spread(sigma: Option<(f64, f64, f64)>) -> Vec<u8> {
     let Some((east, north, correlation)) = sigma else { return Vec::new() };
     let sigmas = [east, north, f64::NAN].into_iter().flat_map(|sigma| imapb::<2>(sigma, SIGMA.0, SIGMA.1));

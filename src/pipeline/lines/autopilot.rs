@@ -5,13 +5,13 @@ use super::samples::Sample as _;
 use windhover_base::msg::{SensorReading, Stamped};
 use windhover_base::settings::{AutopilotConfig, AutopilotUse, Rig};
 use windhover_base::time::{MonoTime, Span};
-use windhover_decode::{AutopilotDecoder, AutopilotSaid, DecodeCounts, HeardAutopilot};
+use windhover_decode::{AutopilotDecoder, AutopilotMeasurement, DecodeCounts, ReceivedAutopilot};
 
 /// MAVLink bytes to readings.
 pub(in crate::pipeline) struct AutopilotLine {
     config: AutopilotConfig,
     decoder: AutopilotDecoder,
-    heard: Vec<HeardAutopilot>,
+    heard: Vec<ReceivedAutopilot>,
     /// Whether it stands in for a compass, and for a receiver.
     is_compass: bool,
     is_receiver: bool,
@@ -35,23 +35,23 @@ impl SourceLine for AutopilotLine {
     fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<SensorReading>) {
         self.decoder.push(bytes, t_recv, &mut self.heard);
         let gives = |what| self.config.gives(what);
-        for HeardAutopilot { t, said } in self.heard.drain(..) {
-            match said {
-                AutopilotSaid::Attitude(value) if gives(AutopilotUse::Attitude) => {
+        for ReceivedAutopilot { t, measurement } in self.heard.drain(..) {
+            match measurement {
+                AutopilotMeasurement::Attitude(value) if gives(AutopilotUse::Attitude) => {
                     let sample = Stamped { t_valid: t, t_recv, seq, value };
                     out.push(match self.is_compass {
                         true => SensorReading::Attitude(sample),
                         false => SensorReading::SecondAttitude(sample),
                     });
                 }
-                AutopilotSaid::Inertial(value) if gives(AutopilotUse::Imu) && value.can_be() => {
+                AutopilotMeasurement::Inertial(value) if gives(AutopilotUse::Imu) && value.can_be() => {
                     out.push(SensorReading::Inertial(Stamped { t_valid: t, t_recv, seq, value }));
                 }
-                AutopilotSaid::Gnss(value) if self.is_receiver => {
+                AutopilotMeasurement::Gnss(value) if self.is_receiver => {
                     let t_valid = t - self.gps_latency;
                     out.push(SensorReading::Gnss(Stamped { t_valid, t_recv, seq, value }));
                 }
-                AutopilotSaid::Position(value) => {
+                AutopilotMeasurement::Position(value) => {
                     out.push(SensorReading::Autopilot(Stamped { t_valid: t, t_recv, seq, value }));
                 }
                 _ => {}

@@ -5,12 +5,12 @@ use super::{SourceLine, Wire};
 use windhover_base::msg::{SensorReading, Stamped};
 use windhover_base::settings::CompassConfig;
 use windhover_base::time::{MonoTime, Span, SteadyClock};
-use windhover_decode::{CompassDecoder, DecodeCounts, HeardAttitude};
+use windhover_decode::{CompassDecoder, DecodeCounts, ReceivedAttitude};
 
 /// Compass bytes to samples at their time of validity.
 pub(in crate::pipeline) struct CompassLine {
     decoder: CompassDecoder,
-    heard: Vec<HeardAttitude>,
+    heard: Vec<ReceivedAttitude>,
     clock: SteadyClock,
     wire: Wire,
     latency: Span,

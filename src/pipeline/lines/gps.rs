@@ -4,7 +4,7 @@ use super::{SourceLine, Wire};
 use windhover_base::msg::{SensorReading, Stamped, WarmArrival};
 use windhover_base::settings::GpsConfig;
 use windhover_base::time::{GnssClock, MonoTime, PulseTrouble, Span};
-use windhover_decode::{DecodeCounts, GnssDecoder, HeardEpoch};
+use windhover_decode::{DecodeCounts, GnssDecoder, ReceivedEpoch};
 
 /// Arrivals kept for a warm start: the jitter of a 5 Hz receiver over 10 s.
 const WARM_ARRIVALS: usize = 50;
@@ -12,7 +12,7 @@ const WARM_ARRIVALS: usize = 50;
 /// GPS bytes to epochs at their time of validity.
 pub(in crate::pipeline) struct GpsLine {
     decoder: GnssDecoder,
-    heard: Vec<HeardEpoch>,
+    heard: Vec<ReceivedEpoch>,
     clock: GnssClock,
     clock_sigma: Option<Span>,
     wire: Wire,

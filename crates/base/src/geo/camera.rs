@@ -23,7 +23,7 @@ pub struct CameraModel {
     /// k1, k2, p1, p2, k3.
     #[serde(default)]
     pub distortion: [f64; 5],
-    /// Bouguet's α: how far the pixel axes are from square.
+    /// Bouguet's α: the skew of the pixel axes.
     #[serde(default)]
     pub skew: f64,
 }
@@ -59,8 +59,8 @@ impl CameraModel {
         (distorted, jacobian)
     }
 
-    /// Undistorted normalised coordinates of distorted ones: Newton's method from the distorted
-    /// point. `None` where it does not settle (beyond the radius at which the polynomial folds).
+    /// Undistorted normalised coordinates of distorted ones: Newton's method from the distorted point. `None` where it
+    /// does not converge (beyond the radius at which the polynomial folds).
     pub fn undistort(&self, distorted: Vector2<f64>) -> Option<Vector2<f64>> {
         let mut m = distorted;
         for _ in 0..20 {
@@ -68,7 +68,7 @@ impl CameraModel {
             let step = jacobian.try_inverse()? * (distorted - at);
             m += step;
             if step.norm_squared() < 1e-24 {
-                // A root across the fold is no answer: the map must keep its orientation.
+                // A root beyond the fold is not a solution: the map must keep its orientation.
                 let ok = jacobian.determinant() > 0.0 && jacobian[(0, 0)] > 0.0;
                 return ok.then_some(m);
             }

@@ -13,9 +13,9 @@ use crate::time::UtcTime;
 #[derive(Clone, PartialEq, Eq, Debug, thiserror::Error)]
 #[error("no magnetic declination for {date}: {reason}; set compass.declination_deg instead")]
 pub struct DeclinationError {
-    /// The date asked for.
+    /// The requested date.
     pub date: UtcTime,
-    /// What the model said.
+    /// The model's error.
     pub reason: String,
 }
 

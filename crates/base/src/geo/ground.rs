@@ -1,4 +1,4 @@
-//! The ground the vehicle drives on, as a surface in the NED frame.
+//! The ground on which the vehicle drives, as a surface in the NED frame.
 
 use std::sync::Arc;
 
@@ -27,8 +27,8 @@ impl Ground {
         }
     }
 
-    /// Distance along a ray (in lengths of `direction`) to the surface raised by `above_m`; `None`
-    /// where the ray does not come down on it (paper eq. 11 and 23, corrected).
+    /// Distance along a ray (in lengths of `direction`) to the surface raised by `above_m`; `None` where the ray does
+    /// not meet it from above (paper eq. 11 and 23, corrected).
     pub fn intersect(&self, origin: &Vector3<f64>, direction: &Vector3<f64>, above_m: f64) -> Option<f64> {
         match self {
             Self::Flat { down_m } => {

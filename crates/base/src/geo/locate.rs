@@ -7,10 +7,10 @@ use super::{CameraModel, Ground, skew};
 /// Why a pixel has no ground position.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, thiserror::Error)]
 pub enum LocateError {
-    /// The pixel lies outside what the distortion model covers.
-    #[error("pixel lies outside what the distortion model covers")]
+    /// The pixel is outside the range of the distortion model.
+    #[error("pixel is outside the range of the distortion model")]
     OutsideModel,
-    /// The ray goes level or up.
+    /// The ray is level or points up.
     #[error("the ray does not reach the ground")]
     AboveHorizon,
     /// The ground is farther than the limit.
@@ -29,7 +29,7 @@ pub struct GroundPoint {
     pub covariance_m2: Matrix2<f64>,
 }
 
-/// One-sigma errors of what geo-positioning is fed with, for first-order covariance.
+/// One-sigma errors of the inputs of geo-positioning, for first-order covariance.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct PoseSigmas {
     /// Camera position covariance in NED, m².
@@ -44,9 +44,9 @@ pub struct PoseSigmas {
 
 /// The ground point seen at `px`.
 ///
-/// `p_camera` is the camera's position in NED, `ned_from_camera` its attitude, `above_m` the height
-/// of the wanted point over the ground (a marker on a roof), `limit_m` the farthest slant accepted.
-/// `d = ned_from_camera [u v 1]ᵀ`, `Zc = (D0 − p_D)/d_D`, `G = p + Zc d` (paper eq. 11–13, corrected).
+/// `p_camera` is the camera's position in NED, `ned_from_camera` its attitude, `above_m` the height of the point over
+/// the ground (a marker on a roof), `limit_m` the largest accepted slant range. `d = ned_from_camera [u v 1]ᵀ`, `Zc =
+/// (D0 − p_D)/d_D`, `G = p + Zc d` (paper eq. 11–13, corrected).
 ///
 /// # Errors
 /// Where the pixel is outside the lens model, or its ray does not meet the ground within `limit_m`.
@@ -71,8 +71,8 @@ pub fn locate(
 
 /// As [`locate`], with the first-order covariance of north and east.
 ///
-/// With `n = (∂D/∂N, ∂D/∂E, −1)` the ground's normal scaled so that it works on a slope too, a small
-/// change `δ` of the ray's far end moves the ground point by `(I − d nᵀ/(nᵀd)) δ`.
+/// Let `n = (∂D/∂N, ∂D/∂E, −1)` be the ground's normal, scaled so that it is also valid on a slope. A small change `δ`
+/// of the ray's far end then moves the ground point by `(I − d nᵀ/(nᵀd)) δ`.
 ///
 /// # Errors
 /// Those of [`locate`].

@@ -1,10 +1,9 @@
-//! Frames, the Earth, the camera, and where a pixel meets the ground.
+//! Frames, the Earth, the camera, and geo-positioning.
 //!
-//! Frames: `ned` is the local tangent plane (north, east, down) at the datum; `body` is the
-//! aircraft (forward, right, down); `camera` is image right, image down, optical axis; `vehicle` is
-//! the ground vehicle (forward, right, down) with its origin on the ground under the middle of the
-//! rear axle. A rotation or pose is named `a_from_b`: it takes coordinates in `b` to coordinates in
-//! `a`. Angles are radians.
+//! Frames: `ned` is the local tangent plane (north, east, down) at the datum; `body` is the aircraft (forward, right,
+//! down); `camera` is image right, image down, optical axis; `vehicle` is the ground vehicle (forward, right, down)
+//! with its origin on the ground under the middle of the rear axle. A rotation or pose is named `a_from_b`: it takes
+//! coordinates in `b` to coordinates in `a`. Angles are radians.
 
 mod camera;
 mod declination;

@@ -1,9 +1,9 @@
-//! Rotations, their Euler sequences, and what compasses mean by pitch and roll.
+//! Rotations, their Euler sequences, and the definitions of pitch and roll that compasses use.
 
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use serde::{Deserialize, Serialize};
 
-/// An angle brought into (−π, π].
+/// An angle wrapped into (−π, π].
 pub fn wrap_angle(angle: f64) -> f64 {
     let wrapped = angle.rem_euclid(std::f64::consts::TAU);
     if wrapped > std::f64::consts::PI { wrapped - std::f64::consts::TAU } else { wrapped }
@@ -53,7 +53,7 @@ pub fn euler_312(ned_from_body: &Rotation3<f64>) -> (f64, f64, f64) {
     ((-r[(0, 1)]).atan2(r[(1, 1)]), phi, (-r[(2, 0)]).atan2(r[(2, 2)]))
 }
 
-/// What a compass means by its pitch and roll figures; `g` is the down unit vector in the body.
+/// A compass's definition of pitch and roll; `g` is the down unit vector in the body.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum TiltConvention {
@@ -68,7 +68,7 @@ pub enum TiltConvention {
     Projection,
 }
 
-/// Pitch and roll as a compass of some [`TiltConvention`] reports them, radians.
+/// Pitch and roll as a compass with some [`TiltConvention`] reports them, radians.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct Tilt {
     /// Nose up positive.
@@ -127,7 +127,7 @@ pub fn tilt_from_down(down: &Vector3<f64>) -> (f64, f64) {
     ((-g.x).clamp(-1.0, 1.0).asin(), g.y.atan2(g.z))
 }
 
-/// Where the top of the image points on the aircraft.
+/// The direction on the aircraft to which the top of the image points.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ImageTop {

@@ -1,4 +1,4 @@
-//! Ground that is not flat: heights on a grid of latitude and longitude, and rays that meet them.
+//! Terrain: heights on a grid of latitude and longitude, and their intersection with rays.
 
 use std::sync::Arc;
 
@@ -6,38 +6,38 @@ use nalgebra::Vector3;
 
 use super::{Geodetic, LocalFrame};
 
-/// Mean radius of the Earth, metres: the tangent plane lies this curve above the ground far away.
+/// Mean radius of the Earth, metres: far away, the tangent plane is above the ground by the Earth's curvature.
 const EARTH_M: f64 = 6_371_000.0;
-/// Farthest that a ray is followed, metres.
+/// Largest distance along a ray, metres.
 const FARTHEST_M: f64 = 50_000.0;
-/// Steps after which a ray that grazes the ground is given up.
+/// Most steps along a ray that grazes the ground.
 const MOST_STEPS: usize = 400;
-/// A ray has met the ground when it is this close, metres.
+/// A ray has met the ground at this distance, metres.
 const MET_M: f64 = 1e-7;
 
-/// Why heights gave no tile.
+/// Why heights do not make a tile.
 #[derive(Clone, PartialEq, Eq, Debug, thiserror::Error)]
 pub enum TerrainError {
-    /// Fewer than 2 × 2 heights, or not as many as rows and columns say.
+    /// Fewer than 2 × 2 heights, or another number than rows and columns give.
     #[error("{got} heights are not {rows} rows of {columns}")]
     Size {
-        /// Heights there are.
+        /// Number of heights.
         got: usize,
         /// Rows.
         rows: usize,
         /// Columns.
         columns: usize,
     },
-    /// The grid's corner or spacing cannot be.
+    /// The grid's corner or spacing is impossible.
     #[error("its corner or spacing is not on Earth")]
     Place,
     /// Most heights are missing.
     #[error("most of its heights are missing")]
     Void,
-    /// An SRTM file's name does not tell its corner.
+    /// An SRTM file's name does not give its corner.
     #[error("an .hgt file is named after its south-west corner, as N30W086.hgt")]
     Name,
-    /// An SRTM file is square, two bytes a height.
+    /// An SRTM file is square, with two bytes for each height.
     #[error("{0} bytes are not an SRTM tile (1201 x 1201 or 3601 x 3601 heights of two bytes)")]
     Srtm(usize),
 }
@@ -55,8 +55,8 @@ pub struct Tile {
 }
 
 impl Tile {
-    /// From heights row by row; `north_deg`, `west_deg` are those of the first height itself (not of
-    /// a pixel's corner). Not-a-number marks a missing height: it is filled from its neighbours.
+    /// A tile from heights row by row; `north_deg`, `west_deg` are those of the first height itself (not of a pixel's
+    /// corner). NaN marks a missing height: it is filled from its neighbours.
     pub fn new(
         (north_deg, west_deg): (f64, f64),
         step_deg: [f64; 2],
@@ -78,12 +78,12 @@ impl Tile {
         Ok(tile)
     }
 
-    /// An SRTM `.hgt` file: big-endian heights of two bytes, −32768 where missing, a square that
-    /// covers one degree and shares its border with its neighbours (USGS, SRTM documentation). `stem`
-    /// is its name without extension, which tells the south-west corner.
+    /// An SRTM `.hgt` file: big-endian heights of two bytes, −32768 where missing, a square that covers one degree and
+    /// shares its border with its neighbours (USGS, SRTM documentation). `stem` is its name without extension, which
+    /// gives the south-west corner.
     ///
     /// # Errors
-    /// Where the name tells no corner, or the bytes are no square of heights.
+    /// Where the name gives no corner, or the bytes are not a square of heights.
     pub fn from_hgt(stem: &str, bytes: &[u8]) -> Result<Self, TerrainError> {
         let (south, west) = hgt_corner(stem).ok_or(TerrainError::Name)?;
         let side = match bytes.len() / 2 {
@@ -100,8 +100,8 @@ impl Tile {
         Self::new((south + 1.0, west), [step; 2], (side, side), heights)
     }
 
-    /// Missing heights become the mean of known neighbours, ring by ring from the known ones inwards. Each is looked
-    /// at a few times, however large the void is.
+    /// Missing heights become the mean of known neighbours, ring by ring from the known ones inwards. Each is visited a
+    /// few times, however large the void is.
     fn fill_voids(&mut self) {
         let is_missing = |tile: &Self, k: usize| !tile.heights_m[k].is_finite();
         let mut ring: Vec<usize> = (0..self.heights_m.len())
@@ -120,7 +120,7 @@ impl Tile {
         }
     }
 
-    /// A height and its neighbours, by their places in the list.
+    /// A height and its neighbours, by their indices in the list.
     fn around(&self, k: usize) -> impl Iterator<Item = usize> + use<> {
         let (row, column, columns) = (k / self.columns, k % self.columns, self.columns);
         let beside = |at: usize, count: usize| at.saturating_sub(1)..=(at + 1).min(count - 1);
@@ -134,7 +134,7 @@ impl Tile {
         (n > 0).then(|| sum / f32::from(n))
     }
 
-    /// Whether a place lies on the tile.
+    /// Whether a place is on the tile.
     pub fn covers(&self, lat_deg: f64, lon_deg: f64) -> bool {
         let (row, column) = self.place(lat_deg, lon_deg);
         (0.0..=(self.rows - 1) as f64).contains(&row) && (0.0..=(self.columns - 1) as f64).contains(&column)
@@ -144,7 +144,7 @@ impl Tile {
         ((self.north_deg - lat_deg) / self.step_deg[0], (lon_deg - self.west_deg) / self.step_deg[1])
     }
 
-    /// Height above mean sea level, metres: bilinear; beyond the border that of the border.
+    /// Height above mean sea level, metres: bilinear; outside the tile that of its border.
     pub fn height_msl_m(&self, lat_deg: f64, lon_deg: f64) -> f64 {
         let (row, column) = self.place(lat_deg, lon_deg);
         let row = row.clamp(0.0, (self.rows - 1) as f64 - 1e-9);
@@ -181,9 +181,9 @@ pub struct Terrain {
     geoid_m: f64,
     /// Metres north per degree of latitude, metres east per degree of longitude, at the datum.
     metres_per_deg: [f64; 2],
-    /// Half a cell, metres: the reach of a slope.
+    /// Half a cell, metres: the step for slopes.
     half_cell_m: f64,
-    /// The steepest that neighbouring heights are.
+    /// The steepest slope between neighbouring heights.
     steepest: f64,
 }
 
@@ -247,7 +247,7 @@ impl Terrain {
     }
 }
 
-/// The steepest slope on the tile, with a little for the Earth's curve.
+/// The steepest slope on the tile, with an allowance for the Earth's curvature.
 fn steepest(tile: &Tile, cell_m: [f64; 2]) -> f64 {
     let height = |r: usize, c: usize| f64::from(tile.heights_m[r * tile.columns + c]);
     let mut most: f64 = 0.0;
@@ -269,7 +269,7 @@ mod tests {
 
     const DATUM: Geodetic = Geodetic { lat_deg: 30.5, lon_deg: -85.5, height_m: 10.0 };
 
-    /// A plane that rises `slope` metres a metre toward north, 40 m high at the datum; 3″ cells.
+    /// A plane that rises `slope` metres for each metre toward north, 40 m high at the datum; 3″ cells.
     fn rising(slope: f64) -> Terrain {
         let frame = LocalFrame::new(DATUM);
         let step = 1.0 / 1200.0;
@@ -296,12 +296,12 @@ mod tests {
         // Toward north, 45° down: −15 + s = −0.2 s.
         let range = terrain.intersect(&origin, &Vector3::new(1.0, 0.0, 1.0), 0.0).expect("it meets the hill");
         assert!((range - 12.5).abs() < 1e-3, "{range}");
-        // Flat ground would have put the point 2.5 m farther.
+        // Flat ground would put the point 2.5 m farther.
         let raised =
             terrain.intersect(&origin, &Vector3::new(1.0, 0.0, 1.0), 0.6).expect("it meets the roof");
         assert!((raised - 12.0).abs() < 1e-3, "{raised}");
         // Level toward the hill: it rises 15 m in 75 m.
-        let level = terrain.intersect(&origin, &Vector3::x(), 0.0).expect("the hill is in the way");
+        let level = terrain.intersect(&origin, &Vector3::x(), 0.0).expect("the hill is met");
         assert!((level - 75.0).abs() < 0.05, "{level}");
         assert!(terrain.intersect(&origin, &-Vector3::x(), 0.0).is_none());
         assert!(terrain.intersect(&Vector3::new(0.0, 0.0, 1.0), &Vector3::z(), 0.0).is_none());
@@ -309,17 +309,17 @@ mod tests {
 
     #[test]
     fn a_void_is_filled_from_its_border_inwards_however_large_it_is() {
-        // Given a tile of the finest kind, half of it missing on one side, and a hole in the other.
+        // Given a tile of the finest resolution, with half of it missing on one side, and a gap in the other half.
         let side = 1201;
         let is_void = |r: usize, c: usize| c < side / 2 || (r == 600 && c == 900);
         let height = |k: usize| if is_void(k / side, k % side) { f32::NAN } else { (k / side) as f32 };
         let step = 1.0 / (side - 1) as f64;
         let heights = (0..side * side).map(height).collect();
-        let tile = Tile::new((1.0, 0.0), [step; 2], (side, side), heights).expect("half of it is there");
+        let tile = Tile::new((1.0, 0.0), [step; 2], (side, side), heights).expect("half of it is known");
         let at = |r: usize, c: usize| tile.heights_m[r * side + c];
         assert!(tile.heights_m.iter().all(|h| h.is_finite()));
         assert_eq!((at(600, 900), at(300, 700)), (600.0, 300.0));
-        // The first ring is the mean of its neighbours, and so is the next: along a ramp these are the ramp's.
+        // The first ring is the mean of its neighbours, and so is the next: along a ramp these are values of the ramp.
         assert_eq!((at(600, side / 2 - 1), at(600, side / 2 - 2), at(0, side / 2 - 1)), (600.0, 600.0, 0.5));
         assert!((at(600, 0) - 600.0).abs() < 1.0, "{}", at(600, 0));
     }

@@ -10,8 +10,7 @@ const F: f64 = 1.0 / 298.257_223_563;
 /// First eccentricity squared.
 const E2: f64 = F * (2.0 - F);
 
-/// A position by latitude, longitude (degrees, as people and files hold them) and height above the
-/// ellipsoid (metres).
+/// A position by latitude, longitude (degrees, as in files) and height above the ellipsoid (metres).
 #[derive(Clone, Copy, PartialEq, Debug, Default, Serialize, Deserialize)]
 pub struct Geodetic {
     /// Latitude, degrees, north positive.
@@ -35,8 +34,8 @@ impl Geodetic {
         )
     }
 
-    /// From Earth-centred coordinates: Bowring's latitude, then three fixed-point steps, which leave
-    /// less than a nanometre anywhere near the surface.
+    /// From Earth-centred coordinates: Bowring's latitude, then three fixed-point steps, with an error below a
+    /// nanometre near the surface.
     pub fn from_ecef(ecef: &Vector3<f64>) -> Self {
         let p = ecef.x.hypot(ecef.y);
         let lon = ecef.y.atan2(ecef.x);

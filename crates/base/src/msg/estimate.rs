@@ -1,27 +1,27 @@
-//! Estimates, and what became of each measurement.
+//! Estimates, and the disposition of each measurement.
 
 use nalgebra::{SMatrix, UnitQuaternion, Vector3};
 
 use crate::time::MonoTime;
 
-/// What became of a measurement.
+/// What was done with a measurement.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum Disposition {
-    /// Used as it is.
+    /// Used unchanged.
     Fused,
     /// Used with its weight reduced by the soft gate.
     Deweighted,
     /// Refused by the gate.
     GateRejected,
-    /// True before the history begins.
+    /// Its time of validity is before the history begins.
     TooOld,
-    /// True later than it was heard.
+    /// Its time of validity is later than its reception.
     TooNew,
     /// The helicopter's own state is not known yet.
     NoOwnship,
-    /// Not a finite number, or outside what can be.
+    /// Not finite, or outside the possible range.
     Invalid,
-    /// Belongs to no target of the configuration.
+    /// Belongs to no configured target.
     Unknown,
 }
 
@@ -41,7 +41,7 @@ impl Disposition {
     }
 }
 
-/// Which measurement a [`FusionResult`] is about.
+/// The measurement of a [`FusionResult`].
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum FusionSource {
     /// GPS position.
@@ -84,31 +84,31 @@ impl FusionSource {
     }
 }
 
-/// What became of one measurement in the filter.
+/// The result of one measurement in the filter.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct FusionResult {
-    /// When the measurement was true.
+    /// Its time of validity.
     pub t_valid: MonoTime,
     /// Which measurement.
     pub source: FusionSource,
-    /// What became of it.
+    /// Its disposition.
     pub disposition: Disposition,
     /// Innovation, first three components, in the measurement's unit (m, m/s, rad, px).
     pub innovation: [f64; 3],
-    /// How many components `innovation` has (at most three are kept).
+    /// Number of components of `innovation` (at most three are kept).
     pub dimension: usize,
     /// Normalised innovation squared over the gate: above 1 is outside.
     pub test_ratio: f64,
 }
 
-/// What the filter holds of a track.
+/// Status of a track in the filter.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug, Default)]
 pub enum TrackStatus {
-    /// Seen, not yet settled.
+    /// Seen, not settled yet.
     Acquiring,
     /// Seen and settled.
     Tracking,
-    /// Not seen for a moment; predicted.
+    /// Not seen at present; predicted.
     Coasting,
     /// Not known.
     #[default]
@@ -148,8 +148,8 @@ pub struct TargetState {
     pub height_m: f64,
     /// Covariance of (north, east, heading, speed, yaw rate); `None` from the paper's estimator.
     pub covariance: Option<SMatrix<f64, 5, 5>>,
-    /// One-sigma of the horizontal position relative to the helicopter, larger axis, metres; `None` where the
-    /// estimator does not tell it (the smoother's and the paper's do not).
+    /// One-sigma of the horizontal position relative to the helicopter, larger axis, metres; `None` where the estimator
+    /// does not provide it (the smoother and the paper's estimator).
     pub relative_sigma_m: Option<f64>,
 }
 
@@ -162,7 +162,7 @@ pub struct TargetEstimate {
     pub frame: u32,
     /// Index of the target in the configuration.
     pub target: usize,
-    /// What the filter holds of it.
+    /// Its status.
     pub status: TrackStatus,
     /// The state; `None` where nothing is known.
     pub state: Option<TargetState>,
@@ -171,9 +171,9 @@ pub struct TargetEstimate {
 /// The helicopter's own state: the body frame's origin.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Ownship {
-    /// When.
+    /// Its time of validity.
     pub t_valid: MonoTime,
-    /// Number of the frame at whose exposure it is; `None` between frames.
+    /// Number of the frame, for a state at its exposure; `None` between frames.
     pub frame: Option<u32>,
     /// North, east, down of the datum, metres.
     pub position_ned_m: Vector3<f64>,
@@ -187,7 +187,7 @@ pub struct Ownship {
     pub lon_deg: f64,
     /// Height above the ellipsoid, metres.
     pub height_m: f64,
-    /// Covariance of position (north, east, down; m), velocity (likewise; m/s) and attitude (small rotations about
+    /// Covariance of position (north, east, down; m), velocity (the same axes; m/s) and attitude (small rotations about
     /// north, east, down: `ned_from_body = exp(δ) estimate`; rad).
     pub covariance: SMatrix<f64, 9, 9>,
 }
@@ -213,10 +213,10 @@ impl Ownship {
     }
 }
 
-/// What a tilt sensor is found to feel.
+/// What a tilt sensor was found to measure.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum FeltTilt {
-    /// Attitude, as an AHRS tells it.
+    /// Attitude, as from an AHRS.
     Attitude,
     /// Specific force.
     Force,
@@ -224,17 +224,18 @@ pub enum FeltTilt {
     Share(f64),
 }
 
-/// Something measured does not fit what the configuration, or the filter's model, says of it.
+/// A measurement that does not fit the configuration or the filter's model.
 ///
-/// The filter tells it as often as it finds it, at most once a second for the same source and cause. The pipeline
-/// tells the operator once, again where the figure changes, and counts it as over when it was not told for a while.
+/// The filter reports it as often as it finds it, at most once a second for the same source and cause. The pipeline
+/// reports it to the operator once, again when the figure changes, and treats it as over when the filter has not
+/// reported it for a while.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Misfit {
     /// When it was found, host time.
     pub t: MonoTime,
-    /// Which source.
+    /// The source.
     pub source: FusionSource,
-    /// The figure that shows it; see [`MisfitCause`].
+    /// The measured value; see [`MisfitCause`].
     pub figure: f64,
     /// What does not fit.
     pub cause: MisfitCause,
@@ -243,76 +244,79 @@ pub struct Misfit {
 /// What does not fit.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum MisfitCause {
-    /// The tilt sensor feels something else than configured. Figure: slope of acceleration over what the reading
-    /// means, 1 where it tells the tilt.
+    /// The tilt sensor measures something else than configured. Figure: slope of the acceleration over the value that
+    /// the reading implies, 1 where it measures the tilt.
     TiltKind(FeltTilt),
-    /// It errs more than it is said to. Figure: mean normalised square of its innovations, 1 where they fit.
+    /// Its errors are larger than its stated noise. Figure: mean normalised square of its innovations, 1 where they
+    /// fit.
     Noise,
-    /// It errs to one side. Figure: mean of its innovations over what they should scatter by.
+    /// Its errors have a mean. Figure: mean of its innovations relative to their expected scatter.
     Bias,
-    /// More of its measurements lie outside the gate than should. Figure: their share.
+    /// More of its measurements are outside the gate than expected. Figure: their share.
     Outside,
-    /// A tag's edge is not its `size_m`, as another marker of the target shows. Figure: measured over configured.
+    /// A tag's edge differs from its `size_m`, as another marker of the target shows. Figure: measured over configured.
     MarkerSize(MarkerPair),
-    /// A marker lies elsewhere on its target, as another one shows. Figure: by how much, m.
+    /// A marker has another position on its target, as another one shows. Figure: the difference, m.
     MarkerPlace(MarkerPair),
-    /// A marker is turned on its target, as another one shows. Figure: by how much, rad, clockwise from above.
+    /// A marker has another yaw on its target, as another one shows. Figure: the difference, rad, clockwise from above.
     MarkerTurn(MarkerPair),
-    /// Markers show another height over the ground than receiver and ground do. Figure: by how much higher, m.
+    /// Markers show another height over the ground than receiver and ground. Figure: the difference, m, positive for
+    /// higher.
     Height,
-    /// What was taken for ground moves. Figure: share of the tracked features.
+    /// Features that were assumed to be ground move. Figure: share of the tracked features.
     MovingGround,
-    /// A vehicle turns faster than its model can. Figure: its yaw rate over the model's bound.
+    /// A vehicle turns faster than its model allows. Figure: its yaw rate over the model's bound.
     TargetTurns {
         /// Index of the target in the configuration.
         target: usize,
     },
-    /// Its measurements are true earlier than their stamps say. Figure: by how much, s.
+    /// The times of validity of its measurements are earlier than their stamps. Figure: by how much, s.
     Late,
 }
 
-/// A marker that does not fit, and the one that shows it: indices in the configuration.
+/// A marker that does not fit, and the marker that shows it: indices in the configuration.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct MarkerPair {
     /// The target.
     pub target: usize,
     /// Its marker that does not fit.
     pub marker: usize,
-    /// Its marker that it was measured against.
+    /// The marker against which it was measured.
     pub against: usize,
 }
 
-/// What the joint filter says.
+/// An output of the joint filter.
 #[expect(clippy::large_enum_variant, reason = "a box would be an allocation for each of them")]
 #[derive(Clone, PartialEq, Debug)]
 pub enum EstimatorOutput {
-    /// A target at a frame, as known when the frame had been looked at.
+    /// A target at a frame, in real time.
     Estimate(TargetEstimate),
-    /// A target at a tick, while no frame comes: predicted, and lost in its time. `frame` is that of the last estimate.
+    /// A target at a tick, while no frame comes: predicted, and lost after its time. `frame` is that of the last
+    /// estimate.
     Coasted(TargetEstimate),
-    /// A target at an earlier frame, with what was measured up to the smoother's lag after it.
+    /// A target at an earlier frame, with the measurements up to the smoother's lag after it.
     Smoothed(TargetEstimate),
     /// The helicopter at a frame, or between frames.
     Ownship(Ownship),
-    /// What became of a measurement.
+    /// The result of a measurement.
     Fusion(FusionResult),
-    /// The receiver jumped for good: helicopter, targets and ground features moved along.
+    /// The receiver jumped for good: helicopter, targets and ground features were moved together.
     Anchored {
-        /// By how much, NED.
+        /// The displacement, NED.
         moved_m: Vector3<f64>,
     },
-    /// What the tilt sensor feels was found out, and is believed from here on.
+    /// What the tilt sensor measures was found out, and is assumed from here on.
     TiltFelt {
-        /// What it feels.
+        /// What it measures.
         felt: FeltTilt,
-        /// Slope of acceleration over what the reading means.
+        /// Slope of the acceleration over the value that the reading implies.
         slope: f64,
     },
-    /// Something measured does not fit.
+    /// A misfit.
     Misfit(Misfit),
-    /// The filter started again.
+    /// The filter was reset.
     Reset {
-        /// Why.
+        /// The reason.
         reason: &'static str,
     },
 }

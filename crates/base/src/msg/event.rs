@@ -1,27 +1,27 @@
-//! What devices (or a capture of them) deliver, stamped on arrival.
+//! Events of devices (or of a capture of them), stamped at arrival.
 
 use std::sync::Arc;
 
 use super::{AttitudeSample, InertialSample, Source, WarmState};
 use crate::time::MonoTime;
 
-/// One thing heard, in the order it was heard.
+/// One event, in order of reception.
 #[derive(Clone, Debug)]
 pub struct Event {
-    /// When it was heard, host time.
+    /// Its reception, host time.
     pub t_recv: MonoTime,
     /// Position in the stream of events.
     pub seq: u64,
-    /// What was heard.
+    /// Its content.
     pub body: EventBody,
 }
 
-/// What was heard.
+/// The content of an event.
 #[derive(Clone, Debug)]
 pub enum EventBody {
     /// The bytes one read of a source's line returned.
     Bytes {
-        /// Whose.
+        /// The source.
         source: Source,
         /// The bytes.
         data: Vec<u8>,
@@ -30,39 +30,39 @@ pub enum EventBody {
     Frame(FramePayload),
     /// A sample of rates and forces, in the sensor's axes.
     Inertial {
-        /// Whose.
+        /// The source.
         source: Source,
-        /// It.
+        /// The sample.
         sample: InertialSample,
     },
     /// A sample of attitude.
     Attitude {
-        /// Whose.
+        /// The source.
         source: Source,
-        /// It.
+        /// The sample.
         sample: AttitudeSample,
     },
-    /// Time passed and nothing arrived. It follows from the times of the events around it, so it is not kept.
+    /// Time has passed without an arrival. It follows from the times of the events around it, so it is not recorded.
     Tick,
     /// Something was lost before it could be recorded.
     Dropped {
-        /// Whose.
+        /// The source.
         source: Source,
-        /// How many messages.
+        /// Number of messages.
         count: u32,
     },
     /// The receiver's pulse marked a whole second of UTC; `t_recv` is the edge.
     Pulse,
-    /// A device answered.
+    /// A device has appeared.
     SourceUp(Source),
-    /// A device went away.
+    /// A device has disappeared.
     SourceDown(Source),
-    /// What an earlier run of the same flight had learnt; comes before everything else, or not at all.
+    /// The state that an earlier run of the same flight learnt; it comes before all other events, or not at all.
     Warm(Box<WarmState>),
 }
 
 impl EventBody {
-    /// The source that delivered it; `None` for what no source delivers.
+    /// The source that delivered it; `None` for events without a source.
     pub const fn delivered_by(&self) -> Option<Source> {
         match self {
             Self::Bytes { source, .. } | Self::Inertial { source, .. } | Self::Attitude { source, .. } => {
@@ -74,7 +74,7 @@ impl EventBody {
     }
 }
 
-/// How the bytes of a frame are to be read.
+/// Encoding of the bytes of a frame.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum FrameEncoding {
     /// 8-bit grey.
@@ -89,21 +89,21 @@ pub enum FrameEncoding {
     Rgb24,
     /// 24-bit BGR.
     Bgr24,
-    /// 8-bit mosaic of colour filters (Bayer): a pixel is red, green or blue.
+    /// 8-bit mosaic of colour filters (Bayer): each pixel is red, green or blue.
     Bayer(Bayer),
-    /// Grey of 10 bits in two bytes, least first.
+    /// Grey of 10 bits in two bytes, little-endian.
     Y10,
-    /// Grey of 12 bits in two bytes, least first.
+    /// Grey of 12 bits in two bytes, little-endian.
     Y12,
-    /// Grey of 16 bits in two bytes, least first.
+    /// Grey of 16 bits in two bytes, little-endian.
     Y16,
-    /// Grey of 10 bits, four pixels in five bytes: their upper eights, then their lower twos.
+    /// Grey of 10 bits, four pixels in five bytes: first their upper eight bits, then their lower two.
     Y10Packed,
     /// JPEG (also one frame of Motion JPEG).
     Jpeg,
     /// PNG.
     Png,
-    /// An encoding this program does not read; the frame counts, but cannot be used.
+    /// An encoding that is not supported; the frame counts, but cannot be used.
     Unknown,
 }
 
@@ -120,21 +120,21 @@ pub enum Bayer {
     Grbg,
 }
 
-/// A frame as the driver or the capture gave it.
+/// A frame as the driver or the capture delivered it.
 #[derive(Clone, Debug)]
 pub struct FramePayload {
-    /// Number of the frame since recording began, from 0, undecodable ones included. A device leaves 0: frames
-    /// are numbered where they join the stream of events.
+    /// Number of the frame since recording began, from 0, including undecodable ones. A device leaves 0: frames are
+    /// numbered where they join the stream of events.
     pub index: u32,
     /// The driver's exposure stamp, host time.
     pub t_exposure: MonoTime,
     /// How to read `data`.
     pub encoding: FrameEncoding,
-    /// Width in pixels; 0 where the encoding tells.
+    /// Width in pixels; 0 where the encoding contains it.
     pub width: u32,
-    /// Height in pixels; 0 where the encoding tells.
+    /// Height in pixels; 0 where the encoding contains it.
     pub height: u32,
-    /// Bytes from one row to the next; 0 where the encoding tells.
+    /// Bytes from one row to the next; 0 where the encoding contains it.
     pub stride: u32,
     /// The bytes.
     pub data: Arc<[u8]>,

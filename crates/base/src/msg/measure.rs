@@ -1,4 +1,4 @@
-//! Measurements: decoded, stamped with the time at which they were true.
+//! Measurements: decoded, stamped with their time of validity.
 
 use nalgebra::{Matrix2, Vector2, Vector3};
 
@@ -6,12 +6,12 @@ use crate::geo::Tilt;
 use crate::msg::TagFamily;
 use crate::time::{MonoTime, Span, UtcTime};
 
-/// A value with when it was true and when it was heard, both host time.
+/// A value with its times of validity and reception, both host time.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Stamped<T> {
-    /// When it was true.
+    /// Time of validity.
     pub t_valid: MonoTime,
-    /// When it was heard.
+    /// Time of reception.
     pub t_recv: MonoTime,
     /// Position in the stream of events.
     pub seq: u64,
@@ -19,7 +19,7 @@ pub struct Stamped<T> {
     pub value: T,
 }
 
-/// What kind of fix a receiver reports; each says more than the one before.
+/// Kind of fix that a receiver reports; each kind contains more than the one before.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug, Default)]
 pub enum FixKind {
     /// No position.
@@ -29,9 +29,9 @@ pub enum FixKind {
     TwoD,
     /// Position and height.
     ThreeD,
-    /// Position and height, from carrier phases of unknown whole cycles (GGA quality 5): decimetres.
+    /// Position and height, from carrier phases with unresolved ambiguities (GGA quality 5): decimetres.
     RtkFloat,
-    /// Position and height, from carrier phases of known whole cycles (GGA quality 4): centimetres.
+    /// Position and height, from carrier phases with resolved ambiguities (GGA quality 4): centimetres.
     RtkFixed,
 }
 
@@ -46,7 +46,7 @@ impl FixKind {
         self >= Self::ThreeD
     }
 
-    /// `none`, `2d` or `3d`, as logs and files tell it: RTK is `3d`.
+    /// `none`, `2d` or `3d`, for logs and files: RTK is `3d`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::None => "none",
@@ -56,10 +56,10 @@ impl FixKind {
     }
 }
 
-/// Everything a receiver said of one instant. `None` where it did not say.
+/// All values that a receiver reported for one instant. `None` where it did not report one.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct GnssEpoch {
-    /// UTC with its date; `None` until the receiver told a date.
+    /// UTC with its date; `None` until the receiver reported a date.
     pub utc: Option<UtcTime>,
     /// Time of day, nanoseconds since UTC midnight.
     pub time_of_day_ns: Option<i64>,
@@ -77,17 +77,17 @@ pub struct GnssEpoch {
     pub speed_mps: Option<f64>,
     /// Course over ground, degrees, true.
     pub course_deg: Option<f64>,
-    /// Velocity north, east, down, m/s; down is 0 and means nothing unless `vel_has_down`.
+    /// Velocity north, east, down, m/s; down is 0 and unknown unless `vel_has_down`.
     pub vel_ned_mps: Option<Vector3<f64>>,
     /// Whether the down component of `vel_ned_mps` was measured (PGRMV) or is not known (RMC, VTG).
     pub vel_has_down: bool,
-    /// Horizontal position error as the receiver puts it, metres.
+    /// Horizontal position error as the receiver reports it, metres.
     pub hpe_m: Option<f64>,
-    /// Vertical position error as the receiver puts it, metres.
+    /// Vertical position error as the receiver reports it, metres.
     pub vpe_m: Option<f64>,
-    /// One-sigma of the position along north, east, down, as the receiver puts it, metres.
+    /// One-sigma of the position along north, east, down, as the receiver reports it, metres.
     pub position_sigma_m: Option<Vector3<f64>>,
-    /// One-sigma of the velocity along north, east, down, as the receiver puts it, m/s.
+    /// One-sigma of the velocity along north, east, down, as the receiver reports it, m/s.
     pub velocity_sigma_mps: Option<Vector3<f64>>,
     /// Satellites used.
     pub sats: Option<u32>,
@@ -95,10 +95,10 @@ pub struct GnssEpoch {
     pub hdop: Option<f64>,
 }
 
-/// One compass reading, radians, with its error flags already honoured.
+/// One compass reading, radians, after evaluation of its error flags.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct AttitudeSample {
-    /// Heading as the device reports it; `None` where its flags say it is not valid.
+    /// Heading as the device reports it; `None` where its flags mark it as invalid.
     pub heading: Option<f64>,
     /// Whether the heading is already true (declination applied by the device).
     pub heading_is_true: bool,
@@ -115,10 +115,10 @@ pub struct InertialSample {
     pub force_mps2: Option<Vector3<f64>>,
 }
 
-/// Where the helicopter's autopilot takes it to be: what it flies by.
+/// The helicopter's position in its autopilot's estimate, which the autopilot uses for flying.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct AutopilotPosition {
-    /// When it was true, since the autopilot's start by its own clock.
+    /// Its time of validity, since the autopilot's start by its own clock.
     pub boot: Span,
     /// Latitude, degrees.
     pub lat_deg: f64,
@@ -130,26 +130,26 @@ pub struct AutopilotPosition {
     pub vel_ned_mps: Vector3<f64>,
 }
 
-/// What a source's bytes were decoded to.
+/// A decoded reading of a source.
 #[expect(
     clippy::large_enum_variant,
     reason = "some hundred readings a second, moved from a list to the filter"
 )]
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum SensorReading {
-    /// Of a GPS receiver.
+    /// From a GPS receiver.
     Gnss(Stamped<GnssEpoch>),
-    /// Of a compass.
+    /// From a compass.
     Attitude(Stamped<AttitudeSample>),
-    /// Of a second source of attitude.
+    /// From a second source of attitude.
     SecondAttitude(Stamped<AttitudeSample>),
-    /// Of gyros and accelerometers.
+    /// From gyros and accelerometers.
     Inertial(Stamped<InertialSample>),
-    /// Of an autopilot.
+    /// From an autopilot.
     Autopilot(Stamped<AutopilotPosition>),
 }
 
-/// Which marker a detection is of.
+/// The marker of a detection.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum MarkerId {
     /// A square tag.
@@ -173,8 +173,7 @@ pub enum MarkerId {
 pub struct MarkerDetection {
     /// Which marker.
     pub marker: MarkerId,
-    /// Where the marker's centre is: the intersection of a tag's diagonals, or a disc's centre
-    /// (corrected for perspective).
+    /// The marker's centre: the intersection of a tag's diagonals, or a disc's centre (corrected for perspective).
     pub center_px: Vector2<f64>,
     /// Covariance of the centre, px².
     pub center_cov_px2: Matrix2<f64>,
@@ -183,7 +182,7 @@ pub struct MarkerDetection {
     pub corners_px: Option<[Vector2<f64>; 4]>,
     /// Covariance of each corner, px²; zero for discs.
     pub corner_cov_px2: [Matrix2<f64>; 4],
-    /// Wrong bits corrected.
+    /// Number of corrected bits.
     pub hamming: u8,
     /// Contrast between a tag's white and black cells at the weakest decision, grey levels.
     pub margin: f32,
@@ -194,15 +193,15 @@ pub struct MarkerDetection {
 /// A static ground feature followed from frame to frame.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct FeatureTrack {
-    /// The same number in every frame it is followed through; never used again.
+    /// The same number in every frame through which it is followed; never reused.
     pub id: u64,
-    /// Where it is in this frame.
+    /// Its place in this frame.
     pub px: Vector2<f64>,
     /// One-sigma per axis, pixels.
     pub sigma_px: f64,
 }
 
-/// Everything seen in one frame.
+/// All detections of one frame.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct FrameObservations {
     /// Number of the frame.

@@ -1,4 +1,4 @@
-//! What flows: events in, measurements between, estimates out. Values only.
+//! The values that flow through the program: events in, measurements between, estimates out.
 
 mod estimate;
 mod event;

@@ -1,54 +1,54 @@
-//! Notices: what an operator should know of a flight.
+//! Notices: information about a flight for the operator.
 
 use std::fmt;
 
 use super::Source;
 use crate::time::MonoTime;
 
-/// What a notice is about. Names are fixed: people search logs for them.
+/// The subject of a notice. Names are fixed: operators search logs for them.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum NoticeKind {
     /// The receiver has a position.
     FixAcquired,
     /// The receiver lost its position.
     FixLost,
-    /// Nothing was heard from a source for longer than its time-out.
+    /// A source delivered nothing for longer than its time-out.
     SourceSilent,
-    /// A silent source speaks again.
+    /// A silent source delivers again.
     SourceBack,
     /// Bytes of a source were refused (checksum, range, grammar).
     BytesRefused,
-    /// A frame could not be read, or has the wrong size.
+    /// A frame could not be decoded, or has the wrong size.
     FrameUnusable,
     /// Parts of a frame are lost; the others are used.
     FrameDamaged,
     /// Frames or bytes were lost before they could be recorded.
     Dropped,
-    /// The origin of the NED frame was settled.
+    /// The origin of the NED frame is settled.
     DatumSet,
-    /// Positions of the receiver cannot be used, and why.
+    /// Positions of the receiver cannot be used; the text gives the reason.
     PositionsUnused,
-    /// The receiver's pulses come and are not used, and why.
+    /// The receiver's pulses arrive and are not used; the text gives the reason.
     PulseUnused,
-    /// The terrain tile of the configuration cannot be used here: the ground is level instead.
+    /// The terrain tile of the configuration cannot be used here: level ground is assumed instead.
     TerrainMissing,
     /// Declination was taken from the World Magnetic Model, or could not be.
     Declination,
-    /// A target was found and settled.
+    /// A target was found and its estimate has settled.
     TargetTracking,
-    /// A target has not been seen for a moment.
+    /// A target is out of sight; its state is predicted.
     TargetCoasting,
     /// A target is lost.
     TargetLost,
-    /// The filter started again.
+    /// The filter was reset.
     FilterReset,
-    /// A stamp went back or leapt ahead.
+    /// A stamp went back or jumped ahead.
     ClockJump,
-    /// Something measured does not fit the configuration, or the filter's model.
+    /// A measurement does not fit the configuration or the filter's model.
     ModelMisfit,
     /// The same marker was seen at two places of a frame.
     MarkerSeenTwice,
-    /// What the compass's tilt sensor feels was found out.
+    /// It was found out what the compass's tilt sensor measures.
     TiltFelt,
 }
 
@@ -81,35 +81,35 @@ impl NoticeKind {
     }
 }
 
-/// Something an operator should know.
+/// Information for the operator.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Notice {
-    /// When, host time.
+    /// Its time, host time.
     pub t: MonoTime,
-    /// What it is about.
+    /// Its kind.
     pub kind: NoticeKind,
-    /// Which source, where it is about one.
+    /// The source, where it concerns one.
     pub source: Option<Source>,
-    /// Name of the target, where it is about one.
+    /// Name of the target, where it concerns one.
     pub target: Option<String>,
-    /// In words: what, where, how many.
+    /// The text: what, where, how many.
     pub detail: String,
-    /// Of a misfit: its parts.
+    /// The parts of a misfit.
     pub misfit: Option<MisfitWords>,
 }
 
-/// What does not fit, in the operator's words.
+/// A misfit in the operator's terms.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct MisfitWords {
     /// The measurements, setting or marker that does not fit: `gps_velocity`, `compass.tilt`, `ugv tag 1`.
     pub source: String,
-    /// A fixed name for what does not fit.
+    /// A fixed name for the kind of misfit.
     pub kind: &'static str,
-    /// The figure that shows it, with its unit.
+    /// The measured value with its unit.
     pub figure: String,
     /// The likely cause.
     pub cause: String,
-    /// What to do.
+    /// What the operator can do.
     pub advice: String,
 }
 

@@ -1,18 +1,18 @@
-//! What the pipeline says: estimates, what became of measurements, notices, health.
+//! Outputs of the pipeline: estimates, dispositions, notices, health.
 
 use super::{EstimatorOutput, FeatureTrack, Health, MarkerDetection, Notice, SensorReading, TargetEstimate};
 use crate::geo::Geodetic;
 use crate::time::MonoTime;
 
-/// One thing the pipeline says.
+/// One output of the pipeline.
 #[expect(clippy::large_enum_variant, reason = "a box would be an allocation for each estimate")]
 #[derive(Clone, Debug)]
 pub enum Output {
-    /// The origin of the NED frame was settled, at this host time.
+    /// The origin of the NED frame is settled, at this host time.
     Datum(MonoTime, Geodetic),
     /// A sensor's reading, mapped to host time.
     Reading(SensorReading),
-    /// What was seen in a frame.
+    /// The detections of a frame.
     Detections {
         /// Number of the frame.
         frame: u32,
@@ -23,20 +23,20 @@ pub enum Output {
         /// Ground features.
         features: Vec<FeatureTrack>,
     },
-    /// The joint filter says something.
+    /// An output of the joint filter.
     Estimator(EstimatorOutput),
     /// A target's estimate by the paper's method.
     Paper(TargetEstimate),
-    /// Something an operator should know.
+    /// A notice for the operator.
     Notice(Notice),
-    /// How everything does, once a second.
+    /// Health, once a second.
     Health(Box<Health>),
 }
 
-/// An output, and when what caused it happened.
+/// An output, and the time of its cause.
 #[derive(Clone, Debug)]
 pub struct TimedOutput {
-    /// Host time of the event, or of the tick before it, from which the output followed.
+    /// Host time of the event, or of the tick before it, that caused the output.
     pub t_cause: MonoTime,
     /// The output.
     pub output: Output,

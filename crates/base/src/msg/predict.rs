@@ -1,10 +1,10 @@
-//! What the filter expects of a frame before it is searched.
+//! The filter's prediction of a frame before detection.
 
 use nalgebra::Vector2;
 
 use super::MarkerId;
 
-/// Where a marker should be in a frame.
+/// The predicted place of a marker in a frame.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct MarkerPrediction {
     /// Which marker.
@@ -17,26 +17,26 @@ pub struct MarkerPrediction {
     pub size_px: f64,
 }
 
-/// What the filter expects of a frame.
+/// The filter's prediction of a frame.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct FramePrediction {
-    /// Markers that should be in view. A marker left out is not expected.
+    /// Markers that should be in view. A marker that is not listed is not expected.
     pub markers: Vec<MarkerPrediction>,
-    /// Whether some target is not held: the whole frame is to be searched at once.
+    /// Whether some target has no track: then the whole frame is searched at once.
     pub search: bool,
-    /// Smallest and largest apparent tag edge to expect from the camera's height over the ground,
-    /// pixels; `None` where the height is not known.
+    /// Smallest and largest expected apparent edge of a tag, from the camera's height over the ground, pixels; `None`
+    /// where the height is not known.
     pub size_range_px: Option<(f64, f64)>,
-    /// Circles (centre, radius, pixels) that vehicles cover: no ground features there.
+    /// Circles (centre, radius, pixels) that vehicles cover: no ground features are used there.
     pub occupied: Vec<(Vector2<f64>, f64)>,
-    /// Tracks of ground features that are of no ground: something that moves.
+    /// Tracks of ground features that are not on the ground: they move.
     pub moving: Vec<u64>,
-    /// Around each of them no other feature is looked for, pixels.
+    /// No other feature is searched for within this distance of them, pixels.
     pub moving_radius_px: f64,
 }
 
 impl FramePrediction {
-    /// Expects nothing: the whole frame is to be searched. Keeps its room.
+    /// Predicts nothing: the whole frame is to be searched. Keeps its allocated memory.
     pub fn clear(&mut self) {
         self.markers.clear();
         self.occupied.clear();

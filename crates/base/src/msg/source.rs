@@ -1,11 +1,11 @@
-//! The table of sources: every sensor that delivers events, one row each.
+//! The table of sources: every sensor that delivers events, one row for each.
 
 use crate::time::Span;
 
-/// How a source delivers.
+/// The form in which a source delivers.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum Delivery {
-    /// Bytes of a line, as each read returned them.
+    /// Bytes of a line, in the portions of the reads.
     Bytes,
     /// Camera frames.
     Frames,
@@ -15,7 +15,7 @@ pub enum Delivery {
     Attitude,
 }
 
-/// What is the same for a source in every recording and every run.
+/// The constants of a source.
 #[derive(Clone, Copy, PartialEq, Debug)]
 struct SourceRow {
     name: &'static str,
@@ -24,10 +24,10 @@ struct SourceRow {
     silent_after: Span,
 }
 
-/// One row a source; the enum and everything that goes through all sources follow from the rows.
+/// One row for each source; the enum and all code that iterates over the sources use these rows.
 macro_rules! sources {
     ($($(#[$doc:meta])* $source:ident: $name:literal, $delivers:ident, $topic:literal, silent after $ms:literal ms;)+) => {
-        /// Where an event comes from.
+        /// The source of an event.
         #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
         pub enum Source {
             $($(#[$doc])* $source,)+
@@ -72,17 +72,17 @@ impl Source {
         self.row().name
     }
 
-    /// How it delivers.
+    /// The form in which it delivers.
     pub const fn delivers(self) -> Delivery {
         self.row().delivers
     }
 
-    /// Topic of what it delivers.
+    /// Topic of its events.
     pub const fn topic(self) -> &'static str {
         self.row().topic
     }
 
-    /// It is silent when it delivered nothing usable for this long.
+    /// It is silent when it has delivered nothing usable for this long.
     pub const fn silent_after(self) -> Span {
         self.row().silent_after
     }

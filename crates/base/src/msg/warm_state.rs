@@ -1,19 +1,19 @@
-//! What was learnt in flight and outlives a restart of the program.
+//! The state that was learnt in flight and survives a restart of the program.
 
 use serde::{Deserialize, Serialize};
 
-/// Everything a restarted pipeline continues from: where the flight is, the receiver's clock against
-/// the host's, the sensors' slow errors, how restless everything is. Plain numbers, to be stored.
+/// Everything from which a restarted pipeline continues: the place of the flight, the receiver's clock relative to the
+/// host's, the sensors' slow errors, the intensities of all motions. Plain numbers, to be stored.
 ///
-/// Host times stay comparable over a restart as far as the computer's clock was not stepped between;
-/// where it was, the clock fit finds out by itself and the errors count as old.
+/// Host times stay comparable over a restart if the computer's clock was not stepped in between. If it was, the clock
+/// fit detects that, and the errors count as old.
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 pub struct WarmState {
-    /// Where and over what ground.
+    /// Place and ground of the flight.
     pub site: WarmSite,
     /// The receiver's recent arrivals, oldest first.
     pub arrivals: Vec<WarmArrival>,
-    /// The filter's part; `None` while the filter knew nothing.
+    /// The filter's part; `None` before the filter has a state.
     pub filter: Option<WarmFilter>,
 }
 
@@ -30,12 +30,12 @@ pub struct WarmSite {
     pub declination_rad: f64,
 }
 
-/// One arrival of an epoch, as the clock fit takes it.
+/// The arrival of one epoch, for the clock fit.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
 pub struct WarmArrival {
     /// Host time of its first byte, ns.
     pub t_ns: i64,
-    /// That less the epoch's time of day, ns.
+    /// That minus the epoch's time of day, ns.
     pub offset_ns: i64,
 }
 
@@ -45,10 +45,10 @@ pub const WARM_STATES: usize = 9;
 /// The sensors' slow errors and the fitted intensities.
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 pub struct WarmFilter {
-    /// Host time at which it held, ns.
+    /// Host time at which it was valid, ns.
     pub t_ns: i64,
-    /// GPS bias north, east, down (m); compass heading bias (rad); share of the tilt the compass
-    /// reads; its pitch and roll bias (rad); GPS delay against the configured latency (s); drag (1/s).
+    /// GPS bias north, east, down (m); compass heading bias (rad); share of the tilt that the compass reads; its pitch
+    /// and roll bias (rad); GPS delay relative to the configured latency (s); drag (1/s).
     pub mean: [f64; WARM_STATES],
     /// Their covariance.
     pub covariance: [[f64; WARM_STATES]; WARM_STATES],
@@ -58,7 +58,7 @@ pub struct WarmFilter {
 }
 
 impl WarmFilter {
-    /// Whether every figure is a number and every variance is one.
+    /// Whether every value is finite and every variance is positive.
     pub fn is_sound(&self) -> bool {
         let finite = self.mean.iter().chain(self.covariance.iter().flatten()).all(|x| x.is_finite());
         let variances = (0..WARM_STATES).all(|i| self.covariance[i][i] >= 0.0);

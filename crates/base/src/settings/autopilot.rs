@@ -1,4 +1,4 @@
-//! `[autopilot]`: the helicopter's own autopilot, heard over MAVLink.
+//! `[autopilot]`: the helicopter's own autopilot, received over MAVLink.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,33 +6,34 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, PartialEq, Eq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AutopilotConfig {
-    /// Serial device that its telemetry comes over.
+    /// Serial device of its telemetry.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub device: Option<String>,
     /// Line speed, bits a second.
     pub baud: u32,
-    /// UDP address at which it is heard instead, `udp://ADDRESS:PORT`.
+    /// Local UDP address for its datagrams instead, `udp://ADDRESS:PORT`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub listen: Option<String>,
-    /// What of it goes into the filter. Its position and its clock are used for what is sent to it in any case.
+    /// Which of its measurements the filter uses. Its position and its clock are always used for the messages that are
+    /// sent to it.
     #[serde(rename = "use")]
     pub uses: Vec<AutopilotUse>,
-    /// Its system id; the first autopilot heard where absent.
+    /// Its system id; the first received autopilot where absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub system_id: Option<u8>,
-    /// Ask it at start for the messages that are used, at the rates they are used at.
+    /// Request at start the messages that are used, at their rates.
     pub configure: bool,
 }
 
-/// What of an autopilot goes into the filter.
+/// A measurement of an autopilot that the filter can use.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum AutopilotUse {
-    /// Its attitude: beside a compass as a second source, else in its place.
+    /// Its attitude: as a second source where there is a compass, else instead of one.
     Attitude,
     /// Its gyros and accelerometers.
     Imu,
-    /// Its receiver's fixes, where there is no receiver of our own.
+    /// Its receiver's fixes, where there is no separate receiver.
     Gps,
 }
 
@@ -50,12 +51,12 @@ impl Default for AutopilotConfig {
 }
 
 impl AutopilotConfig {
-    /// Whether this goes into the filter.
+    /// Whether the filter uses this.
     pub fn gives(&self, what: AutopilotUse) -> bool {
         self.uses.contains(&what)
     }
 
-    /// The UDP address it is heard at.
+    /// The local UDP address for its datagrams.
     pub fn listen_at(&self) -> Option<&str> {
         let listen = self.listen.as_deref()?;
         Some(listen.strip_prefix("udp://").unwrap_or(listen))

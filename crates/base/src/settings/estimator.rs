@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DetectorConfig {
-    /// Smallest edge of a tag's black square looked for over the whole frame, pixels.
+    /// Smallest edge of a tag's black square that is detected over the whole frame, pixels.
     pub min_px: f64,
-    /// Most wrong bits accepted in a tag's code.
+    /// Most wrong bits that are corrected in a tag's code.
     pub max_hamming: u8,
     /// Ground features tracked from frame to frame; 0 for none.
     pub ground_features: usize,
@@ -20,14 +20,14 @@ impl Default for DetectorConfig {
     }
 }
 
-/// `[estimator]`: the joint filter. Every intensity is where learning starts, not where it ends: with
-/// `learn` the filter fits them to the flight.
+/// `[estimator]`: the joint filter. The intensities are initial values: with `learn` the filter fits them to the
+/// flight.
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct EstimatorConfig {
-    /// How often the helicopter's own state is told beside the frames, times a second.
+    /// Rate at which the helicopter's own state is output in addition to the frames, times a second.
     pub ownship_hz: f64,
-    /// How far back late measurements are still fused in their place, ms.
+    /// Age up to which late measurements are inserted at their time, ms.
     pub history_ms: f64,
     /// Lag of the smoothed output, ms.
     pub smoother_lag_ms: f64,
@@ -39,21 +39,21 @@ pub struct EstimatorConfig {
     pub learn_s: f64,
     /// Probability that a good measurement passes the gate at full weight.
     pub gate_probability: f64,
-    /// Measurements in a row outside the gate after which a state is started again.
+    /// Consecutive measurements outside the gate after which a state is reset.
     pub rejections_to_restart: u32,
-    /// Ground features used at once.
+    /// Most ground features in use at once.
     pub features: usize,
-    /// Factor on the pixel sigma that the detector tells of ground features.
+    /// Factor on the detector's pixel sigma of ground features.
     pub feature_sigma_factor: f64,
-    /// One-sigma added to every marker pixel for what the detector cannot know (lens, exposure time), px.
+    /// One-sigma added to every marker pixel for errors that the detector cannot know (lens, exposure time), px.
     pub marker_noise_px: f64,
     /// Random walk of the aircraft's roll and pitch rates, rad/s per √s.
     pub tilt_rate_walk: f64,
     /// Random walk of the aircraft's yaw rate, rad/s per √s.
     pub yaw_rate_walk: f64,
-    /// One-sigma of the force of gusts, an axis over the mass, m/s².
+    /// One-sigma of the force of gusts, for each axis, divided by the mass, m/s².
     pub side_force_mps2: f64,
-    /// One-sigma of the thrust beyond the weight, m/s².
+    /// One-sigma of the thrust in excess of the weight, divided by the mass, m/s².
     pub thrust_mps2: f64,
     /// Correlation time of the gusts, seconds.
     pub force_tau_s: f64,

@@ -4,19 +4,19 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// Data bits, parity and stop bits, written as people do: `8N1`, `7E1`.
+/// Data bits, parity and stop bits in the usual notation: `8N1`, `7E1`.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Framing {
     /// Seven or eight.
     pub data_bits: u8,
-    /// What the bit after them is.
+    /// The parity bit.
     pub parity: Parity,
     /// One or two.
     pub stop_bits: u8,
 }
 
-/// What is sent after the data bits.
+/// The bit after the data bits.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Parity {
     /// Nothing.
@@ -34,12 +34,12 @@ impl Default for Framing {
 }
 
 impl Framing {
-    /// Bits on the wire for a byte, the start bit included.
+    /// Bits on the wire for a byte, including the start bit.
     pub fn bits(self) -> u32 {
         1 + u32::from(self.data_bits) + u32::from(self.parity != Parity::None) + u32::from(self.stop_bits)
     }
 
-    /// Whether it is what nearly every device speaks.
+    /// Whether it is the usual 8N1.
     pub fn is_default(&self) -> bool {
         *self == Self::default()
     }

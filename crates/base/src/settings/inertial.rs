@@ -1,4 +1,4 @@
-//! Sections of what may be there beside the compass: rates and forces, a second source of attitude.
+//! Sections for sensors in addition to the compass: rates and forces, a second source of attitude.
 
 use nalgebra::Rotation3;
 use serde::{Deserialize, Serialize};
@@ -18,11 +18,11 @@ pub struct ImuConfig {
     pub pitch_deg: f64,
     /// Mounting roll, degrees; 180 for a sensor whose axes point forward, left and up.
     pub roll_deg: f64,
-    /// One-sigma noise of a rate, mean of a tenth of a second, degrees a second.
+    /// One-sigma noise of a rate, averaged over a tenth of a second, degrees a second.
     pub rate_noise_dps: f64,
     /// One-sigma of a rate's constant error, degrees a second.
     pub rate_bias_dps: f64,
-    /// One-sigma noise of a specific force, mean of a tenth of a second, m/s²; vibration is most of it.
+    /// One-sigma noise of a specific force, averaged over a tenth of a second, m/s²; mostly vibration.
     pub force_noise_mps2: f64,
     /// One-sigma of a specific force's constant error, m/s².
     pub force_bias_mps2: f64,
@@ -57,9 +57,9 @@ impl ImuConfig {
 pub struct AttitudeConfig {
     /// From a sample's time of validity to its time in the recording, ms.
     pub latency_ms: f64,
-    /// What it means by pitch and roll.
+    /// Its definition of pitch and roll.
     pub angles: TiltConvention,
-    /// What its tilt sensor feels.
+    /// What its tilt sensor measures.
     pub tilt: TiltKind,
     /// One-sigma of the heading's constant error, degrees.
     pub heading_bias_sigma_deg: f64,

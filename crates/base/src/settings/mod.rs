@@ -1,7 +1,7 @@
 //! Settings of the core: sections of the configuration as values, with their defaults.
 //!
-//! Angles are degrees here, as people write them; each user converts where it uses them. Checks of
-//! ranges are made where the whole configuration is read.
+//! Angles are degrees here, as people write them; each user converts them. Ranges are checked where the whole
+//! configuration is read.
 
 mod autopilot;
 mod estimator;

@@ -23,10 +23,10 @@ impl Distribution {
     }
 }
 
-/// `[montecarlo]`: where the camera is, what it looks at, and one sigma per error source.
+/// `[montecarlo]`: pose of the camera, the pixel, and one sigma for each error source.
 ///
-/// The default is the paper's condition (35): the camera 10 m above level ground, level, looking at
-/// the point under it (u = v = 0), with a GPS of 3 m (95 % of horizontal errors) and 0.2° of tilt.
+/// The default is the paper's condition (35): the camera 10 m above level ground, level, with the pixel of the point
+/// under it (u = v = 0), a GPS of 3 m (95 % of horizontal errors) and 0.2° of tilt.
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MonteCarloConfig {
@@ -40,10 +40,10 @@ pub struct MonteCarloConfig {
     pub pitch_deg: f64,
     /// Its roll, degrees, right side down positive.
     pub roll_deg: f64,
-    /// Pixel looked at; where absent the one on the optical axis (u = v = 0).
+    /// The pixel; where absent the one on the optical axis (u = v = 0).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pixel: Option<[f64; 2]>,
-    /// Height over the ground of the point looked at, metres.
+    /// Height of the point over the ground, metres.
     pub above_ground_m: f64,
     /// One-sigma of GPS position, north and east each, metres.
     pub gps_horizontal_sigma_m: f64,
@@ -77,7 +77,7 @@ impl Default for MonteCarloConfig {
             roll_deg: 0.0,
             pixel: None,
             above_ground_m: 0.0,
-            // 3 m is the radius that holds 95 % of the errors: 2.4477 sigma of each axis.
+            // 3 m is the radius that contains 95 % of the errors: 2.4477 sigma of each axis.
             gps_horizontal_sigma_m: 1.2256,
             gps_vertical_sigma_m: 2.0,
             heading_sigma_deg: 0.5,

@@ -1,4 +1,4 @@
-//! What the helicopter carries and what it watches.
+//! The helicopter's instruments and its targets.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +16,7 @@ pub struct Rig {
     /// The digital compass.
     #[serde(default, skip_serializing_if = "CompassConfig::is_absent")]
     pub compass: CompassConfig,
-    /// The helicopter's autopilot, where it is heard.
+    /// The helicopter's autopilot, where one is connected.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub autopilot: Option<AutopilotConfig>,
     /// Gyros and accelerometers, where there are any.
@@ -32,13 +32,13 @@ pub struct Rig {
 }
 
 impl Rig {
-    /// Whether the receiver's line tells the heading too. A server behind TCP gives the same to everybody who asks.
+    /// Whether the receiver's line also carries the heading. A server behind TCP sends the same data to every client.
     pub fn compass_is_receivers(&self) -> bool {
         shares_line(&self.gps, &self.compass)
     }
 }
 
-/// Whether receiver and compass are one line.
+/// Whether receiver and compass share one line.
 pub fn shares_line(gps: &GpsConfig, compass: &CompassConfig) -> bool {
     gps.is_there() && gps.device == compass.device && !gps.device.starts_with("tcp://")
 }

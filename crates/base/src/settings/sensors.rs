@@ -10,19 +10,19 @@ use crate::geo::{CameraModel, ImageTop, TiltConvention, body_from_camera};
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GpsConfig {
-    /// Serial device; a `/dev/serial/by-id` path survives renumbering. Or `tcp://HOST:PORT`, gpsd too, or
-    /// `udp://ADDRESS:PORT`, where datagrams come in.
+    /// Serial device; a `/dev/serial/by-id` path survives renumbering. Or `tcp://HOST:PORT`, also for gpsd, or
+    /// `udp://ADDRESS:PORT`, a local address for datagrams.
     pub device: String,
     /// Line speed, bits a second.
     pub baud: u32,
-    /// What the receiver speaks: sentences ("nmea"), u-blox's packets ("ubx"), or either ("auto").
+    /// Format of the receiver: sentences ("nmea"), u-blox's packets ("ubx"), or either ("auto").
     #[serde(default)]
     pub format: GpsFormat,
     /// Data bits, parity and stop bits of the serial line.
     #[serde(default, skip_serializing_if = "Framing::is_default")]
     pub framing: Framing,
-    /// Whether sentences must have a checksum. Without it what noise makes of a sentence may pass; one that is there
-    /// must match all the same.
+    /// Whether sentences must have a checksum. Without this, a sentence damaged by noise may pass; an existing checksum
+    /// must still match.
     #[serde(default = "defaults::yes", skip_serializing_if = "is_true")]
     pub require_checksum: bool,
     /// Antenna in the body frame, forward-right-down, metres.
@@ -52,7 +52,7 @@ pub struct GpsConfig {
     /// Configure a u-blox receiver at start: line speed, rate, packets, sentences off.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub configure: bool,
-    /// Solutions a second that `configure` asks for.
+    /// Rate of solutions that `configure` sets, Hz.
     #[serde(default = "defaults::gps_rate_hz")]
     pub rate_hz: f64,
     /// Pulse-per-second device (`/dev/pps0`) that marks the receiver's seconds.
@@ -60,7 +60,7 @@ pub struct GpsConfig {
     pub pps_device: Option<String>,
 }
 
-/// No receiver of our own: an autopilot's stands in.
+/// There is no separate receiver: the autopilot's is used.
 impl Default for GpsConfig {
     fn default() -> Self {
         Self {
@@ -85,22 +85,22 @@ impl Default for GpsConfig {
 }
 
 impl GpsConfig {
-    /// Whether there is a receiver of our own.
+    /// Whether there is a separate receiver.
     pub fn is_there(&self) -> bool {
         !self.device.is_empty()
     }
 
-    /// Whether there is none.
+    /// Whether there is no separate receiver.
     pub fn is_absent(&self) -> bool {
         !self.is_there()
     }
 }
 
-/// What a receiver speaks.
+/// Format of a receiver.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum GpsFormat {
-    /// Sentences and packets, as they come.
+    /// Both sentences and packets.
     #[default]
     Auto,
     /// NMEA 0183, with Garmin's own sentences.
@@ -113,32 +113,32 @@ pub enum GpsFormat {
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CompassConfig {
-    /// Serial device, or `tcp://HOST:PORT`, `udp://ADDRESS:PORT` as for the receiver. The receiver's own line where
-    /// the receiver tells the heading too.
+    /// Serial device, or `tcp://HOST:PORT`, `udp://ADDRESS:PORT` as for the receiver. The receiver's own line where the
+    /// receiver also provides the heading.
     pub device: String,
     /// Line speed, bits a second.
     pub baud: u32,
-    /// What the device speaks.
+    /// Format of the device.
     pub format: CompassFormat,
     /// Data bits, parity and stop bits of the serial line.
     #[serde(default, skip_serializing_if = "Framing::is_default")]
     pub framing: Framing,
-    /// Whether sentences must have a checksum, as of the receiver.
+    /// Whether sentences must have a checksum, as for the receiver.
     #[serde(default = "defaults::yes", skip_serializing_if = "is_true")]
     pub require_checksum: bool,
-    /// Use the rates and forces it tells beside its attitude, as `[imu]` says.
+    /// Use its rates and forces too, with the settings of `[imu]`.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub imu: bool,
-    /// What it means by pitch and roll.
+    /// Its definition of pitch and roll.
     #[serde(default)]
     pub angles: TiltConvention,
-    /// What its tilt sensor feels.
+    /// What its tilt sensor measures.
     #[serde(default)]
     pub tilt: TiltKind,
     /// Magnetic declination, degrees, east positive.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub declination_deg: Option<f64>,
-    /// Declination from a model instead of a figure.
+    /// Declination from a model instead of a value.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub declination: Option<Declination>,
     /// From a sample's time of validity to the arrival of its first byte, ms (filter delay of the
@@ -165,7 +165,7 @@ pub struct CompassConfig {
     pub tilt_noise_deg: f64,
 }
 
-/// No compass of our own: an autopilot's attitude stands in, whose heading is true and whose tilt is an AHRS's.
+/// There is no separate compass: the autopilot's attitude is used, whose heading is true and whose tilt is an AHRS's.
 impl Default for CompassConfig {
     fn default() -> Self {
         Self {
@@ -191,27 +191,27 @@ impl Default for CompassConfig {
 }
 
 impl CompassConfig {
-    /// Whether there is a compass of our own.
+    /// Whether there is a separate compass.
     pub fn is_there(&self) -> bool {
         !self.device.is_empty()
     }
 
-    /// Whether there is none.
+    /// Whether there is no separate compass.
     pub fn is_absent(&self) -> bool {
         !self.is_there()
     }
 }
 
-/// What a compass's tilt sensor feels.
+/// What a compass's tilt sensor measures.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum TiltKind {
-    /// Not said: found out in flight.
+    /// Not configured: found out in flight.
     #[default]
     Auto,
-    /// Attitude, as an AHRS tells it: gyros carry it through manoeuvres.
+    /// Attitude, as from an AHRS with gyros that are valid in manoeuvres.
     Inertial,
-    /// Specific force, as a fluid or an accelerometer does. On a rotorcraft that is a part of the tilt or none.
+    /// Specific force, as from a fluid or an accelerometer. On a rotorcraft that is a part of the tilt or none of it.
     Gravity,
 }
 
@@ -226,7 +226,7 @@ impl TiltKind {
     }
 }
 
-/// The enum of formats with their names, out of one row a format.
+/// The enum of formats with their names, from one row for each format.
 macro_rules! compass_formats {
     ($($(#[$about:meta])* $variant:ident = $name:literal;)*) => {
         /// Serial compass formats.
@@ -275,12 +275,12 @@ compass_formats! {
 }
 
 impl CompassFormat {
-    /// Whether a receiver tells its heading so, on the line of its fixes.
+    /// Whether receivers report their heading in this format, on the line of their fixes.
     pub fn is_of_receivers(self) -> bool {
         matches!(self, Self::Nmea | Self::Ubx)
     }
 
-    /// Whether rates or forces come beside the attitude.
+    /// Whether the format has rates or forces in addition to the attitude.
     pub fn has_inertial(self) -> bool {
         matches!(self, Self::Vectornav | Self::Witmotion)
     }
@@ -296,12 +296,15 @@ impl std::str::FromStr for CompassFormat {
     fn from_str(name: &str) -> Result<Self, String> {
         let known = Self::ALL.into_iter().find(|format| format.name() == name);
         known.ok_or_else(|| {
-            format!("{name:?} is no compass format; known are {}", Self::ALL.map(Self::name).join(", "))
+            format!(
+                "{name:?} is not a compass format; the formats are {}",
+                Self::ALL.map(Self::name).join(", ")
+            )
         })
     }
 }
 
-/// Where declination comes from when not given as a figure.
+/// Source of the declination when it is not given as a value.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Declination {
@@ -319,12 +322,12 @@ pub struct CameraConfig {
     pub width: u32,
     /// Frame height, pixels.
     pub height: u32,
-    /// Frames a second asked for.
+    /// Requested frame rate, frames a second.
     pub fps: f64,
-    /// What V4L2 is asked for.
+    /// Pixel format that is requested from V4L2.
     #[serde(default)]
     pub pixel_format: PixelFormat,
-    /// Added to the driver's stamp to reach mid-exposure, ms.
+    /// Added to the driver's stamp to get mid-exposure, ms.
     #[serde(default)]
     pub exposure_offset_ms: f64,
     /// Rolling shutter: from the exposure of the first row to that of the last, ms; 0 where all are exposed together. The
@@ -333,12 +336,12 @@ pub struct CameraConfig {
     pub readout_ms: f64,
     /// The lens.
     pub intrinsics: CameraModel,
-    /// How it is mounted.
+    /// Its mounting.
     #[serde(default)]
     pub mount: CameraMount,
 }
 
-/// Pixel formats understood.
+/// Supported pixel formats.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 pub enum PixelFormat {
     /// 8-bit grey.
@@ -360,7 +363,7 @@ pub enum PixelFormat {
     /// 24-bit RGB (V4L2 RGB3).
     #[serde(rename = "RGB24", alias = "RGB3")]
     Rgb24,
-    /// 8-bit mosaic of colours, red first; read as grey, evened out.
+    /// 8-bit mosaic of colours, red first; read as grey, with the mosaic filtered out.
     #[serde(rename = "RGGB")]
     Rggb,
     /// The same, blue first (V4L2 BA81).
@@ -390,7 +393,7 @@ pub enum PixelFormat {
 #[derive(Clone, Copy, PartialEq, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CameraMount {
-    /// Where the top of the image points on the aircraft.
+    /// The direction on the aircraft to which the top of the image points.
     pub image_top: ImageTop,
     /// Camera in the body frame, forward-right-down, metres.
     pub position_m: [f64; 3],
@@ -419,14 +422,14 @@ impl CameraMount {
     }
 }
 
-/// `[ground]`: either an elevation, or where it comes from.
+/// `[ground]`: an elevation, or its source.
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GroundConfig {
     /// Elevation of level ground above mean sea level, metres.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub elevation_msl_m: Option<f64>,
-    /// Where the elevation comes from instead.
+    /// Source of the elevation.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub source: Option<GroundSource>,
     /// Terrain tile (SRTM .hgt or GeoTIFF).
@@ -434,7 +437,7 @@ pub struct GroundConfig {
     pub terrain: Option<String>,
 }
 
-/// Where the ground's elevation comes from.
+/// Source of the ground's elevation.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum GroundSource {
@@ -458,7 +461,7 @@ fn is_true(value: &bool) -> bool {
     *value
 }
 
-/// Defaults from data sheets; `config/windhover.toml` tells where each comes from.
+/// Defaults from data sheets; `config/windhover.toml` gives the source of each.
 mod defaults {
     pub(super) fn yes() -> bool {
         true

@@ -10,7 +10,7 @@ use crate::msg::TagFamily;
 pub struct TargetConfig {
     /// Name in topics and files.
     pub name: String,
-    /// How it moves.
+    /// Its model of motion.
     pub model: TargetModel,
     /// Distance between the axles, metres; needed by `ackermann`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -22,7 +22,7 @@ pub struct TargetConfig {
     pub marker: Vec<MarkerConfig>,
 }
 
-/// How a target moves.
+/// The model of motion of a target.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum TargetModel {
@@ -46,7 +46,7 @@ pub struct MarkerConfig {
     /// Identity of a tag.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub id: Option<u32>,
-    /// Width of a tag's border, cells: 1 as the families' authors print it, 2 as Kalibr does.
+    /// Edge of a tag's black square, including its whole border, metres.
     #[serde(default = "one_cell", skip_serializing_if = "is_one_cell")]
     pub border: u8,
     /// Edge of a tag's black square, its whole border included, metres.
@@ -55,7 +55,7 @@ pub struct MarkerConfig {
     /// Diameter of a disc, metres.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub diameter_m: Option<f64>,
-    /// Whether a disc is lighter or darker than what surrounds it.
+    /// Whether a disc is lighter or darker than its surroundings.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub brightness: Option<Brightness>,
     /// Colour of a disc, `#rrggbb`.
@@ -72,7 +72,7 @@ fn one_cell() -> u8 {
     1
 }
 
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde hands over references")]
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes references")]
 fn is_one_cell(border: &u8) -> bool {
     *border == 1
 }
@@ -91,8 +91,8 @@ pub enum MarkerKind {
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Brightness {
-    /// Lighter than what surrounds it.
+    /// Lighter than its surroundings.
     Light,
-    /// Darker than what surrounds it.
+    /// Darker than its surroundings.
     Dark,
 }

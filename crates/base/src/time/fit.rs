@@ -1,4 +1,4 @@
-//! GPS time to host time: when was it true what a receiver said later.
+//! GPS time to host time: the time of validity of the receiver's reports.
 
 use std::collections::VecDeque;
 
@@ -6,62 +6,62 @@ use super::jitter::{JitterFit, Point};
 use super::pulse::{PulseTrouble, Pulses};
 use super::{MonoTime, NS_PER_S, Span};
 
-/// Epochs the fit is made over.
+/// Most epochs in the fit.
 const WINDOW_MAX: usize = 600;
 /// Age of the oldest.
 const WINDOW_AGE: Span = Span::from_ns(150 * NS_PER_S);
-/// One-sigma of the drift of the host's clock against UTC expected beforehand: crystals keep ±20
-/// parts in a million. Milliseconds a second.
+/// Prior one-sigma of the drift of the host's clock against UTC, milliseconds a second: crystals are within ±20 parts
+/// in a million.
 const DRIFT_SIGMA: f64 = 0.02;
-/// Arrivals as much as this off the line are kept out of it, beside what the jitter explains.
+/// Arrivals that are this far off the line, in addition to the jitter, are excluded.
 const GATE_MS: f64 = 20.0;
-/// As long as fewer epochs were seen, the gate is as wide as this.
+/// While fewer epochs were seen, the gate has this width.
 const GATE_FIRST: (usize, f64) = (10, 300.0);
-/// Epochs in a row off the line, and within this of each other, begin a new one.
+/// This many consecutive epochs off the line, within this of each other, begin a new line.
 const RESTART: (usize, f64) = (5, 150.0);
-/// One-sigma of the first arrival, milliseconds: that the first few agree may be chance.
+/// One-sigma of the first arrival, milliseconds: the agreement of the first few may be chance.
 const FIRST_SIGMA_MS: f64 = 20.0;
 /// Nanoseconds in a day.
 const DAY_NS: i64 = 86_400 * NS_PER_S;
-/// How long after an epoch is true it may at most be heard to be put in time by the fit.
+/// Longest time from the validity of an epoch to its reception for a stamp by the fit.
 const HEARD_WITHIN: Span = Span::from_ns(1_500_000_000);
-/// How long before it is true it may seem to be heard: the fit's error.
+/// Longest time by which it may seem to be received before its validity: the fit's error.
 const HEARD_BEFORE: Span = Span::from_ns(50_000_000);
 /// One-sigma of a pulse's stamp: interrupt latency of an idle kernel.
 const PULSE_SIGMA: Span = Span::from_ns(50_000);
-/// Epochs the arrivals of which tell well enough which pulse is theirs.
+/// Number of epochs whose arrivals determine well enough to which pulse each belongs.
 const PULSE_EPOCHS: usize = 5;
-/// Bursts nearer than this are not two of one receiver: what it tells of another time is no step.
+/// Bursts nearer than this are not two of one receiver: another time of day in them is not a step.
 const APART: Span = Span::from_ns(30_000_000);
-/// A time of day told again later than this is another burst.
+/// A time of day that is repeated later than this is another burst.
 const AGAIN: Span = Span::from_ns(300_000_000);
 
-/// State of the fit, for people.
+/// State of the fit, for display.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct ClockFit {
-    /// One-sigma of a host time it gives now, without the error of the configured latency.
+    /// Present one-sigma of its host times, without the error of the configured latency.
     pub sigma: Span,
     /// How much faster the host's clock runs than UTC, parts in a million.
     pub drift_ppm: f64,
     /// Jitter of the arrivals: one-sigma of its symmetric part plus mean of its one-sided part.
     pub jitter: Span,
-    /// Epochs it is made over.
+    /// Epochs in the fit.
     pub epochs: usize,
-    /// Whether pulses hold the time.
+    /// Whether pulses determine the time.
     pub pulse: bool,
 }
 
 /// Fits the host's clock to a receiver's UTC over the arrivals of its epochs.
 ///
-/// Only times of day are used: dates may be missing, wrong or roll over. An arrival is the validity
-/// of its epoch, plus the configured latency, plus jitter that is symmetric or only late. Constant
-/// errors of the latency cannot be seen here. Single wild arrivals are left out; a receiver or a
-/// clock that has stepped is followed after five epochs, an announced leap second at once.
+/// Only times of day are used: dates may be missing, wrong or roll over. An arrival is the validity of its epoch, plus
+/// the configured latency, plus jitter that is either symmetric or one-sided (late). Constant errors of the latency
+/// cannot be detected here. Single outliers are excluded; a step of the receiver or of a clock is followed after five
+/// epochs, an announced leap second at once.
 #[derive(Clone, Debug)]
 pub struct GnssClock {
     latency: Span,
     fit: JitterFit,
-    /// Host time that counts as zero, and the offset (arrival less time of day) there.
+    /// Host time that counts as zero, and the offset (arrival minus time of day) there.
     reference: Option<(MonoTime, i64)>,
     points: VecDeque<Point>,
     astray: Vec<(MonoTime, i64)>,
@@ -76,18 +76,18 @@ struct Last {
     arrival: MonoTime,
 }
 
-/// What an arrival off the line tells.
-enum Astray {
-    /// UTC was put right by whole seconds, so many nanoseconds of host time later.
+/// The interpretation of an arrival off the line.
+enum OffLine {
+    /// UTC was corrected by whole seconds: this many nanoseconds of host time later.
     Seconds(i64),
-    /// The receiver's time was put right by some other amount.
+    /// The receiver's time was corrected by some other amount.
     Anew,
-    /// It came late, or is wild.
+    /// It came late, or is an outlier.
     Unknown,
 }
 
 impl GnssClock {
-    /// `latency`: from a fix's validity to the begin of its first byte, without jitter.
+    /// `latency`: from a fix's validity to the start of its first byte, without jitter.
     pub fn new(latency: Span) -> Self {
         Self {
             latency,
@@ -100,16 +100,16 @@ impl GnssClock {
         }
     }
 
-    /// The newest arrivals the fit is made over, oldest first: host time and that less the time of day
-    /// (up to whole days). What [`Self::resume`] takes.
+    /// The newest arrivals in the fit, oldest first: host time, and that minus the time of day (modulo whole days). The
+    /// input of [`Self::resume`].
     pub fn arrivals(&self, most: usize) -> Vec<(MonoTime, i64)> {
         let Some((reference, reference_ns)) = self.reference else { return Vec::new() };
         let newest = self.points.iter().skip(self.points.len().saturating_sub(most));
         newest.map(|&(t, x)| (reference + Span::from_s(t), reference_ns + Span::from_ms(x).ns())).collect()
     }
 
-    /// Continues from the arrivals of an earlier clock of the same receiver and host. New arrivals that
-    /// do not lie with them begin a new fit, as after any step.
+    /// Continues from the arrivals of an earlier clock of the same receiver and host. New arrivals that do not agree
+    /// with them begin a new fit, as after any step.
     pub fn resume(&mut self, arrivals: &[(MonoTime, i64)]) {
         if !arrivals.is_empty() {
             self.restart(arrivals);
@@ -123,7 +123,7 @@ impl GnssClock {
             return;
         }
         if before.is_some_and(|b| b.time_of_day_ns >= DAY_NS && time_of_day_ns < DAY_NS / 2) {
-            // The leap second is over: UTC has stood still for a second.
+            // The leap second is over: UTC stood still for a second.
             self.step(NS_PER_S);
         }
         let offset_ns = arrival.ns().wrapping_sub(time_of_day_ns);
@@ -131,14 +131,14 @@ impl GnssClock {
             self.restart(&[(arrival, offset_ns)]);
             return;
         };
-        if self.is_astray(t, x) {
-            match self.told_by(t, x, offset_ns, before) {
-                Astray::Seconds(ns) => {
+        if self.is_off_line(t, x) {
+            match self.interpret(t, x, offset_ns, before) {
+                OffLine::Seconds(ns) => {
                     self.step(ns);
                     x -= Span::from_ns(ns).ms();
                 }
-                Astray::Anew => return self.restart(&[(arrival, offset_ns)]),
-                Astray::Unknown => return self.stray(arrival, offset_ns),
+                OffLine::Anew => return self.restart(&[(arrival, offset_ns)]),
+                OffLine::Unknown => return self.stray(arrival, offset_ns),
             }
         }
         self.astray.clear();
@@ -151,17 +151,17 @@ impl GnssClock {
         self.pair(time_of_day_ns, arrival);
     }
 
-    /// The receiver's pulse was seen at this host time.
+    /// The receiver's pulse arrived at this host time.
     pub fn observe_pulse(&mut self, edge: MonoTime) {
         self.pulses.edge(edge);
     }
 
-    /// Why pulses that come are not used; `None` where they are, or where none come.
+    /// Why arriving pulses are not used; `None` where they are used, or where none arrive.
     pub fn pulse_trouble(&self) -> Option<PulseTrouble> {
         self.pulses.trouble()
     }
 
-    /// Looks for the pulse that marked an epoch.
+    /// Finds the pulse that marked an epoch.
     fn pair(&mut self, time_of_day_ns: i64, arrival: MonoTime) {
         if self.points.len() < PULSE_EPOCHS {
             return;
@@ -172,7 +172,7 @@ impl GnssClock {
         self.pulses.epoch(of_day_ns, MonoTime::from_ns(of_day_ns + offset_ns), self.latency);
     }
 
-    /// UTC stands back by this much against host time from here on.
+    /// From here on UTC is behind by this much relative to host time.
     fn step(&mut self, ns: i64) {
         if let Some((_, reference_ns)) = &mut self.reference {
             *reference_ns = reference_ns.wrapping_add(ns);
@@ -180,10 +180,10 @@ impl GnssClock {
         self.pulses.shift(ns);
     }
 
-    /// What an arrival off the line tells. Arrivals are never early, and a time of day never goes back: where
-    /// they seem to, the receiver has put its time right (it learns of leap seconds some minutes after it
-    /// starts). A late arrival is one, unless the next is as late.
-    fn told_by(&self, t: f64, x: f64, offset_ns: i64, before: Option<Last>) -> Astray {
+    /// The interpretation of an arrival off the line. Arrivals are never early, and a time of day never goes back:
+    /// where they seem to, the receiver has corrected its time (it learns leap seconds some minutes after its start). A
+    /// late arrival is just late, unless the next is equally late.
+    fn interpret(&self, t: f64, x: f64, offset_ns: i64, before: Option<Last>) -> OffLine {
         let (late_ms, gate_ms) = (x - self.fit.at(t).0, self.gate_ms(t));
         let seconds = (late_ms / 1e3).round();
         let is_whole = seconds != 0.0 && (late_ms - seconds * 1e3).abs() <= gate_ms;
@@ -191,20 +191,20 @@ impl GnssClock {
             let step_ns = (last.time_of_day_ns - before.time_of_day_ns + DAY_NS / 2).rem_euclid(DAY_NS);
             step_ns <= DAY_NS / 2 && last.arrival - before.arrival >= APART
         });
-        // What a stall of the host held back comes at once, each less late than the one before.
+        // Epochs that a stall of the host held back arrive at once, each less late than the one before.
         let as_late_before =
             self.astray.last().zip(before).zip(self.last).is_some_and(|((astray, b), last)| {
                 let apart = Span::from_ns(offset_ns.wrapping_sub(astray.1)).abs();
                 apart.ns() <= (last.arrival - b.arrival).ns() / 4
             });
         if is_whole && (late_ms < 0.0 || went_back || as_late_before) {
-            return Astray::Seconds(seconds as i64 * NS_PER_S);
+            return OffLine::Seconds(seconds as i64 * NS_PER_S);
         }
-        if went_back { Astray::Anew } else { Astray::Unknown }
+        if went_back { OffLine::Anew } else { OffLine::Unknown }
     }
 
-    /// Host time at which an epoch of this time of day, heard at `heard`, was true, with one-sigma.
-    /// `None` before the first epoch, and where the epoch does not fit what was heard before.
+    /// Host time at which an epoch of this time of day, received at `heard`, was valid, with one-sigma. `None` before
+    /// the first epoch, and where the epoch does not agree with earlier ones.
     pub fn host_time_of(&self, time_of_day_ns: i64, heard: MonoTime) -> Option<(MonoTime, Span)> {
         let offset_ns = self.offset_ns(heard)?;
         let days = (heard.ns() - offset_ns - time_of_day_ns + DAY_NS / 2).div_euclid(DAY_NS);
@@ -213,7 +213,7 @@ impl GnssClock {
         (age >= -HEARD_BEFORE && age <= HEARD_WITHIN).then_some((t_valid, self.sigma(heard)))
     }
 
-    /// How well it is known; `None` before the first epoch.
+    /// Quality of the fit; `None` before the first epoch.
     pub fn state(&self) -> Option<ClockFit> {
         let (reference, _) = self.reference?;
         let now = reference + Span::from_s(self.points.back()?.0);
@@ -237,12 +237,12 @@ impl GnssClock {
         })
     }
 
-    /// Validity less time of day: of the pulse where one holds, else of the arrivals.
+    /// Validity minus time of day: from the pulse where one is valid, else from the arrivals.
     fn offset_ns(&self, at: MonoTime) -> Option<i64> {
         self.pulses.offset_ns(at).or_else(|| Some(self.arrival_offset(at)? - self.latency.ns()))
     }
 
-    /// Arrival less time of day, by all arrivals.
+    /// Arrival minus time of day, from all arrivals.
     fn arrival_offset(&self, at: MonoTime) -> Option<i64> {
         let (reference, reference_ns) = self.reference?;
         Some(reference_ns + Span::from_ms(self.fit.at((at - reference).s()).0).ns())
@@ -257,12 +257,12 @@ impl GnssClock {
     }
 
     /// Whether the jitter so far does not explain this point.
-    fn is_astray(&self, t: f64, x: f64) -> bool {
+    fn is_off_line(&self, t: f64, x: f64) -> bool {
         let late = x - self.fit.at(t).0;
         late > self.gate_ms(t) || -late > self.gate_early_ms(t)
     }
 
-    /// The most that an arrival is late by the jitter so far.
+    /// The largest lateness of an arrival by the jitter so far.
     fn gate_ms(&self, t: f64) -> f64 {
         if self.points.len() < GATE_FIRST.0 {
             return GATE_FIRST.1;
@@ -270,7 +270,7 @@ impl GnssClock {
         self.gate_early_ms(t) + 8.0 * self.fit.jitter_ms().1
     }
 
-    /// The most that it is early.
+    /// The largest earliness.
     fn gate_early_ms(&self, t: f64) -> f64 {
         if self.points.len() < GATE_FIRST.0 {
             return GATE_FIRST.1;

@@ -1,4 +1,4 @@
-//! The fit of a receiver's time over made-up arrivals.
+//! The fit of a receiver's time on simulated arrivals.
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -28,7 +28,7 @@ impl Jitter {
     }
 }
 
-/// Errors in ms of a receiver of 5 Hz heard by a host that is `drift_ppm` fast.
+/// Errors in ms of a receiver at 5 Hz, received by a host that is `drift_ppm` fast.
 fn errors_ms(jitter: &Jitter, drift_ppm: f64, seconds: i64, seed: u64) -> Vec<f64> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut clock = GnssClock::new(LATENCY);
@@ -83,7 +83,7 @@ fn single_wild_arrivals_change_nothing() {
     }
     let (time, arrival) = at(50);
     let (t_valid, sigma) = clock.host_time_of(time, arrival + Span::from_ms(400.0)).expect("a fit");
-    assert!((t_valid - (arrival - LATENCY)).ms().abs() < 1.0, "a late epoch is still put in its place");
+    assert!((t_valid - (arrival - LATENCY)).ms().abs() < 1.0, "a late epoch still gets its time");
     assert!(sigma.ms() < 2.0);
 }
 
@@ -98,7 +98,7 @@ fn a_step_of_either_clock_is_followed() {
     let t = MonoTime::from_ns(START_NS + 12 * NS_PER_S);
     let (t_valid, _) = clock.host_time_of(12 * NS_PER_S + step(60), t + LATENCY).expect("a fit");
     assert!((t_valid - t).ms().abs() < 1.0);
-    assert!(clock.host_time_of(12 * NS_PER_S, t + LATENCY).is_none(), "the old time is no more");
+    assert!(clock.host_time_of(12 * NS_PER_S, t + LATENCY).is_none(), "the old time is over");
 }
 
 #[test]
@@ -116,8 +116,8 @@ fn an_announced_leap_second_is_followed_at_once() {
     }
 }
 
-/// Epochs of a receiver with this period that puts its time right by `step_s` at `at`, `gap` epochs missing
-/// there; the most that one is stamped early and late, ms, and how many are stamped off by more than 100 ms.
+/// Epochs of a receiver with this period that corrects its time by `step_s` at `at`, with `gap` epochs missing there;
+/// returns the largest early and late error of a stamp, ms, and how many stamps are off by more than 100 ms.
 fn around_a_step(period_ms: i64, step_s: f64, at: i64, gap: i64, seed: u64) -> (f64, f64, usize) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut clock = GnssClock::new(LATENCY);
@@ -148,7 +148,7 @@ fn a_receiver_that_learns_of_leap_seconds_is_followed_at_once() {
         let (.., off) = around_a_step(period_ms, -0.4, 60, 0, 9);
         assert!(off <= 5, "a step of less than a second: {off}");
     }
-    // Where epochs are missing there, the first after it may have come late.
+    // Where epochs are missing, the first one after the gap may have come late.
     let (.., off) = around_a_step(200, -1.0, 60, 5, 6);
     assert!(off <= 1, "{off}");
 }
@@ -167,7 +167,7 @@ fn what_a_stall_held_back_is_no_step() {
     }
 }
 
-/// A receiver whose bursts come `delay_ms` after its epochs, with a pulse each `pulse_ms`, some missing.
+/// A receiver whose bursts come `delay_ms` after its epochs, with a pulse each `pulse_ms`, some of them missing.
 struct Pulsed {
     period_ms: i64,
     pulse_ms: i64,
@@ -176,12 +176,12 @@ struct Pulsed {
 }
 
 impl Pulsed {
-    /// The clock after 20 s, and the worst stamp of the last 8 s where pulses held it, ms.
+    /// The clock after 20 s, and the worst stamp of the last 8 s where pulses determined it, ms.
     fn run(&self, missing: f64, seed: u64) -> (GnssClock, Option<f64>) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut clock = GnssClock::new(Span::from_ms(self.latency_ms));
         let mut worst: Option<f64> = None;
-        // What happens, in order: (host time, epoch or pulse).
+        // The events in order: (host time, epoch or pulse).
         let mut events = Vec::new();
         for k in 0..20_000 / self.period_ms {
             let valid = MonoTime::from_ns(START_NS + k * self.period_ms * 1_000_000);
@@ -214,8 +214,8 @@ impl Pulsed {
 fn a_pulse_takes_the_latency_out_however_late_the_sentences_come() {
     for (seed, (period_ms, pulse_ms)) in [(1_000, 1_000), (200, 1_000), (200, 200)].into_iter().enumerate() {
         for delay_ms in [40.0, 475.0, 1_100.0] {
-            // Where the pulses follow faster than that, the configured latency must tell which is which; and
-            // nothing tells where the sentences come with a pulse.
+            // Where the pulses are more frequent, the configured latency must decide which is which; where the
+            // sentences come together with a pulse, nothing can.
             let phase_ms = delay_ms % f64::from(pulse_ms as i32);
             if !(15.0..f64::from(pulse_ms as i32) - 15.0).contains(&phase_ms) {
                 continue;
@@ -247,7 +247,7 @@ fn pulses_that_are_not_used_are_told() {
 
 #[test]
 fn an_epoch_that_comes_late_takes_no_pulse_of_another() {
-    // Given sentences 300 ms after the pulse, of which some stall for 1.1 s
+    // Given sentences 300 ms after the pulse, of which some are delayed by 1.1 s
     let mut clock = GnssClock::new(LATENCY);
     for k in 0..60 {
         let valid = MonoTime::from_ns(START_NS + k * NS_PER_S);

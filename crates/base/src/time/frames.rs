@@ -3,24 +3,25 @@
 use super::jitter::Point;
 use super::{MonoTime, Span, SteadyClock};
 
-/// Variance of real exposure times about their beat, ms²: what automatic exposure and a sensor's own clock make, 0.5 ms.
+/// Variance of real exposure times about their beat, ms²: from automatic exposure and the sensor's own clock, 0.5 ms.
 const REAL_MS2: f64 = 0.25;
 /// Variance of stamps about their beat up to which all of it is taken as real, ms².
 const GOOD_MS2: f64 = 0.5;
-/// Variance about the line from which there is no beat: no host stamps frames that badly, ms². The camera takes them
-/// when it will (a variable frame rate, an emulated one), and its stamps are all there is.
+/// Variance about the line from which there is no beat, because no host stamps frames that badly, ms². The camera has a
+/// variable frame rate (or is an emulated one), and its stamps are the only information.
 const NO_BEAT_MS2: f64 = 400.0;
-/// Stamps farther from the beat than this many sigmas do not count in it.
+/// Stamps farther from the beat than this many sigmas are excluded.
 const WILD: f64 = 3.0;
 /// Fewest stamps that show a beat.
 const FEWEST: f64 = 12.0;
 
-/// Tells when frames were exposed.
+/// Determines when frames were exposed.
 ///
-/// A stamp made by the sensor is right though it does not fall on the beat; one made when a USB transfer was done jitters by
-/// milliseconds about it. How far stamps lie from their beat (the straight line through them) tells which: of a deviation
-/// `r`, with a variance `V` beyond `GOOD`, the share `REAL / (REAL + V − GOOD)` is taken as real, which is its
-/// expectation where the rest is the stamp's error. Good stamps are given back as they are.
+/// A stamp made by the sensor is right although it is not exactly on the beat; a stamp made at the end of a USB
+/// transfer jitters by milliseconds about it. The variance of the stamps about their beat (the straight line through
+/// them) distinguishes the two: of a deviation `r`, with a variance `V` above `GOOD`, the share `REAL / (REAL + V −
+/// GOOD)` is taken as real, which is its expectation where the rest is the stamp's error. Good stamps are returned
+/// unchanged.
 #[derive(Clone, Debug, Default)]
 pub struct FrameClock {
     beat: SteadyClock,
@@ -28,7 +29,7 @@ pub struct FrameClock {
 }
 
 impl FrameClock {
-    /// When the next frame was exposed, by its stamp and when it was received: never later than that.
+    /// The exposure of the next frame, from its stamp and its reception; never later than the reception.
     pub fn exposed(&mut self, stamp: MonoTime, received: MonoTime) -> MonoTime {
         self.beat.smooth(stamp);
         let line = Line::through(self.beat.counted());
@@ -38,7 +39,7 @@ impl FrameClock {
             self.last = None;
             return stamp;
         }
-        // Where a beat is followed, time does not run backwards.
+        // Where a beat is followed, times do not go back.
         let exposed = (stamp - Span::from_ms(error_ms)).min(received.max(stamp));
         let exposed = self.last.map_or(exposed, |last| exposed.max(last));
         self.last = Some(exposed);
@@ -56,7 +57,7 @@ struct Line {
 }
 
 impl Line {
-    /// By least squares, once more without the wild ones; `None` through too few.
+    /// A least-squares line, fitted again without outliers; `None` through too few points.
     fn through(points: impl Iterator<Item = Point> + Clone) -> Option<Self> {
         let all = Self::fitted(points.clone())?;
         let reach_ms = WILD * all.variance_ms2.sqrt();
@@ -82,7 +83,7 @@ impl Line {
         ms - self.at_mean_ms - self.slope * (t_s - self.t_mean_s)
     }
 
-    /// What of a stamp's deviation is expected to be its error; nothing where stamps are good or follow no beat.
+    /// The expected error of a stamp, from its deviation; zero where stamps are good or have no beat.
     fn stamp_error_ms(&self, point: Point) -> f64 {
         if self.variance_ms2 > NO_BEAT_MS2 {
             return 0.0;
@@ -100,8 +101,8 @@ mod tests {
 
     use super::*;
 
-    /// Errors in ms of the times given for frames of 10 Hz whose exposures vary by 0.5 ms and whose stamps by
-    /// `jitter_ms` beside; one of fifty is lost.
+    /// Errors in ms of the returned times for frames at 10 Hz whose exposures vary by 0.5 ms and whose stamps vary by
+    /// `jitter_ms` in addition; one of fifty is lost.
     fn errors_ms(jitter_ms: f64, seed: u64) -> Vec<f64> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut normal = || Distribution::<f64>::sample(&StandardNormal, &mut rng);

@@ -1,13 +1,12 @@
-//! A straight line under arrivals that come late by an unknown jitter, with its uncertainty.
+//! A straight line under arrivals that are late by an unknown jitter, with its uncertainty.
 //!
-//! Arrival x at time t is a + b·t + jitter. The jitter is either symmetric, normal of sigma s, or
-//! one-sided, exponential of mean τ with a little normal noise (the exponentially modified
-//! Gaussian), or anywhere up to a width w (what waits for the next tick of a timer: USB adapters hand on
-//! what they have every 16 ms). Its kind and size are not known: each candidate is fitted by Newton's method (both
-//! log-densities are concave, so there is one maximum), weighed by its evidence in Laplace's
-//! approximation, and the line is the mean over all. For symmetric jitter it runs through the
-//! middle, for one-sided jitter along the lower edge, where nothing was late. A small part of the
-//! arrivals may be anywhere, so that single wild ones do not count.
+//! Arrival x at time t is a + b·t + jitter. The jitter is symmetric (normal of sigma s), or one-sided (exponential of
+//! mean τ with a little normal noise: the exponentially modified Gaussian), or uniform up to a width w (arrivals that
+//! wait for the next tick of a timer: USB adapters deliver every 16 ms). Its kind and size are not known: each
+//! candidate is fitted by Newton's method (both log-densities are concave, so there is one maximum) and weighted by its
+//! evidence in Laplace's approximation, and the line is the mean over all candidates. For symmetric jitter it runs
+//! through the middle, for one-sided jitter along the lower edge, where nothing was late. A small share of the arrivals
+//! may be anywhere, so that single outliers do not count.
 
 /// A point: time in seconds, arrival in milliseconds.
 pub(super) type Point = (f64, f64);
@@ -18,24 +17,23 @@ const SIZES_MS: [f64; 8] = [0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0];
 const TICKS: i32 = 11;
 /// Normal noise at the edges of a tick, as a part of its width. So small that no point is near both edges.
 const TICK_NOISE_PART: f64 = 1.0 / 16.0;
-/// Normal noise beside one-sided jitter, as parts of it.
+/// Normal noise beside one-sided jitter, as shares of it.
 const NOISE_PARTS: [f64; 2] = [1.0 / 16.0, 0.2];
-/// Least normal noise, milliseconds: what stamping a read costs.
+/// Least normal noise, milliseconds: the time to stamp a read.
 const NOISE_MIN_MS: f64 = 0.1;
-/// Part of the arrivals that have nothing to do with the jitter, and their density over a second.
+/// Share of arrivals that are independent of the jitter, and their density over a second.
 const WILD_PART: f64 = 0.01;
 const WILD_DENSITY: f64 = WILD_PART / 1_000.0;
-/// How much rarer wild arrivals before the line are where it is under ticks: nothing is handed on before it is there,
-/// and arrivals that seem to be show that the ticks hid how late the others were.
+/// How much rarer outliers before the line are with ticks: nothing is delivered before it exists, and apparent cases
+/// show that the ticks hid how late the others were.
 const WILD_EARLY: f64 = 1e-4;
-/// Belief (log) in symmetric against one-sided jitter before anything is seen: operating systems and
-/// receivers are late, not early.
+/// Prior log-odds of symmetric against one-sided jitter: operating systems and receivers are late, not early.
 const LOG_SYMMETRIC: f64 = -3.0;
-/// Newton steps at most; from the line before, two or three do.
+/// Most Newton steps; from the previous line two or three are enough.
 const STEPS_MAX: usize = 30;
-/// Candidates lighter than the heaviest by more than this (log) are looked at seldom.
+/// Candidates whose log-weight is below the largest by more than this are rarely fitted.
 const LOG_WEIGHT_FAINT: f64 = -25.0;
-/// Every so many fits all candidates are looked at.
+/// Period, in fits, with which all candidates are fitted.
 const FULL_EVERY: u32 = 16;
 
 /// Shape of the jitter, milliseconds.
@@ -45,7 +43,7 @@ struct Shape {
     sigma: f64,
     /// Mean of the one-sided part; 0 for none.
     tau: f64,
-    /// Width of the even part, up to a tick; 0 for none.
+    /// Width of the uniform part, up to a tick; 0 for none.
     width: f64,
 }
 
@@ -66,14 +64,14 @@ struct Candidate {
 pub(super) struct JitterFit {
     candidates: Vec<Candidate>,
     slope_sigma: f64,
-    /// Density of wild arrivals before the line.
+    /// Density of outliers before the line.
     wild_early: f64,
     t_mean: f64,
     fits: u32,
 }
 
 impl JitterFit {
-    /// `slope_sigma`: one-sigma of the slope expected beforehand, milliseconds a second.
+    /// `slope_sigma`: prior one-sigma of the slope, milliseconds a second.
     pub(super) fn new(slope_sigma: f64) -> Self {
         Self::of_shapes(slope_sigma, false)
     }
@@ -111,7 +109,7 @@ impl JitterFit {
         Self { candidates, slope_sigma, wild_early, t_mean: 0.0, fits: 0 }
     }
 
-    /// Fits the line to these points, starting from the fit before.
+    /// Fits the line to these points, starting from the previous fit.
     pub(super) fn fit(&mut self, points: &[Point]) {
         if points.is_empty() {
             return;
@@ -232,16 +230,16 @@ impl Candidate {
         let mut sum = Quadratic {
             log: -0.5 * prior * line.1 * line.1,
             gradient: [0.0, -prior * line.1],
-            // A floor keeps the value determined where the density is flat (all points far above, or all
-            // between the edges of a tick).
+            // A lower limit keeps the value determined where the density is flat (all points far above, or all between
+            // the edges of a tick).
             curvature: [if self.shape.width > 0.0 { self.shape.width.powi(-2) } else { 1e-9 }, 0.0, prior],
         };
         for &(t, x) in points {
             let dt = t - t_mean;
             let off = x - line.0 - line.1 * dt;
             let (log, slope, bend) = self.shape.log_density(off);
-            // Beside the jitter, a few arrivals may be anywhere; what a point counts is how far it is
-            // not one of these.
+            // In addition to the jitter, a few arrivals may be anywhere; the weight of a point is its probability of
+            // not being one of these.
             let density = (1.0 - WILD_PART) * log.exp();
             let mixed = density + if off < 0.0 { wild_early } else { WILD_DENSITY };
             let trust = density / mixed;
@@ -354,7 +352,7 @@ mod tests {
         let points: Vec<Point> = (0..50).map(|i| f64::from(i) * 0.2).map(|t| (t, 3.0 + 0.5 * t)).collect();
         fit.fit(&points);
         let (value, sigma) = fit.at(9.8);
-        // Less jitter than the smallest size considered cannot be told from none.
+        // Jitter below the smallest candidate size cannot be distinguished from none.
         assert!((value - 7.9).abs() < 0.2 && sigma < 0.1, "{value} ± {sigma}");
         assert!((fit.slope() - 0.5).abs() < 0.01, "{}", fit.slope());
     }

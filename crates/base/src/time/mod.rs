@@ -42,8 +42,8 @@ impl MonoTime {
         Self(ns)
     }
 
-    /// A time `ns` nanoseconds after the scale's zero, told without a sign, as in MCAP files and by the kernel;
-    /// what does not fit is the end of time.
+    /// A time `ns` nanoseconds after the scale's zero, as an unsigned number, as in MCAP files and from the kernel; a
+    /// value that does not fit becomes the last time.
     pub fn from_unsigned_ns(ns: impl TryInto<i64>) -> Self {
         Self(ns.try_into().unwrap_or(i64::MAX))
     }
@@ -55,7 +55,7 @@ impl MonoTime {
 }
 
 impl Span {
-    /// No time at all.
+    /// The span of length zero.
     pub const ZERO: Self = Self(0);
 
     /// A span of `ns` nanoseconds.
@@ -63,12 +63,12 @@ impl Span {
         Self(ns)
     }
 
-    /// A span of `ms` milliseconds, rounded to a nanosecond; not-a-number gives zero.
+    /// A span of `ms` milliseconds, rounded to a nanosecond; NaN gives zero.
     pub fn from_ms(ms: f64) -> Self {
         Self((ms * 1e6).round() as i64)
     }
 
-    /// A span of `s` seconds, rounded to a nanosecond; not-a-number gives zero.
+    /// A span of `s` seconds, rounded to a nanosecond; NaN gives zero.
     pub fn from_s(s: f64) -> Self {
         Self((s * 1e9).round() as i64)
     }

@@ -1,63 +1,63 @@
-//! Pulses of a receiver, each paired with the epoch whose instant it marks.
+//! Pulses of a receiver, each paired with the epoch that it marks.
 
 use std::collections::VecDeque;
 
 use super::{MonoTime, NS_PER_S, Span};
 
-/// Edges remembered.
+/// Edges that are remembered.
 const EDGES_MAX: usize = 64;
-/// Edges of equal spacing before they are believed to be pulses.
+/// Edges of equal spacing before they count as pulses.
 const EDGES_FIRST: usize = 4;
-/// How far a spacing may be off its even part of a second: crystals, interrupts, a missed one.
+/// Tolerance of a spacing from a fraction of a second: crystals, interrupts, a missed pulse.
 const SPACING_OFF_NS: i64 = 2_000_000;
-/// A burst nearer than this after a pulse, or after the next one, may be of either: no receiver begins to
+/// A burst nearer than this to a pulse, before or after it, may belong to either of two pulses: no receiver starts to
 /// send so soon, and arrivals are not known better.
 const TOO_SOON: Span = Span::from_ns(15_000_000);
-/// How long a pulse holds the time.
+/// How long a pulse is valid.
 const HOLDS: Span = Span::from_ns(5 * NS_PER_S);
-/// Edges that no epoch could be paired with before that is worth a word.
+/// Edges without an epoch after which this is reported.
 const UNUSED_MIN: u32 = 10;
 
 /// Why pulses are not used.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum PulseTrouble {
-    /// They do not come at an even part of a second.
+    /// They do not come at a fraction of a second.
     Uneven,
-    /// By their arrivals, the bursts may be of one pulse or of the next.
+    /// By their arrivals, the bursts may belong to one pulse or the next.
     Ambiguous,
-    /// No burst that follows them is of a time they can mark.
+    /// No burst after them has a time that they can mark.
     NoBurst,
 }
 
 impl PulseTrouble {
-    /// In words, for people.
+    /// As text.
     pub const fn words(self) -> &'static str {
         match self {
             Self::Uneven => {
                 "the pulses are not used: they do not come once or several times a second at an even spacing"
             }
             Self::Ambiguous => {
-                "the pulses are not used: the sentences come so that they may be of one pulse or of the next: \
+                "the pulses are not used: the sentences arrive at a time at which they may belong to one pulse or the next: \
                  set gps.latency_ms to the receiver's"
             }
-            Self::NoBurst => "the pulses are not used: no sentences follow that are of their time",
+            Self::NoBurst => "the pulses are not used: no sentences with a matching time follow them",
         }
     }
 }
 
-/// Pairs edges with epochs: an epoch is true at the pulse before its burst, so where the burst arrives by
-/// the statistics of all arrivals (not where a single one does) tells the pulse.
+/// Pairs edges with epochs: an epoch is valid at the pulse before its burst. The statistics of all arrivals (not a
+/// single arrival) decide which pulse that is.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Pulses {
     edges: VecDeque<MonoTime>,
-    /// The edge that holds, and its host time less the time of day it marks.
+    /// The valid edge, and its host time minus the time of day that it marks.
     paired: Option<(MonoTime, i64)>,
     unused: u32,
     trouble: Option<PulseTrouble>,
 }
 
 impl Pulses {
-    /// An edge was heard.
+    /// Takes an edge.
     pub(super) fn edge(&mut self, edge: MonoTime) {
         if self.edges.back().is_some_and(|last| edge <= *last) {
             self.edges.clear();
@@ -74,14 +74,14 @@ impl Pulses {
         }
     }
 
-    /// An epoch of this time of day arrives, by all arrivals, at `expected`; `latency` is configured.
+    /// An epoch of this time of day arrives, by the statistics of all arrivals, at `expected`; `latency` is configured.
     pub(super) fn epoch(&mut self, time_of_day_ns: i64, expected: MonoTime, latency: Span) {
         let Some(spacing_ns) = self.spacing_ns() else { return };
         if time_of_day_ns % spacing_ns != 0 {
             return;
         }
         let Some(&last) = self.edges.back() else { return };
-        // Bursts come this long after one pulse or another; the configured latency tells which.
+        // Bursts come this long after one of the pulses; the configured latency decides which.
         let rest_ns = (expected - last).ns().rem_euclid(spacing_ns);
         let periods = ((latency.ns() - rest_ns + spacing_ns / 2).div_euclid(spacing_ns)).max(0);
         let after_ns = rest_ns + periods * spacing_ns;
@@ -101,30 +101,30 @@ impl Pulses {
         self.trouble = None;
     }
 
-    /// Host time less time of day, where a pulse holds it at `at`.
+    /// Host time minus time of day, where a pulse is valid at `at`.
     pub(super) fn offset_ns(&self, at: MonoTime) -> Option<i64> {
         self.paired.filter(|(edge, _)| (at - *edge).abs() <= HOLDS).map(|(_, offset_ns)| offset_ns)
     }
 
-    /// UTC has stepped by whole seconds against host time.
+    /// UTC has stepped by whole seconds relative to host time.
     pub(super) fn shift(&mut self, ns: i64) {
         if let Some((_, offset_ns)) = &mut self.paired {
             *offset_ns = offset_ns.wrapping_add(ns);
         }
     }
 
-    /// What pulses marked is no longer known.
+    /// The times that pulses marked are no longer known.
     pub(super) fn forget(&mut self) {
         self.paired = None;
     }
 
-    /// Why many pulses in a row were of no use.
+    /// Why many consecutive pulses could not be used.
     pub(super) fn trouble(&self) -> Option<PulseTrouble> {
         let many = self.unused >= UNUSED_MIN;
         many.then(|| self.trouble.unwrap_or(PulseTrouble::NoBurst))
     }
 
-    /// The even part of a second at which the last edges came.
+    /// The fraction of a second at which the last edges came.
     fn spacing_ns(&self) -> Option<i64> {
         let last = self.edges.len().checked_sub(EDGES_FIRST)?;
         let edges: Vec<MonoTime> = self.edges.range(last..).copied().collect();
@@ -134,7 +134,7 @@ impl Pulses {
             return None;
         }
         let spacing_ns = NS_PER_S / parts;
-        // One may be missing.
+        // One pulse may be missing.
         let even =
             |gap: i64| (gap - (gap + spacing_ns / 2) / spacing_ns * spacing_ns).abs() <= SPACING_OFF_NS;
         edges.windows(2).all(|pair| even((pair[1] - pair[0]).ns())).then_some(spacing_ns)

@@ -1,27 +1,27 @@
-//! The clock of another computer that counts from its own start, put on host time.
+//! The clock of another computer that counts from its own start, mapped to host time.
 //!
-//! An exchange (we send at `t₁`, it answers `r`, the answer is heard at `t₂`) bounds `host − remote` to
-//! `(t₁ + t₂)/2 − r ± (t₂ − t₁)/2`; the quickest exchange of the last half minute is believed. Without any,
-//! the least delayed arrival stands in, which is late by the least delay.
+//! An exchange (we send at `t₁`, it answers `r`, the answer arrives at `t₂`) bounds `host − remote` to `(t₁ + t₂)/2 − r
+//! ± (t₂ − t₁)/2`; the quickest exchange of the last half minute is used. Without any exchange, the least delayed
+//! arrival is used, which is late by the least delay.
 
 use std::collections::VecDeque;
 
 use super::{MonoTime, Span};
 
-/// Exchanges and arrivals are used for so long.
+/// How long exchanges and arrivals are used.
 const KEPT: Span = Span::from_ns(30_000_000_000);
-/// Two crystals drift apart by no more than this.
+/// Largest drift between two crystals.
 const DRIFT: f64 = 50e-6;
-/// An exchange that takes longer tells nothing.
+/// A slower exchange is not used.
 const SLOWEST: Span = Span::from_ns(500_000_000);
-/// Of arrivals the least delayed of each such span is kept.
+/// In each such span the least delayed arrival is kept.
 const BIN: Span = Span::from_ns(1_000_000_000);
-/// A remote clock that jumps by more than this was started anew.
+/// A remote clock that jumps by more than this was restarted.
 const RESTART: Span = Span::from_ns(1_000_000_000);
-/// So many jumps in a row are believed: one alone is a damaged or foreign message.
+/// Number of consecutive jumps that are accepted: a single one is a damaged or foreign message.
 const BELIEVED: u32 = 3;
 
-/// What bounds the difference of the clocks: `host − remote`, and by how much it can be wrong.
+/// A bound on the difference of the clocks: `host − remote`, and its largest error.
 #[derive(Clone, Copy, PartialEq, Debug)]
 struct Bound {
     at: MonoTime,
@@ -30,7 +30,7 @@ struct Bound {
 }
 
 impl Bound {
-    /// By how much it can be wrong at `now`, seconds.
+    /// Its largest error at `now`, seconds.
     fn doubt_s(&self, now: MonoTime) -> f64 {
         self.wrong_by.s() + DRIFT * (now - self.at).s().abs()
     }
@@ -47,8 +47,8 @@ pub struct RemoteClock {
 }
 
 impl RemoteClock {
-    /// A message that says `remote` was heard at `t`. False where that cannot be: the clock jumped, which is believed
-    /// when it is said three times in a row.
+    /// A message with the remote time `remote` arrived at `t`. False where that is impossible: the clock jumped, which
+    /// is accepted when it happens three times in a row.
     pub fn heard(&mut self, remote: Span, t: MonoTime) -> bool {
         self.now = t;
         if self.has_jumped(remote, t) {
@@ -74,7 +74,7 @@ impl RemoteClock {
         true
     }
 
-    /// An exchange: sent at `sent`, answered at `remote`, the answer heard at `received`.
+    /// An exchange: sent at `sent`, answered at `remote`, the answer received at `received`.
     pub fn exchanged(&mut self, sent: MonoTime, remote: Span, received: MonoTime) {
         let took = received - sent;
         if took < Span::default() || took > SLOWEST || !self.heard(remote, received) {
@@ -87,19 +87,19 @@ impl RemoteClock {
     }
 
     fn has_jumped(&self, remote: Span, t: MonoTime) -> bool {
-        // Against what arrived last: a message held up for a second is late, not early.
+        // Relative to the last arrival: a message delayed by a second is late, not early.
         self.arrivals.back().is_some_and(|last| {
             let moved = (t.ns() - remote.ns()) - last.host_less_remote_ns;
             moved.abs() > RESTART.ns()
         })
     }
 
-    /// How often it was found to be started anew.
+    /// Number of detected restarts.
     pub fn restarts(&self) -> u32 {
         self.restarts
     }
 
-    /// Whether it answered lately: then its time is known to half of what an exchange took.
+    /// Whether it answered recently: then its time is known to half of an exchange's duration.
     pub fn is_exchanged(&self) -> bool {
         self.exchanges.iter().any(|exchange| self.now - exchange.at <= KEPT)
     }
@@ -112,7 +112,7 @@ impl RemoteClock {
         surest.map(|bound| bound.host_less_remote_ns).or_else(earliest)
     }
 
-    /// Host time of a remote one; `None` before anything was heard.
+    /// Host time of a remote one; `None` before the first message.
     pub fn host(&self, remote: Span) -> Option<MonoTime> {
         self.host_less_remote_ns().map(|apart| MonoTime::from_ns(remote.ns().saturating_add(apart)))
     }
@@ -127,7 +127,7 @@ impl RemoteClock {
 mod tests {
     use super::*;
 
-    /// A link that delays each way by 2 ms and, one-sided and uneven, up to 40 ms more.
+    /// A link with a delay of 2 ms each way and, one-sided and unequal, up to 40 ms more.
     fn delay(k: u64) -> Span {
         let mixed = k.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40;
         Span::from_ms(2.0 + 40.0 * ((mixed % 1_000) as f64 / 1_000.0).powi(3))
@@ -137,7 +137,7 @@ mod tests {
         MonoTime::from_ns(1_700_000_000_000_000_000) + Span::from_s(s)
     }
 
-    /// Time on a remote clock that runs 30 ppm fast and was started 50 s before.
+    /// Time of a remote clock that is 30 ppm fast and was started 50 s before.
     fn remote(t: MonoTime) -> Span {
         Span::from_s(50.0 + (t - at(0.0)).s() * (1.0 + 30e-6))
     }

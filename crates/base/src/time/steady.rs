@@ -1,4 +1,4 @@
-//! Arrivals of a device that measures at a steady rate, with the jitter taken out.
+//! Arrivals of a device with a steady rate, with the jitter removed.
 
 use std::collections::VecDeque;
 use std::f64::consts::TAU;
@@ -6,43 +6,41 @@ use std::f64::consts::TAU;
 use super::jitter::{JitterFit, Point};
 use super::{MonoTime, Span};
 
-/// Samples the line is fitted over: a few seconds of a compass.
+/// Samples in the fit of the line: a few seconds of a compass.
 const WINDOW_MAX: usize = 128;
-/// Arrivals the rate is learnt from.
+/// Arrivals from which the rate is determined.
 const RECENT: usize = 24;
-/// Every so many samples the rate is looked at again.
+/// Samples between two checks of the rate.
 const CHECK_EVERY: u32 = 12;
-/// One-sigma of the period learnt so, milliseconds a second.
+/// One-sigma of a period determined in this way, milliseconds a second.
 const PERIOD_SIGMA: f64 = 10.0;
-/// Periods a clock can smooth, seconds.
+/// Periods that a clock can smooth, seconds.
 const PERIODS_S: (f64, f64) = (0.001, 10.0);
-/// Periods looked at more closely: the most coherent ones.
+/// Periods that are examined more closely: the most coherent ones.
 const PEAKS: usize = 6;
-/// Log-odds against a sample that is missing, and against two in the place of one.
+/// Log-odds against a missing sample, and against two in the place of one.
 const LOG_MISSING: f64 = 3.5;
 const LOG_DOUBLE: f64 = 5.0;
-/// Least width of jitter taken for real, seconds.
+/// Least width of jitter, seconds.
 const WIDTH_MIN_S: f64 = 3e-4;
-/// The most of a period that the jitter of a steady device fills, and the most samples of it, as a part, that
-/// are missing or double.
+/// Limits for a steady device: the share of a period that its jitter fills, and the share of missing or double samples.
 const STEADY: (f64, f64) = (0.75, 0.3);
-/// Log-odds by which another period must explain the arrivals better than the one in use.
+/// Log-odds by which another period must explain the arrivals better than the present one.
 const LOG_BETTER: f64 = 8.0;
 
-/// Most of a period that expected lateness moves the limit between one count and the next.
+/// Largest share of a period by which expected lateness moves the limit between two counts.
 const LATE_PART: f64 = 0.3;
-/// Takes the jitter out of the arrivals of a device with a steady rate.
+/// Removes the jitter from the arrivals of a device with a steady rate.
 ///
-/// The rate need not be known: it is the one that explains the recent arrivals best, by the width of the
-/// jitter that is left and the samples that must then be missing. (Coherence alone is not enough: arrivals
-/// that wait for a tick of 16 ms are as coherent at 32.5 Hz as at the 30 Hz of their device.) Samples
-/// may be missing; a device that changes its rate is followed. While there is no steady rate the
-/// arrivals are given back as they are.
+/// The rate need not be known: it is the one that explains the recent arrivals best, by the width of the remaining
+/// jitter and the number of samples that must then be missing. (Coherence alone is not enough: arrivals that wait for a
+/// tick of 16 ms are as coherent at 32.5 Hz as at the 30 Hz of their device.) Samples may be missing; a change of the
+/// device's rate is followed. While there is no steady rate the arrivals are returned unchanged.
 #[derive(Clone, Debug)]
 pub struct SteadyClock {
     fit: JitterFit,
     reference: MonoTime,
-    /// Period the samples are counted with, seconds.
+    /// Period with which the samples are counted, seconds.
     period_s: Option<f64>,
     /// Count of the last sample.
     index: i64,
@@ -59,7 +57,7 @@ impl Default for SteadyClock {
 }
 
 impl SteadyClock {
-    /// A clock of a rate yet unknown.
+    /// A clock of an unknown rate.
     pub fn new() -> Self {
         Self {
             fit: JitterFit::with_ticks(PERIOD_SIGMA),
@@ -73,11 +71,11 @@ impl SteadyClock {
         }
     }
 
-    /// The arrival of the next sample without its jitter. Never before the one given last, never
-    /// more than a period from the arrival.
+    /// The arrival of the next sample without its jitter. Never before the last returned one, never more than a period
+    /// from the arrival.
     pub fn smooth(&mut self, arrival: MonoTime) -> MonoTime {
         if self.recent.back().is_some_and(|last| arrival < *last) {
-            // Host time does not run backwards; something else is wrong here.
+            // Host time does not go back; something else is wrong.
             self.forget();
         }
         if self.recent.len() == RECENT {
@@ -96,19 +94,19 @@ impl SteadyClock {
         self.period_s.map(|period_s| Span::from_s(self.true_period_s(period_s)))
     }
 
-    /// One-sigma of what [`Self::smooth`] gave last; `None` while the rate is not known.
+    /// One-sigma of the last result of [`Self::smooth`]; `None` while the rate is not known.
     pub fn sigma(&self) -> Option<Span> {
         let period_s = self.period_s?;
         Some(Span::from_ms(self.fit.at(self.index as f64 * period_s).1))
     }
 
-    /// The arrivals that the line is fitted over, the last one last: time of the count, s, and arrival against it, ms. None
-    /// while the rate is not known.
+    /// The arrivals in the fit, the latest one last: time of the count, s, and arrival relative to it, ms. None while
+    /// the rate is not known.
     pub(super) fn counted(&self) -> impl DoubleEndedIterator<Item = Point> + Clone + '_ {
         self.points.iter().copied()
     }
 
-    /// Where among [`Self::counted`] this arrival is; `None` where it was not counted.
+    /// The deviation of this arrival in [`Self::counted`]; `None` where it was not counted.
     pub(super) fn deviation_of(&self, arrival: MonoTime) -> Option<Point> {
         let since_s = (arrival - self.reference).s();
         let last = self.points.back()?;
@@ -123,12 +121,12 @@ impl SteadyClock {
         self.last = None;
     }
 
-    /// The period samples are counted with, put right by the slope of the line.
+    /// The counting period, corrected by the slope of the line.
     fn true_period_s(&self, period_s: f64) -> f64 {
         period_s * (1.0 + self.fit.slope() * 1e-3)
     }
 
-    /// Learns the rate, or gives up one that no longer holds.
+    /// Determines the rate, or drops one that is no longer valid.
     fn check_rate(&mut self) {
         self.since_check += 1;
         if self.recent.len() < RECENT || self.since_check < CHECK_EVERY {
@@ -140,7 +138,7 @@ impl SteadyClock {
         let Some(best) = best else { return };
         if let Some(period_s) = self.period_s {
             let kept = Explanation::of(&times, self.true_period_s(period_s));
-            // A few seconds may hide a tick that the fit has seen already.
+            // A few seconds may hide a tick that the fit has already detected.
             let (sigma, late) = self.fit.jitter_ms();
             let is_known = kept.width * self.true_period_s(period_s) * 1e3 <= 2.5 * late + 5.0 * sigma;
             if kept.is_steady() && (is_known || kept.log_odds >= best.log_odds - LOG_BETTER) {
@@ -153,8 +151,7 @@ impl SteadyClock {
         }
     }
 
-    /// Counts the recent samples with a new period and fits the line to them; the last is left to
-    /// be placed.
+    /// Counts the recent samples with a new period and fits the line to them; the last one is not placed yet.
     fn begin(&mut self, times: &[f64], best: &Explanation) {
         self.fit = JitterFit::with_ticks(PERIOD_SIGMA);
         self.reference = self.recent[0];
@@ -176,11 +173,11 @@ impl SteadyClock {
         let t_last = self.index as f64 * period_s;
         let on_line = t_last + self.fit.at(t_last).0 * 1e-3;
         let true_period_s = self.true_period_s(period_s);
-        // Where arrivals are only ever late, more than half a period of lateness is to be told apart.
+        // Where arrivals are only ever late, more than half a period of lateness has to be distinguished.
         let late = (self.fit.jitter_ms().1 * 1e-3 / true_period_s).min(LATE_PART);
         let steps = ((since - on_line) / true_period_s - late).round();
         if !(1.0..1e9).contains(&steps) {
-            // Two in the place of one: the one before was too late to be told from this one.
+            // Two in the place of one: the one before was too late to be distinguished from this one.
             return self.reference + Span::from_s(on_line);
         }
         self.index += steps as i64;
@@ -195,13 +192,13 @@ impl SteadyClock {
     }
 }
 
-/// Time of the count in seconds, arrival against it in milliseconds.
+/// Time of the count in seconds, arrival relative to it in milliseconds.
 fn point(since_s: f64, index: i64, period_s: f64) -> Point {
     let t = index as f64 * period_s;
     (t, (since_s - t) * 1e3)
 }
 
-/// How well times fall on one phase of a period: |mean of exp(2πi t/P)|, and that phase in turns.
+/// How well times agree with one phase of a period: |mean of exp(2πi t/P)|, and that phase in turns.
 fn coherence(times: &[f64], period_s: f64) -> (f64, f64) {
     let (sin, cos) = times.iter().fold((0.0, 0.0), |(sin, cos), time| {
         let (s, c) = (TAU * time / period_s).sin_cos();
@@ -210,15 +207,15 @@ fn coherence(times: &[f64], period_s: f64) -> (f64, f64) {
     (f64::hypot(sin, cos) / times.len() as f64, sin.atan2(cos) / TAU)
 }
 
-/// How a period explains arrivals.
+/// How a period explains the arrivals.
 #[derive(Clone, Copy, Debug)]
 struct Explanation {
     period_s: f64,
-    /// Where in the period the arrivals lie, turns.
+    /// Phase of the arrivals in the period, turns.
     phase: f64,
-    /// Width of the jitter, all but the extremes, as a part of the period.
+    /// Width of the jitter without the extremes, as a share of the period.
     width: f64,
-    /// Samples missing or double, as a part of those there.
+    /// Missing or double samples, as a share of those present.
     wrong: f64,
     /// Log-likelihood up to a constant.
     log_odds: f64,
@@ -258,7 +255,7 @@ impl Explanation {
 fn likely_periods(times: &[f64]) -> Vec<Explanation> {
     let intervals: Vec<f64> = times.windows(2).map(|pair| pair[1] - pair[0]).collect();
     let mean = |of: &[f64]| of.iter().sum::<f64>() / of.len().max(1) as f64;
-    // Without silences, which are no intervals.
+    // Without silences, which are not intervals.
     let (length, rough) = (intervals.iter().sum::<f64>(), mean(&intervals));
     let near: Vec<f64> = intervals.into_iter().filter(|interval| *interval <= 4.0 * rough).collect();
     let interval = mean(&near);
@@ -288,8 +285,8 @@ mod tests {
 
     use super::*;
 
-    /// Errors in ms of samples that arrive late by a mean of `late_ms`, some of them missing; the
-    /// rate goes from 30 to 25 Hz in the middle.
+    /// Errors in ms of samples that arrive late by a mean of `late_ms`, some of them missing; the rate changes from 30
+    /// to 25 Hz in the middle.
     fn errors_ms(late_ms: f64, seed: u64) -> Vec<f64> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let (mut clock, mut errors, mut t) = (SteadyClock::new(), Vec::new(), MonoTime::from_ns(1 << 60));
@@ -357,7 +354,7 @@ mod tests {
                 let what =
                     format!("{tick_ms} ms at {rate_hz} Hz, {late_ms} ms late: {sigma:.2} about {mean:.2} ms");
                 assert!(sigma <= 2.5, "{what}");
-                // How much all are late is seen only where the period goes through all phases of the tick.
+                // The common lateness is visible only where the period goes through all phases of the tick.
                 let seen = [30.0, 30.5].contains(&rate_hz) && tick_ms == 16.0;
                 assert!(mean > -1.5 && mean < if seen { 2.0 } else { tick_ms + 1.0 }, "{what}");
             }

@@ -1,4 +1,4 @@
-//! UTC as the receiver tells it, and its calendar form.
+//! UTC as the receiver reports it, and its calendar form.
 
 use std::fmt;
 
@@ -9,8 +9,8 @@ use super::NS_PER_S;
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct UtcTime(i64);
 
-/// Dates before this are a device's error (a week number that rolled over, a clock without a battery): this
-/// program is younger. 2026-01-01.
+/// Dates before this are a device's error (a week number that rolled over, a clock without a battery), because this
+/// program is newer. 2026-01-01.
 pub const EARLIEST_UTC: UtcTime = UtcTime::from_unix_ns(1_767_225_600_000_000_000);
 
 /// A calendar date and time of day in UTC.

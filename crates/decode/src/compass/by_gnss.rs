@@ -1,16 +1,16 @@
 //! Headings that a receiver measures between its antennas. They are true.
 //!
-//! | sentence | of | what is used |
+//! | sentence | of | used |
 //! |---|---|---|
-//! | `HPR` | Unicore (UM982) | heading, where its quality tells an RTK solution |
+//! | `HPR` | Unicore (UM982) | heading, where its quality is that of an RTK solution |
 //! | `PTNL,AVR` | Trimble | yaw as heading; tilt and roll where both are given; where its quality is not 0 |
 //! | `PSAT,HPR` | Hemisphere | heading, pitch, roll, each where given |
 //! | `PSSN,HRP` | Septentrio | heading; pitch and roll where both are given; where its mode is not 0 |
 //! | `PRDID` | RDI, SBG | pitch, roll, heading |
 //! | `PASHR` | many, with an inertial unit | as the format of that name |
 //!
-//! Two antennas give the heading and one tilt of the line between them: a tilt counts only where the device
-//! tells both angles. Sources: the vendors' manuals.
+//! Two antennas give the heading and one tilt of the line between them: a tilt is used only where the device provides
+//! both angles. Sources: the vendors' manuals.
 
 use super::fields::{heading, tilt};
 use super::pashr;
@@ -18,7 +18,7 @@ use super::reading::CompassReading;
 use crate::counts::Refusal;
 use crate::sentence::Sentence;
 
-/// What such a sentence says; `None` where it is none.
+/// The reading of such a sentence; `None` for other sentences.
 pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
     let told = (sentence.address(), sentence.field(1));
     let (heading_at, pitch_at, roll_at, quality_at) = match told {
@@ -50,7 +50,7 @@ pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Re
     Ok(Some(reading))
 }
 
-/// Some tell the heading from −180 to 180.
+/// Some report the heading from −180 to 180.
 fn heading_of(text: &str) -> Result<Option<f64>, Refusal> {
     match text.strip_prefix('-') {
         Some(size) => {

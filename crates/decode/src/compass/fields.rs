@@ -1,4 +1,4 @@
-//! What fields of several formats have in common: ranges of angles, status letters.
+//! Field types of several formats: ranges of angles, status letters.
 
 use super::reading::CompassReading;
 use crate::counts::Refusal;
@@ -9,19 +9,19 @@ pub(super) fn heading(text: &str) -> Result<Option<f64>, Refusal> {
     number(text, 0.0, 360.0)
 }
 
-/// Pitch or roll, degrees: which of them goes all the way round depends on the device's convention.
+/// Pitch or roll, degrees: which of them has the full range depends on the device's convention.
 pub(super) fn tilt(text: &str) -> Result<Option<f64>, Refusal> {
     number(text, -180.0, 180.0)
 }
 
-/// Status letters of Honeywell and True North: N normal, M and O warnings; L, P and all others
-/// (C calibration, V voltage) alarms, where the value is not to be used.
+/// Status letters of Honeywell and True North: N normal, M and O warnings; L, P and all others (C calibration, V
+/// voltage) are alarms, with which the value must not be used.
 fn alarms(letter: &str) -> bool {
     !matches!(letter, "N" | "M" | "O" | "")
 }
 
-/// Takes away what alarms call invalid: each angle its own, and any of them the heading, which is
-/// made with both angles.
+/// Removes the values that alarms mark as invalid: each angle its own, and any of them the heading, which is computed
+/// with both angles.
 pub(super) fn honour_alarms(reading: &mut CompassReading, heading: &str, pitch: &str, roll: &str) {
     if alarms(pitch) {
         reading.pitch_deg = None;

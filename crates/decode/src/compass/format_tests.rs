@@ -1,4 +1,4 @@
-//! What each format's sentences say.
+//! The readings of each format's sentences.
 
 use nalgebra::Vector3;
 
@@ -13,7 +13,7 @@ fn said(format: CompassFormat, body: &str) -> Result<Option<CompassReading>, Ref
         Reader::Sentences(read)
         | Reader::SentencesOrBare(read, _)
         | Reader::Receiver { sentence: read, .. } => read(&sentence),
-        Reader::Packets | Reader::Records(_) => panic!("these are no sentences"),
+        Reader::Packets | Reader::Records(_) => panic!("these are not sentences"),
     }
 }
 
@@ -97,7 +97,7 @@ fn nmea_headings_and_transducers() {
     assert_eq!(said(CompassFormat::Nmea, "GPRMC,1,2"), Ok(None));
 }
 
-fn readings(format: CompassFormat, bytes: &[u8]) -> (Vec<HeardAttitude>, DecodeCounts) {
+fn readings(format: CompassFormat, bytes: &[u8]) -> (Vec<ReceivedAttitude>, DecodeCounts) {
     let (mut decoder, mut out) = (CompassDecoder::new(format), Vec::new());
     decoder.push(bytes, MonoTime::from_ns(5), &mut out);
     decoder.flush(&mut out);
@@ -185,13 +185,13 @@ fn what_repeats_a_whole_attitude_says_nothing_more() {
 fn a_reading_is_heard_with_its_last_sentence_once_its_end_is_known() {
     let (mut decoder, mut out) = (CompassDecoder::new(CompassFormat::Nmea), Vec::new());
     let bodies = ["HCHDG,101.1,,,,", "HCXDR,A,1.5,D,PITCH", "HCXDR,A,2.5,D,ROLL"];
-    // Read from the middle of a burst on, 33 ms from burst to burst, 6 ms from sentence to sentence.
+    // The recording starts in the middle of a burst, 33 ms from burst to burst, 6 ms from sentence to sentence.
     for n in 1..60 {
         let (burst, sentence) = (n / 3, n % 3);
         let t = MonoTime::from_ns(burst * 33_000_000 + sentence * 6_000_000);
         decoder.push(bursts(&bodies[sentence as usize..][..1], 1).as_bytes(), t, &mut out);
         if burst >= 12 {
-            let last = out.last().expect("some were given out");
+            let last = out.last().expect("some were output");
             assert_eq!(last.t_recv == t, sentence == 2, "sentence {n}");
             assert!(last.sample.heading.is_some() && last.sample.tilt.is_some());
             if sentence == 2 {
@@ -199,7 +199,7 @@ fn a_reading_is_heard_with_its_last_sentence_once_its_end_is_known() {
             }
         }
     }
-    // A device that falls silent is heard out.
+    // The last reading of a device that falls silent is output.
     decoder.push(bursts(&bodies[..1], 1).as_bytes(), MonoTime::from_ns(2_000_000_000), &mut out);
     let before = out.len();
     decoder.tick(MonoTime::from_ns(2_400_000_000), &mut out);
@@ -217,7 +217,7 @@ fn vectornav_tells_angles_or_a_quaternion() {
         assert_eq!(reading(CompassFormat::Vectornav, body), told, "{body}");
     }
     assert_eq!(reading(CompassFormat::Vectornav, "VNYPR,-090.000,+001.0,-002.0").0, Some(270.0));
-    // A turn by 90 degrees about down, then by 30 about the right wing.
+    // A rotation by 90 degrees about down, then by 30 about the right wing.
     let half = std::f64::consts::FRAC_PI_4;
     let (s, c, p) = (half.sin(), half.cos(), 15f64.to_radians());
     let body = format!(
@@ -278,7 +278,7 @@ fn headings_between_antennas_are_true() {
     }
 }
 
-/// Everything a format makes of bytes.
+/// All readings of a format from bytes.
 fn all(format: CompassFormat, bytes: &[u8]) -> (Vec<CompassReading>, DecodeCounts) {
     let (mut decoder, mut out) = (CompassDecoder::new(format), Vec::new());
     decoder.push(bytes, MonoTime::default(), &mut out);
@@ -300,7 +300,7 @@ fn ublox_tells_the_heading_between_its_antennas() {
     let sentence =
         (framed("GNGGA,150405.00,3842.2,N,00911.0,W,4,17,0.6,43.0,M,50.0,M,,") + "\r\n").into_bytes();
     for format in [CompassFormat::Ubx, CompassFormat::Nmea] {
-        // Fix, relative position and heading valid, cycles known or not.
+        // Fix, relative position and heading valid, with float or fixed ambiguities.
         for flags in [0x117, 0x10D | 0x200] {
             let bytes = [sentence.clone(), relative(1, 20_175_000, flags), sentence.clone()].concat();
             let (out, counts) = all(format, &bytes);
@@ -310,7 +310,7 @@ fn ublox_tells_the_heading_between_its_antennas() {
             );
             assert_eq!((out.len(), out[0].pitch_deg, counts.refused_total()), (1, None, 0), "{counts}");
         }
-        // Each flag alone missing takes it.
+        // Without any one of the flags the reading is not used.
         for missing in [0x001, 0x004, 0x010, 0x100] {
             let (out, counts) = all(format, &relative(1, 20_175_000, 0x115 & !missing));
             assert_eq!(
@@ -336,7 +336,7 @@ fn headings_of_sentences_beside_packets_are_read() {
     assert_eq!((out.len(), counts.refused_total(), counts.ignored), (5, 0, 5), "{counts}");
 }
 
-/// A record of WitMotion's.
+/// A record of WitMotion.
 fn wit(kind: u8, figures: [i16; 3]) -> Vec<u8> {
     let mut record = vec![0x55, kind];
     figures.iter().for_each(|figure| record.extend(figure.to_le_bytes()));
@@ -345,7 +345,7 @@ fn wit(kind: u8, figures: [i16; 3]) -> Vec<u8> {
     record
 }
 
-/// Degrees as WitMotion's figure.
+/// Degrees in WitMotion's unit.
 fn steps(degrees: f64) -> i16 {
     (degrees / 180.0 * 32_768.0).round() as i16
 }
@@ -370,7 +370,7 @@ fn witmotion_tells_angles_rates_and_forces() {
             "{told:?} {wanted:?}"
         );
     }
-    // At rest the force is up: one g about z. A turn to the right seen from above is negative about z.
+    // At rest the specific force is up: one g about z. A turn to the right seen from above is negative about z.
     let stream =
         [wit(0x51, [0, 0, 2_048]), wit(0x52, [0, 0, -1_638]), wit(0x54, [1, 2, 3]), angles(0.0, 0.0, 0.0)];
     let mut bytes = vec![0x55, 0x55, 0x53];
@@ -382,7 +382,7 @@ fn witmotion_tells_angles_rates_and_forces() {
     let (force, rate) = (inertial.force_mps2.expect("told"), inertial.rate_rps.expect("told"));
     assert!((force.z + 9.806_65).abs() < 1e-9 && force.xy().norm() < 1e-9, "{force}");
     assert!((rate.z.to_degrees() - 100.0).abs() < 0.05 && rate.xy().norm() < 1e-9, "{rate}");
-    assert_eq!(out[1].inertial, None, "what was told is used once");
+    assert_eq!(out[1].inertial, None, "a gathered value is used once");
 }
 
 #[test]
@@ -403,7 +403,11 @@ fn bno08x_tells_tilt_and_a_yaw_that_is_no_heading() {
     let near = |told: Option<f64>, wanted: f64| (told.expect("told") - wanted).abs() < 1e-9;
     assert!(near(first.reading.heading_deg, 270.0) && near(first.reading.pitch_deg, 2.5));
     assert!(near(first.reading.roll_deg, -10.5) && first.reading.is_valid());
-    assert_eq!((first.sample.heading, first.sample.tilt.is_some()), (None, true), "yaw begins anywhere");
+    assert_eq!(
+        (first.sample.heading, first.sample.tilt.is_some()),
+        (None, true),
+        "yaw has an arbitrary zero"
+    );
     assert_eq!((heard.len(), counts.refused(Refusal::BadChecksum) > 0), (2, true), "{counts}");
     assert!(all(CompassFormat::Bno08xRvc, &record([20_000, 0, 0])).1.refused(Refusal::OutOfRange) > 0);
 }

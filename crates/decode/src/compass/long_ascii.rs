@@ -1,8 +1,8 @@
 //! Headings between antennas in the long ASCII messages of NovAtel and Unicore: `#HEADINGA`, `#UNIHEADINGA`.
 //!
-//! `#NAME,header;status,type,length,heading,pitch,…*CRC`, where the CRC of eight hexadecimal digits is over everything between
-//! `#` and `*`: the polynomial of CRC-32, reflected, from 0 and not inverted. The heading is true; the pitch is that of the
-//! line between the antennas, one tilt alone, and is not used. Sources: the vendors' manuals.
+//! `#NAME,header;status,type,length,heading,pitch,…*CRC`, where the CRC of eight hexadecimal digits covers everything
+//! between `#` and `*`: the polynomial of CRC-32, reflected, from 0 and not inverted. The heading is true. The pitch is
+//! that of the line between the antennas, a single tilt, and is not used. Sources: the vendors' manuals.
 
 use crc::{Algorithm, Crc};
 
@@ -22,7 +22,7 @@ const ALGORITHM: Algorithm<u32> = Algorithm {
 };
 const CRC: Crc<u32> = Crc::<u32>::new(&ALGORITHM);
 
-/// What such a line says; `None` where it is another message.
+/// The reading of such a line; `None` for other messages.
 pub(super) fn read(line: &[u8]) -> Result<Option<CompassReading>, Refusal> {
     let line = std::str::from_utf8(line).map_err(|_| Refusal::NotAscii)?;
     let inner = line.strip_prefix('#').ok_or(Refusal::Malformed)?;
@@ -48,7 +48,7 @@ pub(super) fn read(line: &[u8]) -> Result<Option<CompassReading>, Refusal> {
 mod tests {
     use super::*;
 
-    /// Of a UM982 and two others, as they sent them.
+    /// Messages of a UM982 and two other receivers.
     const REAL: [(&str, f64); 3] = [
         (
             "#UNIHEADINGA,78,GPS,FINE,2428,116060000,0,0,18,11;SOL_COMPUTED,NARROW_INT,1.4773,179.0284,-2.4202,0.0000,\

@@ -21,11 +21,11 @@ mod tagged;
 mod tcm2;
 #[cfg(test)]
 mod tests;
-mod together;
+mod assembler;
 mod vectornav;
 mod witmotion;
 
-pub use reading::{CompassReading, HeardAttitude};
+pub use reading::{CompassReading, ReceivedAttitude};
 
 use windhover_base::settings::CompassFormat;
 use windhover_base::time::MonoTime;
@@ -34,12 +34,12 @@ use crate::counts::{DecodeCounts, Refusal};
 use crate::lines::{LineFramer, LineStart};
 use crate::sentence::{Checksums, Sentence};
 use crate::ubx::{Piece, Splitter, relative_heading};
+use assembler::ReadingAssembler;
 use records::{RecordForm, RecordFramer};
-use together::Together;
 
-/// What a sentence with a sound checksum says.
+/// Reads a sentence with a valid checksum.
 type ReadSentence = fn(&Sentence<'_>) -> Result<Option<CompassReading>, Refusal>;
-/// What a line without `$` says.
+/// Reads a line without `$`.
 type ReadLine = fn(&[u8]) -> Result<Option<CompassReading>, Refusal>;
 
 /// How a format is read.
@@ -47,10 +47,10 @@ type ReadLine = fn(&[u8]) -> Result<Option<CompassReading>, Refusal>;
 enum Reader {
     /// Sentences `$…*HH`.
     Sentences(ReadSentence),
-    /// What a receiver says of the line between its antennas: sentences, long messages `#…*CRC` and packets of u-blox.
+    /// A receiver's reports of the line between its antennas: sentences, long messages `#…*CRC` and packets of u-blox.
     /// Without text: packets alone.
     Receiver { sentence: ReadSentence, has_text: bool },
-    /// Sentences, and lines without frame and checksum of a device that never sends one.
+    /// Sentences, and bare lines without checksum of a device that never sends one.
     SentencesOrBare(ReadSentence, ReadLine),
     /// Binary packets of PNI.
     Packets,
@@ -82,7 +82,7 @@ pub struct CompassDecoder {
     input: Input,
 }
 
-/// Collects bytes into what a format is made of.
+/// Collects bytes into the units of a format.
 #[derive(Clone, Debug)]
 enum Input {
     Text(Box<TextInput>),
@@ -92,11 +92,11 @@ enum Input {
 }
 
 impl Input {
-    /// What puts sentences together, where there are any.
-    fn together(&mut self) -> Option<&mut Together> {
+    /// The part that combines sentences, where the format has them.
+    fn assembler(&mut self) -> Option<&mut ReadingAssembler> {
         match self {
-            Self::Text(text) => Some(&mut text.together),
-            Self::Receiver(receiver) => Some(&mut receiver.text.together),
+            Self::Text(text) => Some(&mut text.assembler),
+            Self::Receiver(receiver) => Some(&mut receiver.text.assembler),
             Self::Packets(_) | Self::Records(_) => None,
         }
     }
@@ -110,15 +110,15 @@ struct TextInput {
     checksums: Checksums,
     /// Whether the device was seen to send checksums: then a bare line is damaged.
     has_checksums: bool,
-    together: Together,
+    assembler: ReadingAssembler,
 }
 
-/// A receiver's line: packets of u-blox, and what is outside them.
+/// A receiver's line: packets of u-blox, and the bytes between them.
 #[derive(Clone, Debug)]
 struct ReceiverInput {
     splitter: Splitter,
     text: TextInput,
-    /// Whether what is outside packets is read.
+    /// Whether the bytes between packets are read.
     has_text: bool,
 }
 
@@ -128,7 +128,7 @@ impl ReceiverInput {
         bytes: &[u8],
         t_recv: MonoTime,
         counts: &mut DecodeCounts,
-        out: &mut Vec<HeardAttitude>,
+        out: &mut Vec<ReceivedAttitude>,
     ) {
         let Self { splitter, text, has_text } = self;
         splitter.push(bytes, 0, t_recv, counts, &mut |piece, counts| match piece {
@@ -143,7 +143,7 @@ impl ReceiverInput {
                         flagged,
                         ..CompassReading::default()
                     };
-                    text.together.whole(reading, span, counts, out);
+                    text.assembler.whole(reading, span, counts, out);
                 }
                 Ok(None) => counts.ignored += 1,
                 Err(why) => counts.refuse(why),
@@ -160,7 +160,7 @@ impl TextInput {
             bare,
             checksums: Checksums::REQUIRED,
             has_checksums: false,
-            together: Together::default(),
+            assembler: ReadingAssembler::default(),
         }
     }
 
@@ -170,13 +170,13 @@ impl TextInput {
         after: usize,
         t_recv: MonoTime,
         counts: &mut DecodeCounts,
-        out: &mut Vec<HeardAttitude>,
+        out: &mut Vec<ReceivedAttitude>,
     ) {
-        let Self { lines, sentence: read, bare, checksums, has_checksums, together } = self;
+        let Self { lines, sentence: read, bare, checksums, has_checksums, assembler } = self;
         lines.push(bytes, after, t_recv, counts, |line, counts| {
             if line.text.starts_with(b"#") && bare.is_none() {
                 return match long_ascii::read(line.text) {
-                    Ok(Some(reading)) => together.whole(reading, line.span, counts, out),
+                    Ok(Some(reading)) => assembler.whole(reading, line.span, counts, out),
                     Ok(None) => counts.ignored += 1,
                     Err(why) => counts.refuse(why),
                 };
@@ -187,7 +187,7 @@ impl TextInput {
                     return counts.refuse(Refusal::NoChecksum);
                 }
                 return match bare(line.text) {
-                    Ok(Some(reading)) => together.whole(reading, line.span, counts, out),
+                    Ok(Some(reading)) => assembler.whole(reading, line.span, counts, out),
                     Ok(None) => counts.ignored += 1,
                     Err(why) => counts.refuse(why),
                 };
@@ -198,9 +198,9 @@ impl TextInput {
             };
             match read(&sentence) {
                 Ok(Some(reading)) if is_part(&sentence) => {
-                    together.part(reading, &sentence, line.span, counts, out);
+                    assembler.part(reading, &sentence, line.span, counts, out);
                 }
-                Ok(Some(reading)) => together.whole(reading, line.span, counts, out),
+                Ok(Some(reading)) => assembler.whole(reading, line.span, counts, out),
                 Ok(None) => counts.ignored += 1,
                 Err(why) => counts.refuse(why),
             }
@@ -208,7 +208,7 @@ impl TextInput {
     }
 }
 
-/// Whether a sentence is plain NMEA, which tells an attitude in parts; others are a device's own.
+/// Whether a sentence is plain NMEA, which has an attitude in parts; others are a device's own.
 fn is_part(sentence: &Sentence<'_>) -> bool {
     !sentence.address().starts_with("VN") && sentence.formatter().is_some()
 }
@@ -242,8 +242,8 @@ impl CompassDecoder {
         self
     }
 
-    /// Takes the bytes one read returned at `t_recv`; appends the samples they complete to `out`.
-    pub fn push(&mut self, bytes: &[u8], t_recv: MonoTime, out: &mut Vec<HeardAttitude>) {
+    /// Takes the bytes that one read returned at `t_recv`; appends the completed samples to `out`.
+    pub fn push(&mut self, bytes: &[u8], t_recv: MonoTime, out: &mut Vec<ReceivedAttitude>) {
         match &mut self.input {
             Input::Text(text) => text.push(bytes, 0, t_recv, &mut self.counts, out),
             Input::Receiver(receiver) => receiver.push(bytes, t_recv, &mut self.counts, out),
@@ -252,21 +252,21 @@ impl CompassDecoder {
         }
     }
 
-    /// Time passed: gives out an open reading the device has fallen silent after.
-    pub fn tick(&mut self, now: MonoTime, out: &mut Vec<HeardAttitude>) {
-        if let Some(together) = self.input.together() {
-            together.tick(now, &mut self.counts, out);
+    /// Time has passed: outputs an open reading after which the device has fallen silent.
+    pub fn tick(&mut self, now: MonoTime, out: &mut Vec<ReceivedAttitude>) {
+        if let Some(assembler) = self.input.assembler() {
+            assembler.tick(now, &mut self.counts, out);
         }
     }
 
-    /// The stream has ended: gives out what is open.
-    pub fn flush(&mut self, out: &mut Vec<HeardAttitude>) {
-        if let Some(together) = self.input.together() {
-            together.close(&mut self.counts, out);
+    /// The stream has ended: outputs the open reading.
+    pub fn flush(&mut self, out: &mut Vec<ReceivedAttitude>) {
+        if let Some(assembler) = self.input.assembler() {
+            assembler.close(&mut self.counts, out);
         }
     }
 
-    /// What was made of the bytes so far.
+    /// Counts of the decoded bytes.
     pub const fn counts(&self) -> &DecodeCounts {
         &self.counts
     }

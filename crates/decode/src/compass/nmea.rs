@@ -1,4 +1,4 @@
-//! Headings and transducers of plain NMEA 0183, which most compasses can send beside their own sentences.
+//! Headings and transducers of plain NMEA 0183, which most compasses can send in addition to their own sentences.
 
 use super::by_gnss;
 use super::fields::{heading, tilt};
@@ -6,12 +6,12 @@ use super::reading::CompassReading;
 use crate::counts::Refusal;
 use crate::sentence::Sentence;
 
-/// HDG, HDM, HDT, THS and XDR of any talker, and what receivers with several antennas send.
+/// HDG, HDM, HDT, THS and XDR of any talker, and the sentences of receivers with several antennas.
 pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
     let mut reading = CompassReading::default();
     match sentence.formatter() {
         Some("HDG") => {
-            // Sensor heading plus deviation is magnetic heading; variation is ours to apply.
+            // Sensor heading plus deviation is magnetic heading; the variation is applied by this program.
             let deviation = signed_east(sentence, 2)?.unwrap_or(0.0);
             reading.heading_deg = heading(sentence.field(1))?.map(|deg| (deg + deviation).rem_euclid(360.0));
         }
@@ -44,8 +44,8 @@ fn signed_east(sentence: &Sentence<'_>, index: usize) -> Result<Option<f64>, Ref
     }
 }
 
-/// XDR: groups of type, value, unit, name; the angles (type A, unit D) named pitch and roll (or heel, as
-/// sailors have it), together or each in a sentence of its own.
+/// XDR: groups of type, value, unit, name; the angles (type A, unit D) named pitch and roll (or heel), together or in
+/// separate sentences.
 fn transducers(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
     let mut reading = CompassReading::default();
     for group in 0..sentence.fields() / 4 {

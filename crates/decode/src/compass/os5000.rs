@@ -7,7 +7,7 @@ use super::tagged::{is_tagged, tagged};
 use crate::counts::Refusal;
 use crate::sentence::{Sentence, number};
 
-/// What a sentence says; `None` where it says nothing of attitude.
+/// The reading of a sentence; `None` where it has no attitude.
 pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
     match sentence.address() {
         "OHPR" => heading_pitch_roll(sentence).map(Some),
@@ -29,8 +29,7 @@ fn heading_pitch_roll(sentence: &Sentence<'_>) -> Result<CompassReading, Refusal
     })
 }
 
-/// OceanServer format 8: `heading,pitch,roll[,…]`, no frame and no checksum, so every field must be
-/// a figure.
+/// OceanServer format 8: `heading,pitch,roll[,…]`, without frame and checksum, so every field must be a number.
 pub(super) fn bare(line: &[u8]) -> Result<Option<CompassReading>, Refusal> {
     let line = std::str::from_utf8(line).map_err(|_| Refusal::NotAscii)?;
     let fields: Vec<&str> = line.split(',').map(str::trim).collect();

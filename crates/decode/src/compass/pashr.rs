@@ -5,16 +5,16 @@ use super::reading::CompassReading;
 use crate::counts::Refusal;
 use crate::sentence::Sentence;
 
-/// What a sentence says; `None` where it says nothing of attitude.
+/// The reading of a sentence; `None` where it has no attitude.
 pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
     if sentence.address() == "PASHR" { pashr(sentence) } else { Ok(None) }
 }
 
-/// `PASHR,hhmmss.sss,heading,T,roll,pitch,heave,…,GPS quality,IMU status`: roll comes before pitch.
-/// Without GPS (quality 0) the heading has nothing to hold it.
+/// `PASHR,hhmmss.sss,heading,T,roll,pitch,heave,…,GPS quality,IMU status`: roll comes before pitch. Without GPS
+/// (quality 0) the heading drifts and is not used.
 fn pashr(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
     if !sentence.field(1).bytes().next().is_some_and(|byte| byte.is_ascii_digit()) {
-        // PASHR,ATT and its like: another grammar under the same address.
+        // PASHR,ATT and similar sentences: another grammar under the same address.
         return Ok(None);
     }
     if sentence.fields() < 5 {

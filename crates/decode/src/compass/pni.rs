@@ -1,17 +1,17 @@
 //! PNI binary packets (TCM3, TCM5, TCM XB, TargetPoint, TRAX, TRAX2 and successors).
 //!
-//! A data response is a count and so many components, each an identity and its value. Heading, pitch, roll,
-//! distortion and heading status are used, the others passed over by their lengths. What follows a component
-//! of unknown length cannot be read: the packet is used up to there, and the component counted by its number.
+//! A data response is a count and that many components, each an identity and its value. Heading, pitch, roll,
+//! distortion and heading status are used, the others skipped by their lengths. Bytes after a component of unknown
+//! length cannot be read: the packet is used up to there, and the component is counted by its number.
 //!
-//! Packet: u16 length of the whole packet, frame identity, payload, u16 CRC, big-endian; the CRC is
-//! polynomial 0x1021 from 0 over everything before it. Source: PNI's manual.
+//! Packet: u16 length of the whole packet, frame identity, payload, u16 CRC, big-endian; the CRC is polynomial 0x1021
+//! from 0 over everything before it. Source: PNI's manual.
 
 use std::collections::VecDeque;
 
 use crc::{CRC_16_XMODEM, Crc};
 
-use super::reading::{CompassReading, HeardAttitude, heard};
+use super::reading::{CompassReading, ReceivedAttitude, heard};
 use crate::counts::{DecodeCounts, Refusal};
 use crate::lines::LineSpan;
 use windhover_base::time::MonoTime;
@@ -19,7 +19,7 @@ use windhover_base::time::MonoTime;
 const CRC: Crc<u16> = Crc::<u16>::new(&CRC_16_XMODEM);
 /// Length, identity and CRC alone.
 const PACKET_MIN: usize = 5;
-/// No packet a compass sends on its own is longer, so noise is not waited on for long.
+/// Largest packet that a compass sends unasked, so that noise is not waited on for long.
 const PACKET_MAX: usize = 255;
 /// Identity of a data response.
 const DATA_RESPONSE: u8 = 5;
@@ -29,30 +29,30 @@ const DATA_RESPONSE: u8 = 5;
 pub(super) struct PacketFramer {
     buffer: VecDeque<u8>,
     little_endian: bool,
-    /// Whether what is in the buffer follows a sound packet.
+    /// Whether the buffer follows a valid packet.
     in_step: bool,
 }
 
 /// What the bytes at some place may be.
 enum Candidate {
-    /// A whole packet of this length.
+    /// A complete valid packet of this length.
     Sound(usize),
-    /// The begin of a packet.
+    /// The start of a packet.
     Incomplete,
-    /// As long as a packet, and its CRC does not match.
+    /// Of a packet's length, with a wrong CRC.
     Broken,
-    /// Not a length.
+    /// Not a valid length.
     Noise,
 }
 
 impl PacketFramer {
-    /// Takes the bytes of one read; appends the samples they complete.
+    /// Takes the bytes of one read; appends the completed samples.
     pub(super) fn push(
         &mut self,
         bytes: &[u8],
         t_recv: MonoTime,
         counts: &mut DecodeCounts,
-        out: &mut Vec<HeardAttitude>,
+        out: &mut Vec<ReceivedAttitude>,
     ) {
         for (index, &byte) in bytes.iter().enumerate() {
             self.buffer.push_back(byte);
@@ -75,7 +75,7 @@ impl PacketFramer {
         }
     }
 
-    /// Takes a whole sound packet off the buffer; drops what cannot begin one.
+    /// Removes a complete valid packet from the buffer; drops bytes that cannot begin one.
     fn next_packet(&mut self, counts: &mut DecodeCounts) -> Option<Vec<u8>> {
         loop {
             match self.packet_at(0) {
@@ -84,7 +84,7 @@ impl PacketFramer {
                     return Some(self.buffer.drain(..length).collect());
                 }
                 Candidate::Incomplete if self.in_step || self.buffer.len() < 2 => return None,
-                // Out of step the length may be any two bytes: a sound packet further on tells.
+                // Out of step the length may be any two bytes: a valid packet further on shows it.
                 Candidate::Incomplete => match self.sound_packet_ahead() {
                     Some(at) => self.skip(at, counts),
                     None => return None,
@@ -136,7 +136,7 @@ impl PacketFramer {
         };
         let (components, unknown) = components_of(&payload[2..], count)?;
         if let Some(identity) = unknown {
-            counts.leave_out(format!("component {identity}, of unknown length, and what follows it"));
+            counts.leave_out(format!("component {identity}, of unknown length, and the rest after it"));
             if !components.iter().any(|component| matches!(component.identity, HEADING | PITCH | ROLL)) {
                 return Err(Refusal::Malformed);
             }
@@ -182,7 +182,7 @@ const GYRO: std::ops::RangeInclusive<u8> = 74..=76;
 const QUATERNION: u8 = 77;
 const HEADING_STATUS: u8 = 79;
 const MAGNETIC_ACCURACY: u8 = 88;
-/// Heading status of an uncertainty beyond 10 degrees (1: within 2 degrees, 2: within 10).
+/// Heading status for an uncertainty beyond 10 degrees (1: within 2 degrees, 2: within 10).
 const STATUS_POOR: u8 = 3;
 
 /// Bytes of a component's value.
@@ -196,7 +196,7 @@ fn length_of(identity: u8) -> Option<usize> {
     }
 }
 
-/// One component: its identity and the first bytes of its value, four of a float or one of a flag.
+/// One component: its identity and the first bytes of its value, four for a float or one for a flag.
 #[derive(Clone, Copy, Debug)]
 struct Component {
     identity: u8,
@@ -208,8 +208,8 @@ impl Component {
         if little_endian { f32::from_le_bytes(self.bytes) } else { f32::from_be_bytes(self.bytes) }
     }
 
-    /// Whether the float is one a compass gives: in range, and zero or not tiny. Read in the wrong
-    /// order most figures become huge or tiny.
+    /// Whether the float is plausible for a compass: in range, and zero or not tiny. In the wrong byte order most
+    /// numbers become huge or tiny.
     fn is_plausible(&self, little_endian: bool) -> bool {
         let (low, high) = match self.identity {
             HEADING => (0.0, 360.0),
@@ -359,7 +359,7 @@ mod tests {
         ) {
             let mut components = attitude();
             for (identity, at) in others {
-                let value = vec![filling; length_of(identity).expect("of the table")];
+                let value = vec![filling; length_of(identity).expect("in the table")];
                 components.insert(at, component(identity, &value));
             }
             let (out, counts) = readings(&response(&components));
@@ -370,7 +370,7 @@ mod tests {
         }
     }
 
-    /// Components that say nothing of the attitude.
+    /// Components without attitude.
     const OTHERS: [u8; 13] =
         [TEMPERATURE, CALIBRATION_STATUS, 21, 22, 23, 27, 28, 29, 74, 75, 76, QUATERNION, MAGNETIC_ACCURACY];
 }

@@ -1,4 +1,4 @@
-//! Readings of a compass, and when they came.
+//! Readings of a compass, with their times of arrival.
 
 use windhover_base::geo::Tilt;
 use windhover_base::msg::{AttitudeSample, InertialSample};
@@ -7,27 +7,27 @@ use windhover_base::time::MonoTime;
 use crate::counts::DecodeCounts;
 use crate::lines::LineSpan;
 
-/// One reading as the device gives it, degrees; `None` where not given or not valid.
+/// One reading as the device reports it, degrees; `None` where not given or not valid.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct CompassReading {
     /// Heading, 0 to 360.
     pub heading_deg: Option<f64>,
     /// Whether the heading is already true.
     pub heading_is_true: bool,
-    /// Whether the heading is counted from an arbitrary direction, so that it is none.
+    /// Whether the heading is relative to an arbitrary direction, so that it cannot be used.
     pub heading_is_free: bool,
     /// Pitch, nose up positive.
     pub pitch_deg: Option<f64>,
     /// Roll, right side down positive.
     pub roll_deg: Option<f64>,
-    /// Whether the device's own flags made something of this reading invalid.
+    /// Whether the device's own flags made a part of this reading invalid.
     pub flagged: bool,
-    /// Rates of turn and specific forces beside it, in the device's axes forward, right, down.
+    /// Rates of turn and specific forces in the same reading, in the device's axes forward, right, down.
     pub inertial: Option<InertialSample>,
 }
 
 impl CompassReading {
-    /// The reading as what the estimator takes: radians, tilt only where both angles are valid.
+    /// The reading for the estimator: radians, tilt only where both angles are valid.
     pub fn sample(&self) -> AttitudeSample {
         let tilt = self.pitch_deg.zip(self.roll_deg);
         AttitudeSample {
@@ -37,18 +37,18 @@ impl CompassReading {
         }
     }
 
-    /// Whether nothing in it was called invalid by the device, and there is something in it.
+    /// Whether the device marked nothing in it as invalid, and it is not empty.
     pub fn is_valid(&self) -> bool {
         !self.flagged && (self.heading_deg.is_some() || self.pitch_deg.is_some() || self.roll_deg.is_some())
     }
 }
 
-/// A reading and when it was heard.
+/// A reading and its time of arrival.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub struct HeardAttitude {
-    /// The reading as the estimator takes it.
+pub struct ReceivedAttitude {
+    /// The reading for the estimator.
     pub sample: AttitudeSample,
-    /// The reading as the device gives it.
+    /// The reading as the device reported it.
     pub reading: CompassReading,
     /// When the read returned that completed it.
     pub t_recv: MonoTime,
@@ -56,20 +56,19 @@ pub struct HeardAttitude {
     pub t_first: MonoTime,
     /// Length of that on the wire.
     pub bytes: usize,
-    /// Bytes of that read after it. Its last byte ended no later than `t_first` less the
-    /// transmission time of these.
+    /// Bytes of that read after it. Its last byte ended no later than `t_first` minus the transmission time of these.
     pub bytes_after: usize,
 }
 
-/// Stamps a reading of sentences from the first to the last.
+/// Stamps a reading from its first and last sentence.
 pub(super) fn heard(
     reading: CompassReading,
     first: LineSpan,
     last: LineSpan,
     counts: &mut DecodeCounts,
-) -> HeardAttitude {
+) -> ReceivedAttitude {
     counts.flagged += u64::from(reading.flagged);
-    HeardAttitude {
+    ReceivedAttitude {
         sample: reading.sample(),
         reading,
         t_recv: last.t_last,

@@ -1,26 +1,26 @@
-//! Records of a fixed length behind a mark, with a sum of their bytes at the end: WitMotion's and the BNO08x's.
+//! Records of a fixed length after a mark, with a sum of their bytes at the end: those of WitMotion and BNO08x.
 
 use std::collections::VecDeque;
 
-use super::reading::{CompassReading, HeardAttitude, heard};
+use super::reading::{CompassReading, ReceivedAttitude, heard};
 use crate::counts::{DecodeCounts, Refusal};
 use crate::lines::LineSpan;
 use windhover_base::time::MonoTime;
 
-/// How the records of a device look, and what is made of one.
+/// Format of a device's records, and their reader.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct RecordForm {
     /// Bytes that begin a record.
     pub mark: &'static [u8],
-    /// Length with mark and sum.
+    /// Length including mark and sum.
     pub length: usize,
-    /// Index of the first byte that is summed: up to the last but one, modulo 256.
+    /// Index of the first summed byte: up to the last but one, modulo 256.
     pub summed_from: usize,
-    /// Takes a record in; `None` where it says nothing of attitude alone.
+    /// Reads a record; `None` where it has no attitude.
     pub read: fn(&[u8], &mut Gathered) -> Result<Option<CompassReading>, Refusal>,
 }
 
-/// What came in records before the one that tells the attitude.
+/// Values from records before the one with the attitude.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Gathered {
     /// Specific force, device axes as the form gives them, forward-right-down, m/s².
@@ -42,13 +42,13 @@ impl RecordFramer {
         Self { form, buffer: VecDeque::with_capacity(form.length), gathered: Gathered::default() }
     }
 
-    /// Takes the bytes of one read; appends the samples they complete.
+    /// Takes the bytes of one read; appends the completed samples.
     pub(super) fn push(
         &mut self,
         bytes: &[u8],
         t_recv: MonoTime,
         counts: &mut DecodeCounts,
-        out: &mut Vec<HeardAttitude>,
+        out: &mut Vec<ReceivedAttitude>,
     ) {
         for (index, &byte) in bytes.iter().enumerate() {
             self.buffer.push_back(byte);
@@ -69,7 +69,7 @@ impl RecordFramer {
         }
     }
 
-    /// Whether the buffer is a whole sound record; what cannot begin one is dropped.
+    /// Whether the buffer is a complete valid record; bytes that cannot begin one are dropped.
     fn is_record(&mut self, counts: &mut DecodeCounts) -> bool {
         loop {
             let begun = self.buffer.iter().zip(self.form.mark).all(|(byte, mark)| byte == mark);
@@ -94,7 +94,7 @@ impl RecordFramer {
     }
 }
 
-/// The signed figure of two bytes at `index`, low byte first.
+/// The signed number of two bytes at `index`, low byte first.
 pub(super) fn figure(record: &[u8], index: usize) -> f64 {
     let byte = |at: usize| record.get(at).copied().unwrap_or(0);
     f64::from(i16::from_le_bytes([byte(index), byte(index + 1)]))

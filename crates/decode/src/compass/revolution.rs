@@ -6,11 +6,11 @@ use super::reading::CompassReading;
 use crate::counts::Refusal;
 use crate::sentence::Sentence;
 
-/// What a sentence says; `None` where it says nothing of attitude.
+/// The reading of a sentence; `None` where it has no attitude.
 pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
     match sentence.address() {
         "PTNTHTM" => revolution(sentence).map(Some),
-        // The XDR carries raw counts, and only what PTNTHTM has as well.
+        // The XDR has raw counts, and otherwise only values of PTNTHM's sentence.
         address if address.ends_with("XDR") => Ok(None),
         _ => nmea::read(sentence),
     }

@@ -1,8 +1,8 @@
-//! BNO08x in its UART-RVC mode: 100 readings a second without a word to the device.
+//! BNO08x in its UART-RVC mode: 100 readings a second without any command to the device.
 //!
-//! A record is AA AA, an index, yaw, pitch and roll (hundredths of a degree), three specific forces, three bytes to spare, and
-//! the sum of all after the marks. Yaw is counted from where the device was switched on, whatever that is: it is told, and is no
-//! heading. Source: data sheet of the BNO08X.
+//! A record is AA AA, an index, yaw, pitch and roll (hundredths of a degree), three specific forces, three reserved
+//! bytes, and the sum of all after the marks. Yaw is relative to the direction in which the device was switched on: it
+//! is reported, but not used as a heading. Source: data sheet of the BNO08X.
 
 use super::reading::CompassReading;
 use super::records::{Gathered, RecordForm, figure};

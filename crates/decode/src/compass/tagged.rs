@@ -1,11 +1,11 @@
-//! Words of tagged figures, `C328.3P28.4R-12.4`, as PNI TCM2 and OceanServer OS5000 send them.
+//! Words of tagged numbers, `C328.3P28.4R-12.4`, as PNI TCM2 and OceanServer OS5000 send them.
 
 use super::fields::{heading, tilt};
 use super::reading::CompassReading;
 use crate::counts::Refusal;
 use crate::sentence::number;
 
-/// `C328.3P28.4…`: a `C` that is followed by a figure, or another tag straight away.
+/// `C328.3P28.4…`: a `C` that is directly followed by a number or another tag.
 pub(super) fn is_tagged(address: &str) -> bool {
     let mut bytes = address.bytes();
     let first = bytes.next();
@@ -16,15 +16,15 @@ pub(super) fn is_tagged(address: &str) -> bool {
         })
 }
 
-/// Inclinometer out of range (TCM2 error word): neither tilt nor the heading made with it is valid.
+/// Inclinometer out of range (TCM2 error word): neither the tilt nor the heading computed with it is valid.
 const TCM2_TILT: u16 = 0x002;
 /// Magnetometer out of range.
 const TCM2_MAGNETOMETER: u16 = 0x004;
 /// Magnetic distortion (TCM2; reserved, so never set, on the 2.5 and 2.6).
 const TCM2_DISTORTION: u16 = 0x001;
 
-/// PNI TCM2 and OceanServer: letters, then a figure, for each item; any item may be absent. Items
-/// other than heading C, pitch P, roll R and error word E are checked and left.
+/// PNI TCM2 and OceanServer: letters, then a number, for each item; any item may be absent. Items other than heading C,
+/// pitch P, roll R and error word E are checked and ignored.
 pub(super) fn tagged(body: &str) -> Result<Option<CompassReading>, Refusal> {
     let mut reading = CompassReading::default();
     let mut errors = 0u16;

@@ -6,7 +6,7 @@ use super::tagged::{is_tagged, tagged};
 use crate::counts::Refusal;
 use crate::sentence::Sentence;
 
-/// What a sentence says; `None` where it says nothing of attitude.
+/// The reading of a sentence; `None` where it has no attitude.
 pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
     if is_tagged(sentence.address()) { tagged(sentence.body) } else { nmea::read(sentence) }
 }

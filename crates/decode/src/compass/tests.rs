@@ -1,13 +1,13 @@
-//! Properties of the compass decoders on any bytes.
+//! Properties of the compass decoders on arbitrary bytes.
 
 use proptest::prelude::*;
 
-use super::{CompassDecoder, HeardAttitude};
+use super::{CompassDecoder, ReceivedAttitude};
 use crate::sentence::framed;
 use windhover_base::settings::CompassFormat;
 use windhover_base::time::MonoTime;
 
-fn in_pieces(format: CompassFormat, bytes: &[u8], sizes: &[usize]) -> Vec<HeardAttitude> {
+fn in_pieces(format: CompassFormat, bytes: &[u8], sizes: &[usize]) -> Vec<ReceivedAttitude> {
     let (mut decoder, mut out) = (CompassDecoder::new(format), Vec::new());
     let (mut rest, mut sizes) = (bytes, sizes.iter().cycle());
     while !rest.is_empty() {
@@ -19,8 +19,8 @@ fn in_pieces(format: CompassFormat, bytes: &[u8], sizes: &[usize]) -> Vec<HeardA
     out
 }
 
-fn check(heard: &[HeardAttitude]) -> Result<(), TestCaseError> {
-    for HeardAttitude { reading, sample, .. } in heard {
+fn check(heard: &[ReceivedAttitude]) -> Result<(), TestCaseError> {
+    for ReceivedAttitude { reading, sample, .. } in heard {
         prop_assert!(reading.heading_deg.is_none_or(|deg| (0.0..=360.0).contains(&deg)));
         let angles = [reading.pitch_deg, reading.roll_deg];
         prop_assert!(angles.iter().flatten().all(|deg| (-180.0..=180.0).contains(deg)));

@@ -14,12 +14,12 @@ use windhover_base::msg::InertialSample;
 /// Largest force, m/s², and rate, rad/s, that any of their sensors measures.
 const FORCE_MAX: f64 = 1_000.0;
 const RATE_MAX: f64 = 100.0;
-/// How far a quaternion's length may be off one.
+/// Largest difference of a quaternion's length from one.
 const UNIT_OFF: f64 = 0.01;
-/// Modes of the inertial solution (bits 0 and 1 of its status) in which it aligns or follows.
+/// Modes of the inertial solution (bits 0 and 1 of its status) in which it is aligning or tracking.
 const INS_MODES: std::ops::RangeInclusive<u16> = 1..=2;
 
-/// What a sentence says; `None` where it says nothing of attitude.
+/// The reading of a sentence; `None` where it has no attitude.
 pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
     match sentence.address() {
         "VNYPR" | "VNYBA" | "VNYIA" => angles(sentence, 1).map(Some),
@@ -32,7 +32,7 @@ pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Re
     }
 }
 
-/// Specific force, m/s², and rates, rad/s, in the device's axes forward, right, down. `None` where they are not there.
+/// Specific force, m/s², and rates, rad/s, in the device's axes forward, right, down. `None` where they are absent.
 fn inertial_at(sentence: &Sentence<'_>, first: usize) -> Result<Option<InertialSample>, Refusal> {
     let three = |at: usize, most: f64| {
         let axis = |index| sentence.number(at + index, -most, most);

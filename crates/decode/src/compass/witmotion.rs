@@ -1,9 +1,9 @@
-//! WitMotion's modules (WT901, HWT901B, JY901 and others) in the protocol they speak from the factory.
+//! WitMotion's modules (WT901, HWT901B, JY901 and others) in their factory protocol.
 //!
-//! A record is 55, a type, eight bytes, and the sum of these ten. Types: 51 specific force (16 g over the range of
-//! a signed figure), 52 rates (2000 degrees a second), 53 angles about x, y, z (180 degrees), which tell the reading.
-//! The device's axes are x right, y forward (where the housing's arrow of y points), z up; angles are right-handed, so
-//! that the one about x is pitch, the one about y roll, and the heading is that about z, the other way round.
+//! A record is 55, a type, eight bytes, and the sum of these ten. Types: 51 specific force (16 g over the range of a
+//! signed number), 52 rates (2000 degrees a second), 53 angles about x, y, z (180 degrees), which complete the reading.
+//! The device's axes are x right, y forward (the direction of the arrow y on the housing), z up; angles are
+//! right-handed, so that the one about x is pitch, the one about y roll, and the heading is minus the one about z.
 //! Source: WitMotion's protocol of the standard modules.
 
 use nalgebra::{Rotation3, Vector3};
@@ -19,7 +19,7 @@ pub(super) const FORM: RecordForm = RecordForm { mark: &[0x55], length: 11, summ
 const FORCE: u8 = 0x51;
 const RATE: u8 = 0x52;
 const ANGLES: u8 = 0x53;
-/// Steps of a signed figure in its range.
+/// Steps of a signed number in its range.
 const STEPS: f64 = 32_768.0;
 /// Ranges of force, m/s², rate, rad/s, and angle, rad.
 const FORCE_RANGE: f64 = 16.0 * 9.806_65;
@@ -45,12 +45,12 @@ fn read(record: &[u8], gathered: &mut Gathered) -> Result<Option<CompassReading>
     Ok(None)
 }
 
-/// Forward, right, down of right, forward, up.
+/// Forward, right, down from right, forward, up.
 fn in_body(device: &Vector3<f64>) -> Vector3<f64> {
     Vector3::new(device.y, device.x, -device.z)
 }
 
-/// Angles about x, then y, then z of axes that are east, north, up at zero.
+/// Attitude from angles about x, then y, then z of axes that are east, north, up at zero.
 fn attitude(angles: &Vector3<f64>) -> CompassReading {
     let up_from_device = Rotation3::from_euler_angles(angles.x, angles.y, angles.z);
     let (ahead, right) = (up_from_device * Vector3::y(), up_from_device * Vector3::x());

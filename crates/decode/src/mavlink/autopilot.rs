@@ -1,7 +1,7 @@
-//! What an autopilot says, put on host time: attitude, rates and forces, its receiver's fixes, its own position.
+//! Measurements of an autopilot, on host time: attitude, rates and forces, its receiver's fixes, its own position.
 //!
-//! ArduPilot's and PX4's messages in the units of `common.xml`. One system is followed, that of `system_id` or the first
-//! whose HEARTBEAT is an autopilot's; what others send is left out.
+//! ArduPilot's and PX4's messages in the units of `common.xml`. One system is used: that of `system_id`, or the first
+//! with an autopilot's HEARTBEAT. Messages of other systems are ignored.
 
 use mavlink::dialects::development::*;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
@@ -17,28 +17,28 @@ use crate::counts::{DecodeCounts, Refusal};
 const AUTOPILOT: u8 = 1;
 /// Standard gravity, m/s²: accelerations of SCALED_IMU are in thousandths of it.
 const GRAVITY: f64 = 9.806_65;
-/// A better message of the same kind was heard so lately: the other one is left out.
+/// A better message of the same kind was received within this time: the other one is ignored.
 const LATELY: Span = Span::from_ns(1_000_000_000);
-/// Our questions for the time are marked in digits of a nanosecond's clock that no clock tells.
+/// Our time requests are marked in the nanosecond digits below the resolution of clocks.
 const MARK_NS: i64 = 618;
-/// A `time_usec` beyond this is UTC, one below since start: 2001 in microseconds since 1970.
+/// A larger `time_usec` is UTC, a smaller one is time since start: 2001 in microseconds since 1970.
 const UNIX_USEC: u64 = 1_000_000_000_000_000;
-/// 2020-01-01: an autopilot that says an earlier time does not know it.
+/// 2020-01-01: an autopilot that reports an earlier time does not know it.
 const EARLIEST_UNIX_USEC: u64 = 1_577_836_800_000_000;
 
-/// What was said, and when it was true.
+/// A decoded message, and its time of validity.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub struct HeardAutopilot {
-    /// When it was true, host time; fixes are true their receiver's latency before.
+pub struct ReceivedAutopilot {
+    /// Time of validity, host time; fixes were valid their receiver's latency earlier.
     pub t: MonoTime,
-    /// What.
-    pub said: AutopilotSaid,
+    /// The content.
+    pub measurement: AutopilotMeasurement,
 }
 
-/// What an autopilot says.
+/// The content of an autopilot's message.
 #[derive(Clone, Copy, PartialEq, Debug)]
-#[expect(clippy::large_enum_variant, reason = "a value at a time, handed on")]
-pub enum AutopilotSaid {
+#[expect(clippy::large_enum_variant, reason = "a value at a time, passed on")]
+pub enum AutopilotMeasurement {
     /// Attitude, its heading true.
     Attitude(AttitudeSample),
     /// Rates and forces in the body's axes.
@@ -57,17 +57,17 @@ pub fn is_autopilot(frame: &MavlinkFrame) -> bool {
             && beat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID)
 }
 
-/// The time that a question for an autopilot's time carries: `now`, marked as ours.
+/// The time in a time request to an autopilot: `now`, marked as ours.
 pub fn question(now: MonoTime) -> i64 {
     now.ns().div_euclid(1_000) * 1_000 + MARK_NS
 }
 
-/// When a question of ours was asked; `None` for one that is not ours.
+/// When we sent this time request; `None` for one that is not ours.
 pub fn asked(ts1: i64) -> Option<MonoTime> {
     (ts1.rem_euclid(1_000) == MARK_NS).then(|| MonoTime::from_ns(ts1))
 }
 
-/// MAVLink bytes to what an autopilot says.
+/// MAVLink bytes to an autopilot's measurements.
 #[derive(Clone, Debug, Default)]
 pub struct AutopilotDecoder {
     frames: MavlinkFrames,
@@ -77,18 +77,18 @@ pub struct AutopilotDecoder {
     quaternion: Option<MonoTime>,
     forces: Option<MonoTime>,
     fix_usec: u64,
-    /// UTC less time since start, microseconds.
+    /// UTC minus time since start, microseconds.
     utc_less_boot: Option<i64>,
 }
 
 impl AutopilotDecoder {
-    /// Of this system; of the first autopilot that is heard where `None`.
+    /// For this system; for the first autopilot that is received where `None`.
     pub fn new(system_id: Option<u8>) -> Self {
         Self { follows: system_id, ..Self::default() }
     }
 
-    /// Takes bytes that were heard at `t`.
-    pub fn push(&mut self, bytes: &[u8], t: MonoTime, out: &mut Vec<HeardAutopilot>) {
+    /// Takes bytes that were received at `t`.
+    pub fn push(&mut self, bytes: &[u8], t: MonoTime, out: &mut Vec<ReceivedAutopilot>) {
         let mut heard = std::mem::take(&mut self.heard);
         self.frames.push(bytes, &mut heard);
         for frame in heard.drain(..) {
@@ -103,7 +103,7 @@ impl AutopilotDecoder {
         self.heard = heard;
     }
 
-    /// What became of the bytes.
+    /// Counts of the decoded bytes.
     pub fn counts(&self) -> &DecodeCounts {
         self.frames.counts()
     }
@@ -113,17 +113,17 @@ impl AutopilotDecoder {
         &self.clock
     }
 
-    /// The system that is followed.
+    /// The system that is used.
     pub fn system(&self) -> Option<u8> {
         self.follows
     }
 
-    /// Whether the frame is of use.
+    /// Decodes a frame; returns whether it was used.
     fn frame(
         &mut self,
         frame: &MavlinkFrame,
         t: MonoTime,
-        out: &mut Vec<HeardAutopilot>,
+        out: &mut Vec<ReceivedAutopilot>,
     ) -> Result<bool, Refusal> {
         if self.follows.is_none() && is_autopilot(frame) {
             self.follows = Some(frame.system);
@@ -181,13 +181,13 @@ impl AutopilotDecoder {
         }
     }
 
-    /// Host time of a time since its start that was heard at `t`.
+    /// Host time of a time since its start that was received at `t`.
     fn at(&mut self, boot: Span, t: MonoTime) -> Result<MonoTime, Refusal> {
         let believed = self.clock.heard(boot, t);
         self.clock.host(boot).filter(|_| believed).ok_or(Refusal::OutOfRange)
     }
 
-    /// Time since its start of a stamp that may be UTC.
+    /// Time since its start, from a stamp that may be UTC.
     fn since_boot(&self, time_usec: u64) -> Result<Span, Refusal> {
         let usec = i64::try_from(time_usec).map_err(|_| Refusal::OutOfRange)?;
         let boot_usec = match time_usec < UNIX_USEC {
@@ -197,7 +197,7 @@ impl AutopilotDecoder {
         Ok(Span::from_ns(boot_usec.saturating_mul(1_000)))
     }
 
-    /// An answer to a question of ours.
+    /// An answer to one of our time requests.
     fn timesync(&mut self, sync: &TIMESYNC_DATA, t: MonoTime) -> bool {
         let sent = asked(sync.ts1).filter(|_| sync.tc1 != 0);
         if let Some(sent) = sent {
@@ -212,13 +212,13 @@ impl AutopilotDecoder {
         heading: f64,
         tilt: Tilt,
         rates: [f32; 3],
-        out: &mut Vec<HeardAutopilot>,
+        out: &mut Vec<ReceivedAutopilot>,
     ) -> Result<bool, Refusal> {
         if ![heading, tilt.pitch, tilt.roll].iter().all(|angle| angle.is_finite() && angle.abs() < 7.0) {
             return Err(Refusal::OutOfRange);
         }
         let sample = AttitudeSample { heading: Some(heading), heading_is_true: true, tilt: Some(tilt) };
-        out.push(HeardAutopilot { t, said: AutopilotSaid::Attitude(sample) });
+        out.push(ReceivedAutopilot { t, measurement: AutopilotMeasurement::Attitude(sample) });
         if self.forces.is_none_or(|last| t - last >= LATELY) {
             self.inertial(t, Vector3::from(rates).map(f64::from), None, out);
         }
@@ -230,13 +230,13 @@ impl AutopilotDecoder {
         t: MonoTime,
         rate: Vector3<f64>,
         force: Option<Vector3<f64>>,
-        out: &mut Vec<HeardAutopilot>,
+        out: &mut Vec<ReceivedAutopilot>,
     ) -> bool {
         if force.is_some() {
             self.forces = Some(t);
         }
         let sample = InertialSample { rate_rps: Some(rate), force_mps2: force };
-        out.push(HeardAutopilot { t, said: AutopilotSaid::Inertial(sample) });
+        out.push(ReceivedAutopilot { t, measurement: AutopilotMeasurement::Inertial(sample) });
         true
     }
 
@@ -244,9 +244,9 @@ impl AutopilotDecoder {
         &mut self,
         fix: &GPS_RAW_INT_DATA,
         t: MonoTime,
-        out: &mut Vec<HeardAutopilot>,
+        out: &mut Vec<ReceivedAutopilot>,
     ) -> Result<bool, Refusal> {
-        // The same fix again: it is sent at a rate of its own.
+        // The same fix again: the message has its own rate.
         if fix.time_usec == self.fix_usec {
             return Ok(false);
         }
@@ -256,7 +256,7 @@ impl AutopilotDecoder {
             return Err(Refusal::OutOfRange);
         }
         self.fix_usec = fix.time_usec;
-        // A fix is as old as it is: only its own clock tells when it came, never its arrival here.
+        // A fix's own clock gives its time, never its arrival here.
         let t = self.clock.host(boot).unwrap_or(t);
         let kind = fix_kind(fix.fix_type);
         let metres = |mm: u32| (mm > 0 && mm < u32::MAX).then(|| f64::from(mm) * 1e-3);
@@ -292,7 +292,7 @@ impl AutopilotDecoder {
             hdop: known(fix.eph).map(|dop| dop * 1e-2),
             ..GnssEpoch::default()
         };
-        out.push(HeardAutopilot { t, said: AutopilotSaid::Gnss(epoch) });
+        out.push(ReceivedAutopilot { t, measurement: AutopilotMeasurement::Gnss(epoch) });
         Ok(true)
     }
 
@@ -300,12 +300,12 @@ impl AutopilotDecoder {
         &mut self,
         place: &GLOBAL_POSITION_INT_DATA,
         t: MonoTime,
-        out: &mut Vec<HeardAutopilot>,
+        out: &mut Vec<ReceivedAutopilot>,
     ) -> Result<bool, Refusal> {
         let boot = Span::from_ns(i64::from(place.time_boot_ms) * 1_000_000);
         let t = self.at(boot, t)?;
         let (lat_deg, lon_deg) = (f64::from(place.lat) * 1e-7, f64::from(place.lon) * 1e-7);
-        // Without a position yet it says 0, 0.
+        // Before it has a position it reports 0, 0.
         if (place.lat, place.lon) == (0, 0) {
             return Ok(false);
         }
@@ -315,12 +315,12 @@ impl AutopilotDecoder {
         let vel_ned_mps = Vector3::new(place.vx, place.vy, place.vz).map(|v| f64::from(v) * 1e-2);
         let alt_msl_m = f64::from(place.alt) * 1e-3;
         let said = AutopilotPosition { boot, lat_deg, lon_deg, alt_msl_m, vel_ned_mps };
-        out.push(HeardAutopilot { t, said: AutopilotSaid::Position(said) });
+        out.push(ReceivedAutopilot { t, measurement: AutopilotMeasurement::Position(said) });
         Ok(true)
     }
 }
 
-/// A figure that is not its "unknown".
+/// A number that is not the value for "unknown".
 fn known(figure: u16) -> Option<f64> {
     (figure != u16::MAX).then(|| f64::from(figure))
 }

@@ -1,4 +1,4 @@
-//! MAVLink 1 and 2 frames out of a stream of bytes.
+//! MAVLink 1 and 2 frames from a stream of bytes.
 //!
 //! Source: <https://mavlink.io/en/guide/serialization.html>.
 
@@ -9,26 +9,26 @@ use crate::counts::{DecodeCounts, Refusal};
 
 /// First bytes of frames.
 const MAGIC: [u8; 2] = [0xfe, 0xfd];
-/// Header of each version, the magic included; checksum; signature.
+/// Header of each version, including the magic byte; checksum; signature.
 const HEADER_V1: usize = 6;
 const HEADER_V2: usize = 10;
 const CHECKSUM: usize = 2;
 const SIGNATURE: usize = 13;
-/// Flag of a version 2 header: a signature follows. Others are not understood.
+/// Flag of a version 2 header: a signature follows. Other flags are not supported.
 const SIGNED: u8 = 0x01;
 
-/// A frame whose checksum is right.
+/// A frame with a correct checksum.
 #[derive(Clone, Debug)]
 pub struct MavlinkFrame {
     /// System id of its sender.
     pub system: u8,
     /// Component id of its sender.
     pub component: u8,
-    /// Its number.
+    /// Its sequence number.
     pub sequence: u8,
-    /// What it says.
+    /// Its content.
     pub message: MavMessage,
-    /// Its bytes as they came.
+    /// Its bytes as received.
     pub bytes: Vec<u8>,
 }
 
@@ -39,13 +39,13 @@ pub struct MavlinkFrames {
     counts: DecodeCounts,
 }
 
-/// What stands at the begin of some bytes.
+/// What some bytes begin with.
 enum Found {
-    /// A frame that is not whole yet.
+    /// A frame that is not complete yet.
     Part,
-    /// No frame.
+    /// Not a frame.
     Noise(Option<Refusal>),
-    /// A frame of this length, of a message that the dialect does not have.
+    /// A frame of this length with a message that is not in the dialect.
     Unknown(usize),
     /// A frame of this length.
     Whole(usize, Box<MavlinkFrame>),
@@ -82,7 +82,7 @@ impl MavlinkFrames {
         self.buffer = rest.to_vec();
     }
 
-    /// What became of the bytes; frames count as used or ignored where they are looked at.
+    /// Counts of the bytes; frames count as used or ignored where they are decoded.
     pub fn counts_mut(&mut self) -> &mut DecodeCounts {
         &mut self.counts
     }
@@ -93,7 +93,7 @@ impl MavlinkFrames {
     }
 }
 
-/// What stands at the begin of `rest`, the first byte of which is a magic.
+/// What `rest` begins with; its first byte is a magic byte.
 fn first(rest: &[u8]) -> Found {
     let v2 = rest.first() == Some(&MAGIC[1]);
     let header = if v2 { HEADER_V2 } else { HEADER_V1 };
@@ -114,7 +114,7 @@ fn first(rest: &[u8]) -> Found {
         false => (u32::from(rest[5]), MavlinkVersion::V1),
     };
     if MavMessage::default_message_from_id(id).is_none() {
-        // Its checksum cannot be computed: what follows tells whether it was a frame.
+        // Its checksum cannot be computed: the following byte shows whether it was a frame.
         return match rest.get(length) {
             None => Found::Part,
             Some(next) if MAGIC.contains(next) => Found::Unknown(length),

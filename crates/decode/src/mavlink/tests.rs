@@ -1,4 +1,4 @@
-//! An autopilot's messages as ArduPilot and PX4 send them, and bytes that are none.
+//! An autopilot's messages as ArduPilot and PX4 send them, and bytes that are not messages.
 
 use ::mavlink::dialects::development::*;
 use ::mavlink::{MAVLinkV2MessageRaw, MavHeader};
@@ -38,7 +38,7 @@ fn attitude(time_boot_ms: u32, yaw: f32) -> MavMessage {
     })
 }
 
-/// A decoder that follows system 1, started 100 s before `at(0)`.
+/// A decoder that uses system 1, started 100 s before `at(0)`.
 fn following() -> AutopilotDecoder {
     let mut decoder = AutopilotDecoder::new(None);
     decoder.push(&frame(1, 1, &heartbeat()), at(0.0), &mut Vec::new());
@@ -46,7 +46,7 @@ fn following() -> AutopilotDecoder {
     decoder
 }
 
-fn heard(decoder: &mut AutopilotDecoder, message: &MavMessage, t: MonoTime) -> Vec<HeardAutopilot> {
+fn heard(decoder: &mut AutopilotDecoder, message: &MavMessage, t: MonoTime) -> Vec<ReceivedAutopilot> {
     let mut out = Vec::new();
     decoder.push(&frame(1, 1, message), t, &mut out);
     out
@@ -62,11 +62,11 @@ fn only_the_autopilot_is_heard() {
     }
     assert_eq!(out, []);
     decoder.push(&frame(1, 1, &attitude(100_000, 0.5)), at(0.002), &mut out);
-    let AutopilotSaid::Attitude(sample) = out[0].said else { panic!("{out:?}") };
+    let AutopilotMeasurement::Attitude(sample) = out[0].measurement else { panic!("{out:?}") };
     assert!(sample.heading_is_true && (sample.heading.expect("told") - 0.5).abs() < 1e-6);
     let tilt = sample.tilt.expect("told");
     assert!((tilt.pitch + 0.2).abs() < 1e-6 && (tilt.roll - 0.1).abs() < 1e-6);
-    // A system that is asked for is waited for.
+    // With a configured system id, only that system is used.
     let mut second = AutopilotDecoder::new(Some(2));
     second.push(&frame(1, 1, &attitude(100_000, 0.5)), at(0.0), &mut Vec::new());
     assert_eq!(second.counts().used, 0);
@@ -86,11 +86,12 @@ fn quaternions_are_preferred_and_forces_are_in_si_units() {
         ..ATTITUDE_QUATERNION_DATA::DEFAULT
     });
     let out = heard(&mut decoder, &quaternion, at(0.0));
-    let [HeardAutopilot { said: AutopilotSaid::Attitude(sample), .. }, rates] = out[..] else {
+    let [ReceivedAutopilot { measurement: AutopilotMeasurement::Attitude(sample), .. }, rates] = out[..]
+    else {
         panic!("{out:?}")
     };
     assert!((sample.heading.expect("told") - 2.0).abs() < 1e-6, "{sample:?}");
-    let AutopilotSaid::Inertial(rates) = rates.said else { panic!("{out:?}") };
+    let AutopilotMeasurement::Inertial(rates) = rates.measurement else { panic!("{out:?}") };
     assert!(rates.force_mps2.is_none() && (rates.rate_rps.expect("told").x - 0.3).abs() < 1e-6);
     assert_eq!(heard(&mut decoder, &attitude(100_100, 0.0), at(0.1)), []);
     let imu = MavMessage::SCALED_IMU(SCALED_IMU_DATA {
@@ -100,7 +101,7 @@ fn quaternions_are_preferred_and_forces_are_in_si_units() {
         ..SCALED_IMU_DATA::DEFAULT
     });
     let out = heard(&mut decoder, &imu, at(0.15));
-    let AutopilotSaid::Inertial(sample) = out[0].said else { panic!("{out:?}") };
+    let AutopilotMeasurement::Inertial(sample) = out[0].measurement else { panic!("{out:?}") };
     let (rate, force) = sample.rate_rps.zip(sample.force_mps2).expect("both");
     assert!((rate - Vector3::new(0.5, 0.0, 0.0)).norm() < 1e-9);
     assert!((force - Vector3::new(0.0, 0.0, -9.806_65)).norm() < 1e-9);
@@ -130,8 +131,8 @@ fn fixes_and_its_own_position() {
         ..GPS_RAW_INT_DATA::DEFAULT
     });
     let out = heard(&mut decoder, &fix, at(0.25));
-    let AutopilotSaid::Gnss(epoch) = out[0].said else { panic!("{out:?}") };
-    assert!((out[0].t - at(0.2)).abs() < Span::from_ms(1.0), "when its own clock says: {:?}", out[0].t);
+    let AutopilotMeasurement::Gnss(epoch) = out[0].measurement else { panic!("{out:?}") };
+    assert!((out[0].t - at(0.2)).abs() < Span::from_ms(1.0), "by its own clock: {:?}", out[0].t);
     assert_eq!((epoch.fix, epoch.sats), (FixKind::RtkFixed, Some(14)));
     assert_eq!(epoch.utc.map(|utc| utc.unix_ns()), Some(1_800_000_000_100_000_000));
     assert!((epoch.geoid_m.expect("told") + 27.0).abs() < 1e-9);
@@ -152,7 +153,7 @@ fn fixes_and_its_own_position() {
         ..GLOBAL_POSITION_INT_DATA::DEFAULT
     });
     let out = heard(&mut decoder, &place, at(0.5));
-    let AutopilotSaid::Position(position) = out[0].said else { panic!("{out:?}") };
+    let AutopilotMeasurement::Position(position) = out[0].measurement else { panic!("{out:?}") };
     assert_eq!((position.boot, position.alt_msl_m), (Span::from_s(100.5), 45.0));
 }
 
@@ -162,12 +163,12 @@ fn questions_for_the_time_put_its_clock_on_ours() {
     let asked = question(at(1.0));
     let answer =
         |ts1| MavMessage::TIMESYNC(TIMESYNC_DATA { tc1: 101_005_000_000, ts1, ..TIMESYNC_DATA::DEFAULT });
-    // Somebody else's is none of ours.
+    // An answer to another system's request is not ours.
     heard(&mut decoder, &answer(asked - 1), at(1.010));
     assert!(!decoder.clock().is_exchanged());
     heard(&mut decoder, &answer(asked), at(1.010));
     assert!(decoder.clock().is_exchanged());
-    // A message that took 200 ms is stamped as well as any.
+    // A message that took 200 ms is stamped as well as any other.
     let out = heard(&mut decoder, &attitude(102_000, 0.0), at(2.2));
     assert!((out[0].t - at(2.0)).abs() < Span::from_ms(0.01), "{:?}", out[0].t - at(2.0));
 }
@@ -196,7 +197,7 @@ fn values_that_cannot_be_are_refused_and_noise_is_passed_over() {
     });
     assert_eq!(heard(&mut decoder, &zero, at(0.0)), []);
     assert_eq!(decoder.counts().refused(crate::Refusal::OutOfRange), 4);
-    // A frame amid noise, in parts, one bit of another changed.
+    // A frame among noise, in parts, and with one bit of another changed.
     let good = frame(1, 1, &attitude(100_100, 0.5));
     let mut bad = good.clone();
     bad[12] ^= 1;

@@ -1,4 +1,4 @@
-//! Recordings that lack something: each is refined as far as it goes, or refused with a word.
+//! Incomplete recordings: each is refined as far as possible, or refused with a reason.
 
 use windhover_base::settings::EstimatorConfig;
 use windhover_base::time::Span;
@@ -83,7 +83,7 @@ fn several_flights_share_their_constants() {
     }
 }
 
-/// A position from outside takes the receiver's error away.
+/// With an external position the receiver's error is removed.
 #[test]
 fn with_positions_from_outside_the_place_is_theirs() {
     let flown = fly("follow", 8.0, 6, |_| {});

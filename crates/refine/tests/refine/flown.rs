@@ -1,4 +1,4 @@
-//! Simulated flights as values, what the filter makes of them, and what a refinement does.
+//! Simulated flights as values, the filter's estimates, and the refined ones.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use windhover_estimate::{Estimator, Site};
 use windhover_refine::{Recording, Refined, refine};
 use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 
-/// What is scored begins here, seconds into the flight: the filter has settled.
+/// Scores start here, seconds into the flight: the filter has settled.
 pub(super) const BURN_S: f64 = 6.0;
 
 pub(super) struct Flown {

@@ -5,7 +5,7 @@ mod flown;
 
 use flown::{Score, fly};
 
-/// From 6 s on, of a flight of 14 s with eight ground features.
+/// From 6 s on, in a flight of 14 s with eight ground features.
 #[test]
 fn a_flight_is_known_better_afterwards() {
     let flown = fly("follow", 14.0, 3, |_| {});
@@ -27,7 +27,7 @@ fn a_flight_is_known_better_afterwards() {
     assert_eq!(refined.features.1, 0);
 }
 
-/// What is grossly wrong is named, and pulls nothing.
+/// Gross errors are listed, and have no effect.
 #[test]
 fn outliers_are_named_and_do_not_pull() {
     let flown = fly("follow", 12.0, 4, |scenario| scenario.camera.marker_outlier = 0.05);
@@ -40,7 +40,7 @@ fn outliers_are_named_and_do_not_pull() {
     assert!((5..60).contains(&named), "{named} markers are named");
 }
 
-/// The mount and the compass are told where they are otherwise than configured.
+/// Mount and compass are determined where they differ from the configuration.
 #[test]
 fn a_crooked_mount_is_found() {
     let flown = fly("follow", 20.0, 5, |scenario| scenario.camera.mount_error_deg = [0.0, 1.5, 0.0]);
@@ -50,7 +50,7 @@ fn a_crooked_mount_is_found() {
         .iter()
         .find(|constant| constant.kind == windhover_refine::ConstantKind::Mount(1))
         .expect("it is estimated");
-    assert!(pitch.is_told(), "{pitch:?}");
+    assert!(pitch.is_determined(), "{pitch:?}");
     let error = (pitch.value - 1.5f64.to_radians()) / pitch.sigma;
     assert!(error.abs() < 3.0, "{pitch:?}");
 }

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::super::company::Looks;
+use super::super::company::Appearance;
 use windhover_base::settings::{Brightness, MarkerConfig, MarkerKind, TargetConfig};
 use windhover_detect::{TagLayout, TagPattern, tag_pattern};
 
@@ -112,11 +112,11 @@ impl Body {
     }
 
     /// What companion `index` looks like, beside vehicles like `target`.
-    pub(super) fn of_companion(looks: Looks, target: &TargetConfig, index: usize) -> Self {
+    pub(super) fn of_companion(looks: Appearance, target: &TargetConfig, index: usize) -> Self {
         let paint = |cell_m: f32| Some(Paint { per_m: 1.0 / cell_m, seed: 1 + index as u32 });
         match looks {
-            Looks::Double => Self::new(target),
-            Looks::Painted => {
+            Appearance::Double => Self::new(target),
+            Appearance::Painted => {
                 let bare = Self::new(&TargetConfig { marker: Vec::new(), ..target.clone() });
                 let length = target.wheelbase_m.unwrap_or(0.8) as f32;
                 Self {
@@ -124,7 +124,7 @@ impl Body {
                     ..bare.of_size((-0.35 * length, 1.45 * length), 0.43 * length, 0.55)
                 }
             }
-            Looks::Person => {
+            Appearance::Person => {
                 let bare = Self::new(&TargetConfig { marker: Vec::new(), ..target.clone() });
                 Self { paint: paint(0.08), ..bare.of_size((-0.17, 0.17), 0.24, 1.7) }
             }

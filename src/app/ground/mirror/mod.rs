@@ -16,26 +16,26 @@ use crate::io::proto::windhover as wh;
 use crate::io::store::flight::is_flight_name;
 use segment::Segment;
 
-/// File in a flight's directory that tells which run it is of.
+/// File in a flight's directory that holds the number of its run.
 pub(super) const RUN_FILE: &str = "run";
-/// The word of health messages that names the flight on the payload's card.
+/// The field of health messages that names the flight on the payload's card.
 const FLIGHT_WORD: &str = "flight";
-/// How the name of a flight without a date begins.
+/// Prefix of the name of a flight without a date.
 const UNDATED: &str = "boot-";
 /// A segment ends at this many bytes of messages.
 const SEGMENT_BYTES: u64 = 64 << 20;
-/// Segments that one payload has open at a time: of the run in the air, and of those being filled.
+/// Segments that one payload has open at a time: of the current run, and of those being filled.
 const OPEN: usize = 4;
 
-/// Why something could not be kept.
+/// Why something could not be stored.
 #[derive(Debug, thiserror::Error)]
 pub enum MirrorError {
-    /// The system refused.
+    /// The system's refusal.
     #[error("cannot write {}: {source}", path.display())]
     Io {
         /// The file or directory.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The MCAP writer refused.
@@ -43,17 +43,17 @@ pub enum MirrorError {
     Mcap {
         /// The file.
         path: PathBuf,
-        /// What it said.
+        /// Its error.
         source: mcap::McapError,
     },
-    /// The file is not there any more.
+    /// The file no longer exists.
     #[error("{} was removed while it was written", path.display())]
     Removed {
         /// The file.
         path: PathBuf,
     },
     /// More channels, or longer schemas, than any payload has.
-    #[error("{}: more channels and schemas than are kept", path.display())]
+    #[error("{}: more channels and schemas than the limit", path.display())]
     Overfull {
         /// The file.
         path: PathBuf,
@@ -71,21 +71,21 @@ pub struct OnDisk {
     pub numbers: RangeSet,
 }
 
-/// What became of what was given to a mirror since the last look.
+/// The result for what was given to a mirror since the last sync.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Kept {
     /// On the disk now.
     pub done: Vec<OnDisk>,
-    /// Not on the disk, or not any more: to be received again.
+    /// Not on the disk, or no longer there: to be received again.
     pub lost: Vec<OnDisk>,
-    /// What went wrong with the disk; it is tried again.
+    /// An error of the disk; it is tried again.
     pub trouble: Option<String>,
-    /// Payloads that sent more than is kept of any, and what of.
+    /// Payloads that sent more than the limit, and of what.
     pub excess: BTreeMap<String, String>,
 }
 
-/// Writes what arrives under one directory. It never fails: what cannot be written is told, and tried again after the
-/// next look.
+/// Writes what arrives under one directory. It never fails: what cannot be written is reported, and tried again after
+/// the next sync.
 pub struct Mirror {
     root: PathBuf,
     open: BTreeMap<(String, u32), Segment>,
@@ -101,7 +101,7 @@ fn io_error(path: &Path) -> impl FnOnce(std::io::Error) -> MirrorError + '_ {
 }
 
 impl Mirror {
-    /// Under `root`, which is made when needed.
+    /// A mirror under `root`, which is made when needed.
     ///
     /// # Errors
     /// It cannot be made.
@@ -112,11 +112,11 @@ impl Mirror {
         Ok(Self { root, open, turn: 0, done: Vec::new(), lost, trouble: None, excess })
     }
 
-    /// Keeps a record; it is on disk after the next [`Mirror::sync`] that does not tell it as lost.
+    /// Stores a record; it is on disk after the next [`Mirror::sync`] that does not report it as lost.
     pub fn keep(&mut self, arrival: &Arrival) {
         let key = (arrival.payload.to_string(), arrival.run);
         if self.trouble.is_some() {
-            // One attempt a look is enough for a disk that fails.
+            // One attempt for each sync is enough for a disk that fails.
             return self.lose(key, RangeSet::of(arrival.number, arrival.number.saturating_add(1)));
         }
         match self.write(&key, arrival) {
@@ -148,7 +148,7 @@ impl Mirror {
         segment.write(arrival)
     }
 
-    /// Ends the segment of a payload that waited longest, where it has as many open as it may.
+    /// Ends the payload's segment that was written to longest ago, where it has the most that may be open.
     fn make_room(&mut self, payload: &str) {
         let of_payload = || self.open.iter().filter(|((name, _), _)| name == payload);
         if of_payload().count() < OPEN {
@@ -167,7 +167,8 @@ impl Mirror {
         self.end(&key);
     }
 
-    /// Ends a segment that was synced, if it is open. Without its end it is one that was cut off, which readers take.
+    /// Ends a segment that was synced, if it is open. A segment without its end reads as one that was cut off, which
+    /// readers accept.
     fn end(&mut self, key: &(String, u32)) {
         if let Some(Err(error)) = self.open.remove(key).map(Segment::finish) {
             self.trouble.get_or_insert(error.to_string());
@@ -188,7 +189,7 @@ impl Mirror {
         self.trouble.get_or_insert(error.to_string());
     }
 
-    /// Brings everything to the disk, ends segments that are long enough, and tells what became of it.
+    /// Writes everything through to the disk, ends segments that are long enough, and returns the results.
     pub fn sync(&mut self) -> Kept {
         let mut done = std::mem::take(&mut self.done);
         let keys: Vec<_> = self.open.keys().cloned().collect();
@@ -227,11 +228,11 @@ impl Mirror {
     }
 }
 
-/// The name that the payload gave its flight since it knows the date, as its health tells it.
+/// The name that the payload gave its flight after it got the date, from its health messages.
 fn dated_name(health: &[u8]) -> Option<String> {
     let health = wh::Health::decode(health).ok()?;
     let name = health.words.get(FLIGHT_WORD)?;
-    // A name of somebody else's making becomes a directory here: only a flight's is one.
+    // The name comes from another machine and becomes a directory here: only names of flights are accepted.
     (is_flight_name(name) && !name.starts_with(UNDATED)).then(|| name.clone())
 }
 
@@ -243,8 +244,8 @@ pub(super) fn segments(dir: &Path) -> Vec<PathBuf> {
     files
 }
 
-/// The directory of a run: the one that has it, whatever its name has become; else named after its flight, with -2, -3, …
-/// where another run has that name already.
+/// The directory of a run: the one that has it, whatever its present name; else one named after its flight, with -2,
+/// -3, … where another run has that name.
 fn flight_dir(root: &Path, payload: &str, flight: &str, run: u32) -> PathBuf {
     let payload = root.join(payload);
     let entries = std::fs::read_dir(&payload).into_iter().flatten().flatten();
@@ -264,13 +265,13 @@ fn flight_dir(root: &Path, payload: &str, flight: &str, run: u32) -> PathBuf {
     dirs.find(of_run).expect("some number is free")
 }
 
-/// Messages of a flight's directory, as far as they are on the disk: of a segment that is being written, or was
-/// cut off, every whole chunk.
+/// Messages of a flight's directory, as far as they are on the disk: every whole chunk of a segment that is being
+/// written or was cut off.
 pub(super) fn messages(dir: &Path) -> impl Iterator<Item = RawMessage> {
     McapReader::open(dir).into_iter().flatten()
 }
 
-/// Numbers of a run that the files of earlier lives hold.
+/// Numbers of a run in the files of earlier runs of the program.
 pub fn recall(root: &Path, payload: &str, flight: &str, run: u32) -> RangeSet {
     let mut numbers = RangeSet::new();
     for message in messages(&flight_dir(root, payload, flight, run)) {
@@ -292,7 +293,7 @@ mod tests {
         let dir = tempfile::tempdir().expect("a temporary directory");
         let mut mirror = Mirror::at(dir.path()).expect("a mirror");
         mirror.keep(&arrival(7, 0));
-        // Names that are no flight's become no directory, whoever says them.
+        // A name that is not a flight's does not become a directory, whoever sends it.
         for name in ["boot-1", "../../elsewhere", "20261118T150405Z"] {
             let words = [(FLIGHT_WORD.to_owned(), name.to_owned())].into();
             let data = wh::Health { words, ..Default::default() }.encode_to_vec();
@@ -311,7 +312,7 @@ mod tests {
             .map(|entry| entry.expect("an entry").file_name())
             .collect();
         assert_eq!(names, ["20261118T150405Z"]);
-        // The payload goes on calling it by the name it began with.
+        // The payload keeps using the name with which it began.
         assert_eq!(recall(dir.path(), "alpha", "boot-1", 7).len(), 3);
         let mut again = Mirror::at(dir.path()).expect("a mirror");
         again.keep(&arrival(7, 3));
@@ -348,7 +349,7 @@ mod tests {
         let done = mirror.sync().done;
         assert_eq!(done[0].numbers.iter().collect::<Vec<_>>(), [(0, 3), (5, 6)]);
         mirror.keep(&arrival(7, 9));
-        // As after a kill: neither an end nor what was not synced.
+        // As after a kill: neither the end nor what was not synced is there.
         std::mem::forget(mirror);
         let known = recall(dir.path(), "alpha", "boot-1", 7);
         assert_eq!(known.iter().collect::<Vec<_>>(), [(0, 3), (5, 6)]);
@@ -393,10 +394,10 @@ mod tests {
         mirror.keep(&arrival(7, 3));
         mirror.keep(&arrival(7, 4));
         let kept = mirror.sync();
-        // Then what came is told as lost, with the reason, once a look.
+        // Then what came is reported as lost, with the reason, once for each sync.
         assert!(kept.done.is_empty() && kept.trouble.is_some_and(|why| why.contains("alpha")));
         assert_eq!(kept.lost[0].numbers.iter().collect::<Vec<_>>(), [(3, 5)]);
-        // When the disk is right again, then so is the mirror.
+        // When the disk works again, then so does the mirror.
         std::fs::remove_file(dir.path().join("alpha")).expect("removed");
         mirror.keep(&arrival(7, 3));
         let kept = mirror.sync();
@@ -413,7 +414,7 @@ mod tests {
         mirror.keep(&arrival(7, 1));
         let kept = mirror.sync();
         assert!(kept.done.is_empty() && kept.trouble.is_some_and(|why| why.contains("removed")));
-        assert_eq!(kept.lost[0].numbers.iter().collect::<Vec<_>>(), [(0, 2)], "also what was there before");
+        assert_eq!(kept.lost[0].numbers.iter().collect::<Vec<_>>(), [(0, 2)], "the content from before");
         mirror.keep(&arrival(7, 0));
         assert_eq!((mirror.sync().done.len(), recall(dir.path(), "alpha", "boot-1", 7).len()), (1, 1));
     }

@@ -1,4 +1,4 @@
-//! One segment of a mirrored flight: an open MCAP file, and which numbers it holds.
+//! One segment of a mirrored flight: an open MCAP file, and the numbers that it holds.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
@@ -14,7 +14,7 @@ use crate::io::link::{Arrival, Channel, RangeSet};
 use crate::io::proto::schema_of_package;
 use windhover_base::time::MonoTime;
 
-/// Channels of a segment, and bytes of their schemas; a payload has some tens of them.
+/// Most channels of a segment, and most bytes of their schemas; a payload has some tens of channels.
 const CHANNELS: usize = 2_048;
 const SCHEMA_BYTES: usize = 16 << 20;
 
@@ -22,12 +22,12 @@ const SCHEMA_BYTES: usize = 16 << 20;
 pub(super) struct Segment {
     path: PathBuf,
     writer: mcap::Writer<BufWriter<File>>,
-    /// The same file, to bring it to the disk and to tell whether it is still there.
+    /// The same file, to sync it and to check whether it still exists.
     file: File,
     channels: HashMap<(String, String), u16>,
     schema_bytes: usize,
     pub(super) bytes: u64,
-    /// When it was last written to, by the count of writes of the mirror.
+    /// When it was last written to, by the mirror's count of writes.
     pub(super) turn: u64,
     pub(super) unsynced: RangeSet,
     /// Numbers that are on the disk.
@@ -35,7 +35,7 @@ pub(super) struct Segment {
 }
 
 impl Segment {
-    /// A flight that began without a date gets its name as it has on the card; one that has a date keeps it.
+    /// A flight that began without a date gets the name that it has on the card; one that has a date keeps its name.
     pub(super) fn rename_flight(&mut self, name: &str) -> Result<(), MirrorError> {
         let (Some(dir), Some(file)) = (self.path.parent().map(Path::to_owned), self.path.file_name()) else {
             return Ok(());
@@ -59,7 +59,7 @@ impl Segment {
         let next = segments(dir).iter().filter_map(|p| p.file_stem()?.to_str()?.parse::<u32>().ok()).max();
         let path = dir.join(format!("{:06}.mcap", next.map_or(0, |last| last + 1)));
         let file = File::create_new(&path).map_err(io_error(&path))?;
-        // The names must be as durable as what is in the file.
+        // The names must be as durable as the content of the file.
         for durable in [dir, dir.parent().unwrap_or(dir)] {
             File::open(durable).and_then(|d| d.sync_all()).map_err(io_error(durable))?;
         }
@@ -126,7 +126,7 @@ impl Segment {
         Ok(id)
     }
 
-    /// Brings everything to the disk.
+    /// Writes everything through to the disk.
     pub(super) fn sync(&mut self) -> Result<RangeSet, MirrorError> {
         self.writer.flush().map_err(|source| MirrorError::Mcap { path: self.path.clone(), source })?;
         self.settle()
@@ -139,7 +139,7 @@ impl Segment {
         self.settle()
     }
 
-    /// What was handed to the system is on the disk now, under the segment's name; gives what is new there.
+    /// What was handed to the system is now on the disk, under the segment's name; returns what is new there.
     fn settle(&mut self) -> Result<RangeSet, MirrorError> {
         self.file.sync_data().map_err(io_error(&self.path))?;
         if !self.is_there() {
@@ -150,22 +150,22 @@ impl Segment {
         Ok(numbers)
     }
 
-    /// Whether the file is still the one of its name.
+    /// Whether the file still has its name.
     fn is_there(&self) -> bool {
         let identity = |there: std::fs::Metadata| (there.dev(), there.ino());
         let named = self.path.symlink_metadata().map(identity);
         named.is_ok_and(|named| self.file.metadata().is_ok_and(|file| identity(file) == named))
     }
 
-    /// Gives up a file that failed: the numbers that are not kept by it, be it that they never reached the disk or that
-    /// the file is gone. One that never held anything is removed.
+    /// Abandons a file that failed: returns the numbers that it does not hold, because they never reached the disk or
+    /// the file is gone. A file that never held anything is removed.
     pub(super) fn give_up(self) -> RangeSet {
         let there = self.is_there();
         let mut lost = self.unsynced;
         if !there {
             lost.union(&self.synced);
         } else if self.synced.is_empty() {
-            // Where it cannot be removed, it is an empty segment.
+            // Where it cannot be removed, it stays as an empty segment.
             let _ = std::fs::remove_file(&self.path);
         }
         lost

@@ -1,4 +1,4 @@
-//! Headings out of magnetic fields, for bags whose inertial samples tell no attitude.
+//! Headings from magnetic fields, for bags whose inertial samples have no attitude.
 
 use nalgebra::{UnitQuaternion, Vector3};
 
@@ -6,14 +6,16 @@ use super::super::measured::{Measured, MeasuredLog};
 use windhover_base::geo::{Geodetic, declination, ned_from_body_321, rot_x, rot_y, tilt_from_down};
 use windhover_base::time::{MonoTime, Span, UtcTime};
 
-/// Specific forces are averaged over about so long: what remains is gravity, while the helicopter does not turn or speed up.
+/// Time over which specific forces are averaged: the average is gravity while the helicopter neither turns nor
+/// accelerates.
 const AVERAGED: Span = Span::from_ns(1_000_000_000);
 
-/// Adds an attitude for every field of `topic`: tilt from the averaged specific force, heading from the field levelled by it,
-/// true by the World Magnetic Model at the first fix. Nothing is added where attitudes or forces are missing or there.
+/// Adds an attitude for every field of `topic`: tilt from the averaged specific force, heading from the field levelled
+/// by it, true by the World Magnetic Model at the first fix. Nothing is added where attitudes exist or forces are
+/// missing.
 pub(super) fn headings(log: &mut MeasuredLog, topic: &str, fields: &[(MonoTime, Vector3<f64>)]) {
     if log.measured.iter().any(|(_, what)| matches!(what, Measured::Attitude(_))) {
-        log.warnings.push(format!("magnetic fields on {topic} are not used: attitudes are told"));
+        log.warnings.push(format!("magnetic fields on {topic} are not used: the bag has attitudes"));
         return;
     }
     let place = log.measured.iter().find_map(|(t, what)| match what {
@@ -52,7 +54,7 @@ pub(super) fn headings(log: &mut MeasuredLog, topic: &str, fields: &[(MonoTime, 
     }
     if told.is_empty() {
         log.warnings.push(format!(
-            "magnetic fields on {topic} are not used: no specific force tells which way is down"
+            "magnetic fields on {topic} are not used: without specific force the vertical is not known"
         ));
     }
     told.into_iter().for_each(|(t, attitude)| log.push(t, Measured::Attitude(attitude), topic));

@@ -1,4 +1,4 @@
-//! The fields of messages as ROS 1 and ROS 2 serialise them, and the messages that are taken.
+//! The fields of messages as ROS 1 and ROS 2 serialise them, and the supported messages.
 
 use std::sync::Arc;
 
@@ -17,7 +17,7 @@ pub(super) enum Wire {
     Cdr,
 }
 
-/// A stamp further than this from when its message came is of another clock, or none.
+/// A stamp that is further than this from the arrival of its message is invalid or of another clock.
 const STAMP_WITHIN: Span = Span::from_ns(10 * NS_PER_S);
 
 /// Reads one field after another.
@@ -81,7 +81,7 @@ impl<'a> Fields<'a> {
         std::str::from_utf8(bytes.strip_suffix(&[0]).unwrap_or(bytes)).ok()
     }
 
-    /// When the message was true: its stamp, or when it came where the stamp cannot be that.
+    /// The message's time of validity: its stamp, or its arrival where the stamp is invalid.
     fn header(&mut self, came: MonoTime) -> Option<MonoTime> {
         if self.wire == Wire::Ros1 {
             self.u32()?;
@@ -113,7 +113,7 @@ pub(super) fn image(fields: &mut Fields<'_>, came: MonoTime, index: u32) -> Opti
     })
 }
 
-/// `sensor_msgs/CompressedImage` as a frame; what its words do not tell is told by its first bytes.
+/// `sensor_msgs/CompressedImage` as a frame; where its text does not name the format, its first bytes do.
 pub(super) fn compressed(fields: &mut Fields<'_>, came: MonoTime, index: u32) -> Option<FramePayload> {
     let t_exposure = fields.header(came)?;
     fields.string()?;
@@ -129,13 +129,13 @@ pub(super) fn compressed(fields: &mut Fields<'_>, came: MonoTime, index: u32) ->
 /// `sensor_msgs/NavSatFix`
 pub(super) struct NavSatFix {
     pub t: MonoTime,
-    /// −1 none, 0 a fix, 1 with corrections from satellites, 2 from the ground.
+    /// −1 no fix, 0 a fix, 1 with corrections from satellites, 2 from the ground.
     pub status: i8,
     pub lat_deg: f64,
     pub lon_deg: f64,
     /// Above the ellipsoid.
     pub altitude_m: f64,
-    /// One sigma of the horizontal position and of the height, where told.
+    /// One sigma of the horizontal position and of the height, where given.
     pub sigmas_m: Option<(f64, f64)>,
 }
 
@@ -150,7 +150,7 @@ pub(super) fn nav_sat_fix(fields: &mut Fields<'_>, came: MonoTime) -> Option<Nav
     Some(NavSatFix { t, status, lat_deg, lon_deg, altitude_m, sigmas_m })
 }
 
-/// `sensor_msgs/Imu`; what its covariances say is absent is `None`.
+/// `sensor_msgs/Imu`; fields that its covariances mark as absent are `None`.
 pub(super) struct Imu {
     pub t: MonoTime,
     /// East-north-up from the sensor's axes (forward, left, up).
@@ -174,7 +174,7 @@ pub(super) fn imu(fields: &mut Fields<'_>, came: MonoTime) -> Option<Imu> {
     Some(Imu { t, orientation, rate_rps, force_mps2 })
 }
 
-/// `sensor_msgs/MagneticField`: when, and the field in the sensor's axes (forward, left, up).
+/// `sensor_msgs/MagneticField`: its time, and the field in the sensor's axes (forward, left, up).
 pub(super) fn magnetic_field(fields: &mut Fields<'_>, came: MonoTime) -> Option<(MonoTime, Vector3<f64>)> {
     let t = fields.header(came)?;
     let field = Vector3::from(fields.f64s::<3>()?);

@@ -1,4 +1,4 @@
-//! Bags of ROS 1 and ROS 2: images as frames; fixes, inertial samples and magnetic fields as an autopilot would have told them.
+//! Bags of ROS 1 and ROS 2: images as frames; fixes, inertial samples and magnetic fields as messages of an autopilot.
 
 mod compass;
 mod fields;
@@ -29,12 +29,12 @@ struct BagMessage {
     topic: Arc<str>,
     kind: Arc<str>,
     wire: Wire,
-    /// When it came.
+    /// Its arrival.
     t: MonoTime,
     data: Vec<u8>,
 }
 
-/// What is taken of a bag.
+/// The supported kinds of messages.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 enum Kind {
     Image,
@@ -44,7 +44,7 @@ enum Kind {
 }
 
 impl Kind {
-    /// By a type's name of either ROS.
+    /// The kind by its type name in either ROS.
     fn of(name: &str) -> Option<Self> {
         Some(match name.replace("/msg/", "/").as_str() {
             "sensor_msgs/Image" | "sensor_msgs/CompressedImage" => Self::Image,
@@ -82,7 +82,7 @@ impl BagReader {
             }
             let mut files: VecDeque<PathBuf> = parts("db3")?.into();
             let first = files.pop_front().ok_or_else(|| {
-                refuse("holds no .mcap and no .db3; a compressed bag is unpacked by `ros2 bag convert`, or by zstd")
+                refuse("has no .mcap and no .db3; unpack a compressed bag with `ros2 bag convert` or zstd")
             })?;
             return Self::sqlite(&first, files);
         }
@@ -98,9 +98,9 @@ impl BagReader {
                 Ok(Self::Ros1(Box::new(Ros1Reader::new(file).map_err(|e| ImportError::io(path, e))?)))
             }
             head if head.starts_with(b"#ROSBAG") => {
-                Err(refuse("is a bag older than version 2.0: `rosbag fix` makes one"))
+                Err(refuse("is a bag older than version 2.0: convert it with `rosbag fix`"))
             }
-            _ => Err(refuse("is no bag: neither ROS 1's (#ROSBAG V2.0), nor MCAP, nor SQLite")),
+            _ => Err(refuse("is not a bag: neither ROS 1's (#ROSBAG V2.0), nor MCAP, nor SQLite")),
         }
     }
 
@@ -116,13 +116,14 @@ impl BagReader {
         let file: File = regular::open(path).map_err(|e| ImportError::io(path, e))?;
         let reader = SqliteReader::open(file).ok_or_else(|| ImportError::Bag {
             path: path.to_owned(),
-            reason: "has no tables `topics` and `messages`: it is no bag, or a damaged one".into(),
+            reason: "has no tables `topics` and `messages`: it is not a bag, or it is damaged".into(),
         })?;
         let mut log = path.as_os_str().to_owned();
         log.push("-wal");
         let mut warnings = Vec::new();
         if Path::new(&log).metadata().is_ok_and(|log| log.len() > 0) {
-            warnings.push(format!("{} was not closed: what stands in its -wal is left out", path.display()));
+            warnings
+                .push(format!("{} was not closed: the content of its -wal file is left out", path.display()));
         }
         Ok(Self::Sqlite { reader: Box::new(reader), rest, warnings })
     }
@@ -185,7 +186,7 @@ fn files_of(folder: &Path, extension: &str) -> std::io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// What a bag gave: measurements, and the topic of its images if it has any.
+/// The content of a bag: measurements, and the topic of its images if it has any.
 pub struct ImportedBag {
     /// Measurements.
     pub log: ImportedLog,
@@ -205,7 +206,7 @@ struct Told {
 /// none of a kind is named, the one with the shortest name.
 ///
 /// # Errors
-/// It is no bag, or cannot be read.
+/// It is not a bag, or cannot be read.
 pub fn read_bag(path: &Path, topics: &[String]) -> Result<ImportedBag, ImportError> {
     let mut bag = BagReader::open(path)?;
     let mut told: BTreeMap<(Kind, Arc<str>), Told> = BTreeMap::new();
@@ -220,11 +221,11 @@ pub fn read_bag(path: &Path, topics: &[String]) -> Result<ImportedBag, ImportErr
     }
     let mut log = MeasuredLog { warnings: bag.warnings(), ..MeasuredLog::default() };
     if unread > 0 {
-        log.warnings.push(format!("{} not what their type says: left out", counted(unread, "message")));
+        log.warnings.push(format!("{} do not agree with their type: left out", counted(unread, "message")));
     }
     let chosen = choose(&told, topics, &mut log.warnings);
     for name in topics.iter().filter(|name| !told.keys().any(|(_, topic)| **topic == ***name)) {
-        log.warnings.push(format!("the bag has no topic {name} of a kind that is taken"));
+        log.warnings.push(format!("the bag has no topic {name} of a supported kind"));
     }
     let mut fields = Vec::new();
     for ((_, topic), told) in told.iter_mut().filter(|(key, _)| chosen.contains(key)) {
@@ -235,9 +236,8 @@ pub fn read_bag(path: &Path, topics: &[String]) -> Result<ImportedBag, ImportErr
     }
     let images = chosen.iter().find(|(kind, _)| *kind == Kind::Image).map(|(_, topic)| Arc::clone(topic));
     if images.is_none() && log.measured.is_empty() {
-        let why =
-            log.warnings.first().map_or("no images, fixes or inertial samples are in it", String::as_str);
-        let reason = format!("holds nothing that can be used: {why}");
+        let why = log.warnings.first().map_or("it has no images, fixes or inertial samples", String::as_str);
+        let reason = format!("has nothing usable: {why}");
         return Err(ImportError::Bag { path: path.to_owned(), reason });
     }
     log.measured.sort_by_key(|(t, _)| *t);
@@ -247,10 +247,10 @@ pub fn read_bag(path: &Path, topics: &[String]) -> Result<ImportedBag, ImportErr
     Ok(ImportedBag { log: log.into_packets("ROS bag"), images, path: path.to_owned() })
 }
 
-/// Times that can be: from zero to the end of the century.
+/// Valid times: from zero to the end of the century.
 const TIMES: std::ops::Range<MonoTime> = MonoTime::from_ns(0)..MonoTime::from_ns(4_100_000_000_000_000_000);
 
-/// Times before this are no dates.
+/// Times before this are not dates.
 const YEAR_2000_NS: i64 = 946_684_800_000_000_000;
 
 fn choose(
@@ -265,7 +265,7 @@ fn choose(
             of_kind.iter().filter(|((_, t), _)| topics.iter().any(|name| **name == **t)).collect();
         let shortest = of_kind.iter().min_by_key(|((_, topic), _)| (topic.len(), Arc::clone(topic)));
         let used: Vec<_> = if named.is_empty() { shortest.into_iter().collect() } else { named };
-        // One camera makes a capture.
+        // A capture has one camera.
         let most = if kind == Kind::Image { 1 } else { used.len() };
         chosen.extend(used.into_iter().take(most).map(|(key, _)| (*key).clone()));
         for ((_, topic), told) in of_kind.iter().filter(|(key, _)| !chosen.contains(key)) {
@@ -279,7 +279,7 @@ fn choose(
     chosen
 }
 
-/// Half a turn about the axis between north and east: north-east-down of east-north-up.
+/// Half a turn about the axis between north and east: north-east-down from east-north-up.
 fn ned_from_enu() -> UnitQuaternion<f64> {
     let half = std::f64::consts::FRAC_1_SQRT_2;
     UnitQuaternion::from_quaternion(Quaternion::new(0.0, half, half, 0.0))
@@ -300,7 +300,7 @@ fn take(kind: Kind, message: &BagMessage, told: &mut Told) -> Option<()> {
         Kind::Image => {}
         Kind::Fix => {
             let fix = fields::nav_sat_fix(&mut fields, message.t)?;
-            // A figure that is none is no fix's.
+            // A fix without finite values is not used.
             if fix.lat_deg.is_finite() && fix.lon_deg.is_finite() {
                 told.measured.push((fix.t, Measured::Fix(of_ros(&fix))));
             }
@@ -323,7 +323,7 @@ fn take(kind: Kind, message: &BagMessage, told: &mut Told) -> Option<()> {
     Some(())
 }
 
-/// `NavSatFix` tells the height above the ellipsoid alone: it stands for both heights, as over a geoid of zero.
+/// `NavSatFix` has only the height above the ellipsoid: it is used for both heights, as with a geoid of zero.
 fn of_ros(fix: &fields::NavSatFix) -> Fix {
     let height = Some(fix.altitude_m).filter(|height| height.is_finite());
     let kind = match (fix.status, height) {

@@ -1,4 +1,4 @@
-//! ROS 1's bags, version 2.0 (<http://wiki.ros.org/Bags/Format/2.0>), record by record; whole or cut off.
+//! ROS 1's bags, version 2.0 (<http://wiki.ros.org/Bags/Format/2.0>), record by record; complete or cut off.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -9,10 +9,10 @@ use super::{BagMessage, Wire};
 use windhover_base::time::{MonoTime, NS_PER_S};
 
 pub(super) const MAGIC: &[u8] = b"#ROSBAG V2.0\n";
-/// Longest header of a record, record, and unpacked chunk that are believed.
+/// Largest accepted header of a record, record, and unpacked chunk.
 const MOST_HEADER: u32 = 1 << 16;
 const MOST_DATA: u32 = 1 << 28;
-/// Connections that are believed.
+/// Most accepted connections.
 const MOST_CONNECTIONS: usize = 4096;
 
 const OP_MESSAGE: u8 = 2;
@@ -26,7 +26,7 @@ type Connection = (Arc<str>, Arc<str>);
 pub(super) struct Ros1Reader {
     input: BufReader<File>,
     left: u64,
-    /// The chunk being read, and how far.
+    /// The chunk being read, and the position in it.
     chunk: Option<(Vec<u8>, usize)>,
     connections: HashMap<u32, Connection>,
     pub warnings: Vec<String>,
@@ -63,7 +63,7 @@ impl<'a> Head<'a> {
     }
 }
 
-/// Header and data of the record at the begin of these bytes, and how long it is.
+/// Header and data of the record at the start of these bytes, and its length.
 fn split(bytes: &[u8]) -> Option<(Head<'_>, &[u8], usize)> {
     let sized = |bytes: &[u8]| Some(u32::from_le_bytes(*bytes.first_chunk::<4>()?) as usize);
     let header = sized(bytes)?;
@@ -74,7 +74,7 @@ fn split(bytes: &[u8]) -> Option<(Head<'_>, &[u8], usize)> {
 }
 
 impl Ros1Reader {
-    /// Of a file whose first line was looked at.
+    /// A reader of a file whose first line was checked.
     pub(super) fn new(file: File) -> std::io::Result<Self> {
         let left = file.metadata()?.len().saturating_sub(MAGIC.len() as u64);
         let mut input = BufReader::with_capacity(1 << 16, file);
@@ -155,7 +155,7 @@ impl Ros1Reader {
 /// The records of a chunk.
 fn unpack(head: &Head<'_>, data: Vec<u8>) -> Result<Vec<u8>, String> {
     let compression = head.text("compression").unwrap_or_default();
-    let size = head.u32("size").filter(|size| *size <= MOST_DATA).ok_or("its size is not believed")?;
+    let size = head.u32("size").filter(|size| *size <= MOST_DATA).ok_or("its size is not plausible")?;
     let mut records = Vec::new();
     let most = u64::from(size);
     match &*compression {
@@ -167,7 +167,7 @@ fn unpack(head: &Head<'_>, data: Vec<u8>) -> Result<Vec<u8>, String> {
             .take(most)
             .read_to_end(&mut records)
             .map_err(|error| error.to_string())?,
-        other => return Err(format!("compressed as {other:?}, which is not read here")),
+        other => return Err(format!("compressed as {other:?}, which is not supported")),
     };
     Ok(records)
 }

@@ -1,5 +1,5 @@
-//! ROS 2's bags of the storage `sqlite3`: the two tables that they are, out of SQLite's file format
-//! (<https://www.sqlite.org/fileformat2.html>), read only, without its library.
+//! ROS 2's bags in the storage `sqlite3`: their two tables, read from SQLite's file format
+//! (<https://www.sqlite.org/fileformat2.html>) without its library.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -10,9 +10,9 @@ use super::{BagMessage, Wire};
 use windhover_base::time::MonoTime;
 
 pub(super) const MAGIC: &[u8] = b"SQLite format 3\0";
-/// Trees are not deeper: each level holds hundreds of times the one below.
+/// Deepest tree: each level holds hundreds of times the one below.
 const DEPTH: usize = 12;
-/// Longest row that is believed.
+/// Longest accepted row.
 const MOST_ROW: usize = 1 << 28;
 
 /// A value of a row.
@@ -55,15 +55,15 @@ pub(super) struct SqliteReader {
     pub warnings: Vec<String>,
 }
 
-/// A walk over the leaves of a table: pages from the root down, each with the cell that is next.
+/// A walk over the leaves of a table: pages from the root down, each with its next cell.
 #[derive(Default)]
 struct Walk {
     path: Vec<(Vec<u8>, u32, usize)>,
-    /// Pages that may still be visited: a damaged tree may lead in circles.
+    /// Pages that may still be visited: a damaged tree may have cycles.
     left: u32,
 }
 
-/// SQLite's integers of up to nine bytes; gives how many.
+/// SQLite's integers of up to nine bytes; also returns their length.
 fn varint(bytes: &[u8]) -> Option<(u64, usize)> {
     let mut value = 0u64;
     for (k, byte) in bytes.iter().take(9).enumerate() {
@@ -109,7 +109,7 @@ impl Pages {
         Some(page)
     }
 
-    /// The row of a leaf's cell, with what overflows into other pages.
+    /// The row of a leaf's cell, including its overflow pages.
     fn row(&self, page: &[u8], cell: usize) -> Option<(i64, Vec<u8>)> {
         let (length, a) = varint(page.get(cell..)?)?;
         let (id, b) = varint(page.get(cell + a..)?)?;
@@ -215,7 +215,7 @@ impl Walk {
 }
 
 impl SqliteReader {
-    /// Of a file whose first bytes were looked at; `None` where it has no tables of a bag.
+    /// A reader of a file whose first bytes were checked; `None` where it does not have the tables of a bag.
     pub(super) fn open(file: File) -> Option<Self> {
         let pages = Pages::open(file)?;
         let roots = roots(&pages);
@@ -254,7 +254,7 @@ impl SqliteReader {
     }
 }
 
-/// Where tables begin, by name.
+/// The root pages of the tables, by name.
 fn roots(pages: &Pages) -> HashMap<String, u32> {
     let mut roots = HashMap::new();
     let mut walk = Walk::from(pages, 1);

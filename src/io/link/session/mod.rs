@@ -1,4 +1,4 @@
-//! The payload's side of one connection: greeting, control, the judge of its path.
+//! The payload's side of one connection: greeting, control, assessment of its path.
 
 mod send;
 mod wanted;
@@ -22,7 +22,7 @@ use wanted::Wanted;
 
 /// Longest a greeting may take.
 const GREETING: Duration = Duration::from_secs(20);
-/// How often the path is judged.
+/// How often the path is assessed.
 const JUDGE: Duration = Duration::from_millis(100);
 
 /// What the tasks of a session share.
@@ -56,7 +56,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Serves a station until the connection ends; tells why it did. `up` is called when both have greeted.
+/// Serves a station until the connection ends; returns the reason. `up` is called when both sides have greeted.
 pub(super) async fn serve(shared: &Arc<PayloadShared>, peer: &Peer, up: impl Fn()) -> Ended {
     let connection = peer.connection.clone();
     let outcome = match tokio::time::timeout(GREETING, greet(shared, &connection)).await {
@@ -72,7 +72,7 @@ pub(super) async fn serve(shared: &Arc<PayloadShared>, peer: &Peer, up: impl Fn(
 
 type Greeted = (SendStream, Reader, pb::StationHello);
 
-/// The control stream is opened by whoever called; both sides greet at once.
+/// The control stream is opened by the side that connected; both sides greet at once.
 async fn greet(shared: &Arc<PayloadShared>, connection: &Connection) -> Result<Greeted, WireError> {
     let ended = |e: quinn::ConnectionError| WireError::Ended(e.to_string());
     let (mut out, input) = match connection.side() {
@@ -138,12 +138,12 @@ async fn run(
 }
 
 impl Session {
-    /// Judges the path, accounts for what was sent beyond what was foreseen, tells how it does.
+    /// Assesses the path, accounts for bytes sent beyond the estimate, publishes the state.
     async fn judge(&self) -> Result<(), WireError> {
         let sent = |stats: &quinn::ConnectionStats| {
             stats.udp_tx.bytes as f64 + stats.udp_tx.datagrams as f64 * self.headers
         };
-        // The handshake counts under the ceiling; as to the path, it is over.
+        // The handshake counts under the ceiling; for the path it is over.
         let mut accounted = sent(&self.connection.stats());
         if let Some(bucket) = &self.shared.ceiling {
             lock(bucket).charge(accounted);
@@ -177,7 +177,7 @@ impl Session {
         }
     }
 
-    /// What the station says.
+    /// Handles the station's messages.
     async fn listen(&self, mut control: Reader) -> Result<(), WireError> {
         while let Some(message) = control.next::<pb::ToPayload>().await? {
             match message.body {
@@ -208,7 +208,7 @@ impl Session {
         }
     }
 
-    /// The control stream to the station: channel numbers, and once a second how far the run is.
+    /// The control stream to the station: channel numbers, and once a second the state of the run.
     async fn speak(
         &self,
         mut out: SendStream,

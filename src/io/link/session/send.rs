@@ -1,4 +1,4 @@
-//! What a session sends by itself: live datagrams, back-fill, thumbnails, in this order of urgency.
+//! What a session sends: live datagrams, back-fill, thumbnails, in this order of priority.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -10,26 +10,26 @@ use tokio::time::Instant;
 
 use super::{JUDGE, Session, lock};
 use crate::io::link::live::LiveQueue;
-use crate::io::link::pace::Way;
+use crate::io::link::pace::Priority;
 use crate::io::link::wire::{self, WireError};
 use crate::io::proto::link::{self as pb, to_station};
 use crate::io::records::{Record, Schema};
 
 /// QUIC's short header, connection id, packet number, tag and frame header of one datagram, bytes.
 const QUIC_OVERHEAD: f64 = 1.0 + 8.0 + 2.0 + 16.0 + 3.0;
-/// Back-fill is written in portions that take a slow path this long, so that live data never waits longer,
+/// Back-fill is written in portions that take this long on a slow path, so that live data never waits longer,
 const PORTION_S: f64 = 0.03;
 /// and on a path where a packet takes less, in portions of a packet
 const PACKET: f64 = 1_100.0;
-/// or of this long.
+/// or of this duration.
 const PORTION_FAST_S: f64 = 0.002;
 
-/// The shortest wait: what the runtime's timer can tell apart.
+/// The shortest wait: the resolution of the runtime's timer.
 const TIMER: Duration = Duration::from_millis(1);
 
 impl Session {
-    /// The channel number of a record, and its announcement where the station has not had it on this path
-    /// (`with_schema`: on the back-fill stream, where the schema goes along unless the station has it).
+    /// The channel number of a record, and its announcement where the station has not received it on this path
+    /// (`with_schema`: on the back-fill stream, where the schema is included unless the station has it).
     fn channel(&self, record: &Record, with_schema: bool) -> (u32, Option<pb::Channel>) {
         let key = (record.topic.to_string(), record.schema.name());
         let mut table = lock(&self.table);
@@ -60,7 +60,7 @@ impl Session {
     }
 
     /// Time until something may be sent.
-    fn delay(&self, way: Way) -> Duration {
+    fn delay(&self, way: Priority) -> Duration {
         let now = Instant::now();
         let own = lock(&self.governor).delay(way, now);
         let ceiling = self.shared.ceiling.as_ref();
@@ -82,7 +82,7 @@ impl Session {
         }
     }
 
-    /// Live datagrams: the newest of what is most urgent, whenever something may be sent.
+    /// Live datagrams: the newest of the most urgent records, whenever something may be sent.
     pub(super) async fn live(&self, mut news: watch::Receiver<u32>) -> Result<(), WireError> {
         let mut queue = LiveQueue::default();
         let mut seen = self.shared.recent.end().saturating_sub(64);
@@ -101,9 +101,9 @@ impl Session {
                 changed.await.map_err(|_| WireError::Ended("the program ends".into()))?;
                 continue;
             }
-            let delay = self.delay(Way::Live);
+            let delay = self.delay(Priority::Live);
             if !delay.is_zero() {
-                // A newer estimate may come meanwhile and take the place of the one that waits.
+                // A newer estimate may arrive meanwhile and replace the waiting one.
                 let _ = tokio::time::timeout(delay, changed).await;
                 continue;
             }
@@ -136,11 +136,11 @@ impl Session {
         }
     }
 
-    /// Waits until nothing live waits, the path answers, and something may be sent.
+    /// Waits until no live record waits, the path answers, and something may be sent.
     async fn low_turn(&self) {
         loop {
             let cut = lock(&self.governor).is_cut();
-            let delay = self.delay(Way::Low);
+            let delay = self.delay(Priority::Low);
             if !cut && delay.is_zero() && !self.live_waits.load(Ordering::Relaxed) {
                 return;
             }
@@ -155,11 +155,11 @@ impl Session {
         ((rate * PORTION_S).min(PACKET).max(rate * PORTION_FAST_S) as usize).clamp(200, 32 << 10)
     }
 
-    /// Sends again what the station misses, on one stream below all live data.
+    /// Sends the station's missing records, on one stream with lower priority than all live data.
     pub(super) async fn backfill(&self) -> Result<(), WireError> {
         let ended = |e: String| WireError::Ended(e);
         let mut stream = self.connection.open_uni().await.map_err(|e| ended(e.to_string()))?;
-        // The stream cannot be gone: it was opened just now.
+        // The stream exists: it was just opened.
         let _ = stream.set_priority(-1);
         stream.write_all(&[wire::KIND_BACKFILL]).await.map_err(|e| ended(e.to_string()))?;
         loop {
@@ -185,7 +185,7 @@ impl Session {
         }
     }
 
-    /// The messages that answer `first..end` as far as `found` goes, and the end of what they answer.
+    /// The messages that answer `first..end` as far as `found` goes, and the end of the answered range.
     fn portion_of(&self, run: u32, first: u32, end: u32, found: &[(u32, Arc<Record>)]) -> (Vec<u8>, u32) {
         let mut bytes = Vec::new();
         let mut put = |body| bytes.extend(pb::Backfill { body: Some(body) }.encode_length_delimited_to_vec());

@@ -1,4 +1,4 @@
-//! What a station asked for again, and what of it already went.
+//! The station's requests, and which of them were already sent.
 
 use std::collections::BTreeMap;
 
@@ -6,20 +6,20 @@ use crate::io::link::backlog::Extent;
 use crate::io::link::ranges::RangeSet;
 use crate::io::proto::link as pb;
 
-/// Ranges a station may ask for at once; more would only be sent again.
+/// Most ranges that a station may request at once; more would only repeat records.
 const WANT_LIMIT: usize = 1_024;
 
-/// What the station asked for, and what already went on a stream of this connection (which QUIC delivers).
+/// The requested numbers, and those already sent on a stream of this connection (which QUIC delivers).
 #[derive(Default)]
 pub(super) struct Wanted {
     open: BTreeMap<u32, RangeSet>,
     sent: BTreeMap<u32, RangeSet>,
-    /// First number held of each run, and one more than the last.
+    /// The first existing number of each run, and one more than the last.
     there: BTreeMap<u32, (u32, u32)>,
 }
 
 impl Wanted {
-    /// Replaces what was asked for; `there` is what the payload holds.
+    /// Replaces the request; `there` is what the payload has.
     pub(super) fn replace(&mut self, ranges: &[pb::Range], there: &[Extent]) {
         self.there = there.iter().map(|extent| (extent.run, (extent.first, extent.end))).collect();
         self.open.clear();
@@ -40,25 +40,25 @@ impl Wanted {
         self.open.iter().find_map(|(run, set)| set.iter().next().map(|(first, end)| (*run, first, end)))
     }
 
-    /// They went on the stream.
+    /// These were sent on the stream.
     pub(super) fn done(&mut self, run: u32, first: u32, end: u32) {
         if let Some(open) = self.open.get_mut(&run) {
             open.remove_range(first, end);
         }
-        // Only what there is: that numbers are nobody's may be said again, and to remember it has no limit.
+        // Only existing numbers are remembered: unknown ones can be requested without limit.
         if let Some((held, held_end)) = self.there.get(&run) {
             self.sent.entry(run).or_default().insert_range(first.max(*held), end.min(*held_end));
         }
     }
 
-    /// They cannot be answered now; the station asks again.
+    /// They cannot be answered now; the station requests them again.
     pub(super) fn postpone(&mut self, run: u32, first: u32, end: u32) {
         if let Some(open) = self.open.get_mut(&run) {
             open.remove_range(first, end);
         }
     }
 
-    /// How many are still to be sent.
+    /// Number of records still to be sent.
     pub(super) fn count(&self) -> u64 {
         self.open.values().map(RangeSet::len).sum()
     }
@@ -82,7 +82,7 @@ mod tests {
         wanted.postpone(3, 4, 8);
         assert_eq!((wanted.first(), wanted.count()), (Some((3, 8, 10)), 2));
         wanted.replace(&[range(0, 10)], &there);
-        assert_eq!(wanted.first(), Some((3, 4, 10)), "asked for again");
+        assert_eq!(wanted.first(), Some((3, 4, 10)), "requested again");
     }
 
     #[test]
@@ -90,7 +90,7 @@ mod tests {
         let mut wanted = Wanted::default();
         let there = [Extent { run: 3, flight: "boot-3".into(), first: 50_000, end: 50_010 }];
         for n in 0..10_000 {
-            // Runs that never were, and numbers before what is held, each apart from the others.
+            // Runs that never existed, and numbers before the existing ones, each apart from the others.
             let asked = [pb::Range { run: n + 4, first: 2 * n, end: 2 * n + 1 }, range(2 * n, 2 * n + 1)];
             wanted.replace(&asked, &there);
             while let Some((run, first, end)) = wanted.first() {

@@ -1,5 +1,5 @@
-//! Code words of OpenCV's ArUco dictionaries (facts it publishes), cells row by row, first in the top bit. The smaller
-//! dictionaries are the first words of these.
+//! Code words of OpenCV's ArUco dictionaries (published facts), cells row by row, the first in the highest bit. The
+//! smaller dictionaries are the first words of these.
 
 /// 16 bits.
 #[rustfmt::skip]

@@ -1,4 +1,4 @@
-//! Code words of tagCircle21h7 (facts published by AprilRobotics), cells row by row, first in the top bit.
+//! Code words of tagCircle21h7 (facts published by AprilRobotics), cells row by row, the first in the highest bit.
 
 /// 21 bits, minimum distance 7.
 #[rustfmt::skip]

@@ -1,4 +1,5 @@
-//! Code words of ArUco's MIP_36h12 as OpenCV orders their bits (facts it publishes), cells row by row, first in the top bit.
+//! Code words of ArUco's MIP_36h12 with OpenCV's order of bits (published facts), cells row by row, the first in the
+//! highest bit.
 
 /// 36 bits, minimum distance 12.
 #[rustfmt::skip]

@@ -1,4 +1,4 @@
-//! Families of square tags: their names, how their cells lie, and their code words.
+//! Families of square tags: their names, the layout of their cells, and their code words.
 //!
 //! A family is a file of code words beside this one and a row in the table below.
 
@@ -15,45 +15,44 @@ mod tag41h12;
 mod tag48h12;
 mod tag52h13;
 
-/// How the tags of a family are made.
+/// Layout and code words of a family.
 ///
-/// A tag is a grid of unit cells. Its border, the square that is found in an image, is `border` cells on a
-/// side; around it lies a ring of the other colour.
+/// A tag is a grid of unit cells. Its border, the square that is detected in an image, is `border` cells on a side; a
+/// ring of the other colour surrounds it.
 #[derive(Clone, Copy, Debug)]
 pub struct FamilySpec {
     /// Name in configuration and files.
     pub name: &'static str,
     /// Cells of the border on a side.
     pub border: usize,
-    /// Cells of the print around the border: 1, or more where data cells lie outside the ring.
+    /// Cells of the print around the border: 1, or more where data cells are outside the ring.
     pub pad: usize,
-    /// Which of the cells inside the border and outside the ring hold data.
+    /// Which of the cells inside the border and outside the ring are data cells.
     pub form: Form,
     /// Whether the border is light and the ring dark.
     pub inverted: bool,
     /// Most wrong bits that may be corrected.
     ///
-    /// With N codes of n bits, a random grid matches within h errors in one of four turns with probability
-    /// about `4 N Σ C(n, k) / 2ⁿ`. The limits keep that below 2·10⁻⁴ save for 16h5, whose 2·10⁻³ at h = 0 is
-    /// what its few bits allow.
+    /// With N codes of n bits, a random grid matches within h errors in one of four turns with probability about `4 N Σ
+    /// C(n, k) / 2ⁿ`. The limits keep that below 2·10⁻⁴ except for 16h5, whose few bits allow no better than 2·10⁻³ at
+    /// h = 0.
     pub correctable: u8,
     /// Code word of each tag, data cells row by row, the first in the highest bit.
     pub codes: &'static [u64],
 }
 
-/// Which of the cells inside the border and outside the ring hold data.
+/// Which of the cells inside the border and outside the ring are data cells.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Form {
     /// All of them.
     Square,
     /// All but four in the middle, where another tag may be.
     Nested,
-    /// Those whose middle is in a circle: at most half a cell's length more from the print's middle, squared and in
-    /// cells, than the outermost row.
+    /// Those whose centre is in a circle: its squared radius in cells is that of the outermost row plus half a cell.
     Round,
 }
 
-/// Words of eight bytes, the lowest first.
+/// Words of eight bytes, little-endian.
 const fn words<const N: usize>(bytes: &[u8]) -> [u64; N] {
     let (chunks, mut words, mut k) = (bytes.as_chunks().0, [0; N], 0);
     while k < N {
@@ -63,7 +62,7 @@ const fn words<const N: usize>(bytes: &[u8]) -> [u64; N] {
     words
 }
 
-/// The enum, its list and the lookup of its specifications, out of one row a family.
+/// The enum, its list and the lookup of its specifications, from one row for each family.
 macro_rules! families {
     ($($(#[$about:meta])* $variant:ident, $text:literal, $codes:expr,
        $form:ident border $border:literal pad $pad:literal inverted $inverted:literal correctable $correctable:literal;)*) => {
@@ -77,7 +76,7 @@ macro_rules! families {
             /// Every family.
             pub const ALL: [Self; [$($text),*].len()] = [$(Self::$variant),*];
 
-            /// How its tags are made.
+            /// Layout and code words of its tags.
             pub const fn spec(self) -> &'static FamilySpec {
                 match self {
                     $(Self::$variant => {
@@ -150,7 +149,7 @@ impl TagFamily {
         self.spec().name
     }
 
-    /// How many tags it has.
+    /// Number of its tags.
     pub const fn codes(self) -> usize {
         self.spec().codes.len()
     }
@@ -159,8 +158,8 @@ impl TagFamily {
 impl std::str::FromStr for TagFamily {
     type Err = String;
 
-    /// Names are taken as AprilTag and OpenCV write them too: `tagStandard41h12`, `DICT_4X4_50`. Of `4x4`, all that
-    /// there are.
+    /// Names are also accepted in the form of AprilTag and OpenCV: `tagStandard41h12`, `DICT_4X4_50`. `4x4` means all
+    /// tags of that size.
     fn from_str(name: &str) -> Result<Self, String> {
         let plain = |name: &str| {
             let name = name.to_ascii_lowercase().replace('_', "");
@@ -170,7 +169,7 @@ impl std::str::FromStr for TagFamily {
         let wanted = plain(name);
         let known = |wanted: &str| Self::ALL.into_iter().find(|family| plain(family.name()) == wanted);
         known(&wanted).or_else(|| known(&format!("{wanted}1000"))).ok_or_else(|| {
-            format!("{name:?} is no tag family; known are {}", Self::ALL.map(Self::name).join(", "))
+            format!("{name:?} is not a tag family; the families are {}", Self::ALL.map(Self::name).join(", "))
         })
     }
 }

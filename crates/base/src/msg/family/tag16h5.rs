@@ -1,4 +1,4 @@
-//! Code words of tag16h5 (facts published by AprilRobotics), cells row by row, first in the top bit.
+//! Code words of tag16h5 (facts published by AprilRobotics), cells row by row, the first in the highest bit.
 
 /// 16 bits, minimum distance 5.
 #[rustfmt::skip]

@@ -1,4 +1,4 @@
-//! Code words of tag25h9 (facts published by AprilRobotics), cells row by row, first in the top bit.
+//! Code words of tag25h9 (facts published by AprilRobotics), cells row by row, the first in the highest bit.
 
 /// 25 bits, minimum distance 9.
 #[rustfmt::skip]

@@ -1,4 +1,4 @@
-//! Code words of tag36h11 (facts published by AprilRobotics), cells row by row, first in the top bit.
+//! Code words of tag36h11 (facts published by AprilRobotics), cells row by row, the first in the highest bit.
 
 /// 36 bits, minimum distance 11.
 #[rustfmt::skip]

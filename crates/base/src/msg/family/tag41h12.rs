@@ -1,4 +1,4 @@
-//! Code words of tagStandard41h12 (facts published by AprilRobotics), cells row by row, first in the top bit.
+//! Code words of tagStandard41h12 (facts published by AprilRobotics), cells row by row, the first in the highest bit.
 
 /// 41 bits, minimum distance 12.
 #[rustfmt::skip]

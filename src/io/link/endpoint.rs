@@ -1,4 +1,4 @@
-//! The UDP port of the link: lets peers in that show a certificate, and throws out who was revoked.
+//! The UDP port of the link: admits peers with a valid certificate, and disconnects those that were revoked.
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -17,20 +17,20 @@ use super::tls::{Identity, KeyFiles, peer_certificate, refusal};
 
 /// Longest a handshake may take.
 pub(super) const CALL: Duration = Duration::from_secs(4);
-/// Handshakes under way above which a caller must first prove its address.
+/// With more handshakes in progress than this, a caller must first prove its address.
 const BUSY: usize = 8;
-/// How often the key files are looked at.
+/// How often the key files are checked for changes.
 const KEYS_WATCH: Duration = Duration::from_secs(5);
-/// Longest wait, at the end, until the peers were told.
+/// Longest wait at the end until the close has been sent to the peers.
 const GOODBYE: Duration = Duration::from_millis(300);
 
 /// One side's UDP port.
 #[derive(Clone)]
-pub struct Door {
+pub struct LinkEndpoint {
     pub(super) endpoint: Endpoint,
     pub(super) role: Role,
     files: KeyFiles,
-    /// When the files were last written, as of just before they were read.
+    /// Modification times of the files just before they were read.
     stamps: Vec<Option<std::time::SystemTime>>,
     identity: Arc<Mutex<Arc<Identity>>>,
     pub(super) events: Events,
@@ -38,8 +38,8 @@ pub struct Door {
     open: Arc<Mutex<BTreeMap<usize, Connection>>>,
 }
 
-impl Door {
-    /// Opens the port. Peers that got in come out of the receiver, for [`Door::run`].
+impl LinkEndpoint {
+    /// Opens the port. Admitted peers come out of the receiver, for [`LinkEndpoint::run`].
     pub fn open(
         role: Role,
         files: &KeyFiles,
@@ -60,7 +60,7 @@ impl Door {
         let endpoint = Endpoint::new(config, server, socket, Arc::new(quinn::TokioRuntime))
             .map_err(|source| LinkError::Bind { address, source })?;
         let (arrivals, receiver) = mpsc::channel(16);
-        let door = Self {
+        let link_endpoint = Self {
             endpoint,
             role,
             files: files.clone(),
@@ -70,10 +70,10 @@ impl Door {
             arrivals,
             open: Arc::default(),
         };
-        Ok((door, receiver))
+        Ok((link_endpoint, receiver))
     }
 
-    /// The port it has.
+    /// The local address of the port.
     pub fn local_addr(&self) -> std::io::Result<SocketAddr> {
         self.endpoint.local_addr()
     }
@@ -82,8 +82,8 @@ impl Door {
         Arc::clone(&self.identity.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// Lets peers in, calls those of `dial` and watches the key files until `stop` says so (or its sender is
-    /// gone); each peer that came is given to `welcome`, whose future is its session.
+    /// Admits peers, connects to those of `dial` and watches the key files until `stop` is set (or its sender is gone);
+    /// each admitted peer is passed to `welcome`, whose future is its session.
     pub(super) async fn run<F, S>(
         self,
         dial: Vec<String>,
@@ -110,14 +110,14 @@ impl Door {
                 Some(_) = tasks.join_next() => {}
             }
         }
-        // Ends every connection and waits, briefly, until the peers were told.
+        // Closes every connection and waits, briefly, until the close has been sent.
         self.endpoint.close(VarInt::from_u32(close::BYE), b"the program ends");
         let _ = tokio::time::timeout(GOODBYE, self.endpoint.wait_idle()).await;
     }
 
-    /// Lets peers in, until the port is closed.
+    /// Admits peers, until the port is closed.
     async fn listen(self) {
-        // They end with this task: a port that is given up is free at once.
+        // They end with this task, so the port is free at once when it is closed.
         let mut underway = JoinSet::new();
         while let Some(incoming) = self.endpoint.accept().await {
             while underway.try_join_next().is_some() {}
@@ -126,7 +126,7 @@ impl Door {
                 let _ = incoming.retry();
                 continue;
             }
-            let door = self.clone();
+            let link_endpoint = self.clone();
             underway.spawn(async move {
                 let address = incoming.remote_address();
                 let outcome = match incoming.accept() {
@@ -138,22 +138,22 @@ impl Door {
                 };
                 match outcome {
                     Ok(connection) => {
-                        let _ = door.greet(connection).await;
+                        let _ = link_endpoint.greet(connection).await;
                     }
-                    Err(e) => door.events.refused(address, refusal(&e).0),
+                    Err(e) => link_endpoint.events.refused(address, refusal(&e).0),
                 }
             });
         }
     }
 
-    /// Checks the role in the peer's certificate and hands the peer on.
+    /// Checks the role in the peer's certificate and passes the peer on.
     pub(super) async fn greet(&self, connection: Connection) -> Option<Peer> {
         let known = peer_certificate(&connection).and_then(|der| peer_of(&der));
         let name = match known {
             Some((role, name)) if role == self.role.peer() => name,
             _ => {
                 connection.close(VarInt::from_u32(close::WRONG_ROLE), b"certificate of another role");
-                let why = format!("refused: its certificate is not a {}'s", self.role.peer().name());
+                let why = format!("refused: its certificate is not that of a {}", self.role.peer().name());
                 self.events.refused(connection.remote_address(), why);
                 return None;
             }
@@ -167,7 +167,7 @@ impl Door {
         Some(peer)
     }
 
-    /// Reads the key files again when they change: a revoked peer is out within seconds.
+    /// Reads the key files again when they change: a revoked peer is disconnected within seconds.
     async fn watch_keys(self) {
         let mut seen = self.stamps.clone();
         loop {

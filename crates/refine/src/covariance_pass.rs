@@ -1,4 +1,4 @@
-//! A pass with covariances: the whole problem opened backward, what is left over of each measurement, and the estimates.
+//! A pass with covariances: the whole problem opened backward, the residual of each measurement, and the estimates.
 
 use std::collections::BTreeMap;
 
@@ -12,22 +12,22 @@ use crate::front::Back;
 use crate::noise::Components;
 use crate::problem::{Origin, Pass, Problem};
 use crate::recording::Recording;
-use crate::solve::{Factors, What};
-use crate::told::{Constant, Outlier, Refined, Tally};
+use crate::result::{Constant, Outlier, Refined, Tally};
+use crate::solve::{EliminatedKind, Factors};
 use crate::unknowns::{Prior, knot};
 use crate::values::Values;
 
-/// What a pass with covariances finds.
-pub(crate) struct Looked {
+/// Result of a pass with covariances.
+pub(crate) struct PassResult {
     pub(crate) components: Components,
     pub(crate) refined: Refined,
-    /// How long errors of pixels last.
+    /// Correlation of pixel errors from frame to frame.
     pub(crate) memory: PixelMemory,
-    /// Of each landmark: sightings, and those outside the gate.
+    /// For each landmark: detections, and those outside the gate.
     pub(crate) landmarks: Vec<(usize, usize)>,
 }
 
-/// Opens the whole problem backward: covariances, what is left over of each measurement, and the estimates.
+/// Opens the whole problem backward: covariances, the residual of each measurement, and the estimates.
 pub(crate) fn look(
     pass: &mut Pass<'_>,
     factors: &Factors,
@@ -35,9 +35,9 @@ pub(crate) fn look(
     noise: &Noise,
     site: &Site,
     recordings: &[Recording],
-) -> Looked {
+) -> PassResult {
     let problem = pass.problem;
-    let mut looked = Looked {
+    let mut looked = PassResult {
         components: Components::new(problem.targets, problem.plan.windows),
         refined: Refined::default(),
         memory: PixelMemory::default(),
@@ -48,9 +48,9 @@ pub(crate) fn look(
     for (what, e) in factors.steps.iter().rev() {
         back.solve_with_covariance(e);
         match what {
-            What::Constants => looked.refined.constants = constants(problem, values, &back),
-            What::Landmark(_) => {}
-            What::Knot(k) => {
+            EliminatedKind::Constants => looked.refined.constants = constants(problem, values, &back),
+            EliminatedKind::Landmark(_) => {}
+            EliminatedKind::Knot(k) => {
                 let stop = &problem.plan.stops[*k];
                 pass.blocks(*k, values, noise, &mut |origin: Origin, block: &Block| {
                     looked.take(origin, block, &back, problem, (*k, noise), &mut counts);
@@ -72,7 +72,7 @@ pub(crate) fn look(
     looked
 }
 
-impl Looked {
+impl PassResult {
     fn take(
         &mut self,
         origin: Origin,
@@ -106,10 +106,10 @@ impl Looked {
     }
 }
 
-/// How long errors of markers' pixels last, from what is left over of a marker in neighbouring frames.
+/// Correlation of pixel errors, from the residuals of a marker in neighbouring frames.
 ///
-/// A lens that is a little off, or an edge that is located a little to one side, errs alike in all frames. Trajectories hardly
-/// feel it; constants, which gather thousands of pixels, would be told far too well.
+/// A slightly wrong lens, or an edge that is located slightly to one side, has the same error in all frames.
+/// Trajectories hardly depend on it; constants, which combine thousands of pixels, would get far too small sigmas.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PixelMemory {
     last: BTreeMap<MarkerId, (usize, Vec<f64>)>,
@@ -117,7 +117,7 @@ pub(crate) struct PixelMemory {
     alone: f64,
 }
 
-/// Most that errors which last make of a variance.
+/// Largest factor of correlated errors on a variance.
 const MOST_INFLATION: f64 = 100.0;
 
 impl PixelMemory {
@@ -132,8 +132,8 @@ impl PixelMemory {
         self.last.insert(marker, (k, left.to_vec()));
     }
 
-    /// By what factor variances of what is constant are larger than white errors would make them, `(1 + ρ)/(1 − ρ)` with the
-    /// correlation ρ from frame to frame.
+    /// Factor on the variances of constants relative to white errors, `(1 + ρ)/(1 − ρ)` with the correlation ρ from
+    /// frame to frame.
     pub(crate) fn inflation(&self) -> f64 {
         if self.alone <= 0.0 {
             return 1.0;

@@ -1,8 +1,8 @@
-//! A door of the station: so many visitors at a time, and none for long that says nothing.
+//! Admission of clients to a port of the station: a limited number at a time, and a silent client does not stay long.
 //!
-//! Who is answered keeps the place. Who is not (a connection that is only opened, or asks word by word) has to leave
-//! after [`ASKING`], and at once where places are short. A failed accept (no descriptors left) ends nothing: it is told
-//! and tried again.
+//! A client that has been answered keeps its place. A client that has not (a connection that only opened, or sends its
+//! question slowly) is closed after [`ASKING`], and at once where places are needed. A failed accept (out of file
+//! descriptors) ends nothing: it is reported and tried again.
 
 use std::collections::VecDeque;
 use std::io;
@@ -20,25 +20,25 @@ use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 
 use crate::app::events::OperatorEvent;
 
-/// Visitors at a time; each costs a descriptor and some ten kilobytes.
+/// Clients at a time; each costs a descriptor and some ten kilobytes.
 const PLACES: usize = 128;
-/// How long a visitor has for a question.
+/// How long a client has for its question.
 const ASKING: Duration = Duration::from_secs(10);
-/// How long a visitor who was answered may stay without another word to or from him.
+/// How long an answered client may stay without further traffic.
 const STAYING: Duration = Duration::from_secs(120);
-/// How long one may listen who hears nothing: a year.
+/// How long a listening client may stay without traffic: a year.
 const LISTENING: Duration = Duration::from_secs(365 * 86_400);
 /// Pause after a connection could not be accepted.
 const PAUSE: Duration = Duration::from_millis(500);
 
-/// One visitor's place.
+/// One client's place.
 #[derive(Debug)]
 struct Place {
     answered: AtomicBool,
     leave: CancellationToken,
 }
 
-/// Places that are taken, in the order in which they were.
+/// The taken places, in order of arrival.
 #[derive(Clone, Debug, Default)]
 struct Places(Arc<Mutex<VecDeque<Arc<Place>>>>);
 
@@ -47,7 +47,7 @@ impl Places {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A place, if need be that of the one who has waited longest without an answer.
+    /// Takes a place, if needed that of the client that has waited longest without an answer.
     fn take(&self) -> Option<Arc<Place>> {
         let mut taken = self.taken();
         if taken.len() >= PLACES {
@@ -60,28 +60,28 @@ impl Places {
     }
 }
 
-/// Where visitors come in.
+/// Accepts the clients of one port.
 #[derive(Debug)]
-pub(super) struct Door {
+pub(super) struct ClientListener {
     listener: TcpListener,
-    /// What it leads to, for the operator.
+    /// What the port serves, for the operator.
     name: &'static str,
     places: Places,
 }
 
-impl Door {
-    /// The door to `name`.
+impl ClientListener {
+    /// Admits clients to `name`.
     pub(super) fn new(listener: TcpListener, name: &'static str) -> Self {
         Self { listener, name, places: Places::default() }
     }
 
-    /// The next visitor who gets a place.
-    pub(super) async fn next(&mut self) -> (Visitor, SocketAddr) {
+    /// The next client that gets a place.
+    pub(super) async fn next(&mut self) -> (ClientStream, SocketAddr) {
         loop {
             match self.listener.accept().await {
                 Ok((stream, address)) => match self.places.take() {
-                    Some(place) => return (Visitor::new(stream, place, self.places.clone()), address),
-                    None => self.tell(&format!("{address} is turned away: {PLACES} visitors are here")),
+                    Some(place) => return (ClientStream::new(stream, place, self.places.clone()), address),
+                    None => self.tell(&format!("{address} is refused: {PLACES} clients are connected")),
                 },
                 Err(error) => {
                     self.tell(&format!("cannot accept a connection: {error}"));
@@ -96,11 +96,11 @@ impl Door {
     }
 }
 
-impl axum::serve::Listener for Door {
-    type Io = Visitor;
+impl axum::serve::Listener for ClientListener {
+    type Io = ClientStream;
     type Addr = SocketAddr;
 
-    async fn accept(&mut self) -> (Visitor, SocketAddr) {
+    async fn accept(&mut self) -> (ClientStream, SocketAddr) {
         self.next().await
     }
 
@@ -109,9 +109,9 @@ impl axum::serve::Listener for Door {
     }
 }
 
-/// A visitor's connection. It fails when the visitor has to leave.
+/// A client's connection. It fails when the client has to leave.
 #[derive(Debug)]
-pub(super) struct Visitor {
+pub(super) struct ClientStream {
     stream: TcpStream,
     place: Arc<Place>,
     places: Places,
@@ -119,13 +119,13 @@ pub(super) struct Visitor {
     limit: Pin<Box<Sleep>>,
 }
 
-impl Visitor {
+impl ClientStream {
     fn new(stream: TcpStream, place: Arc<Place>, places: Places) -> Self {
         let leave = Box::pin(place.leave.clone().cancelled_owned());
         Self { stream, place, places, leave, limit: Box::pin(tokio::time::sleep(ASKING)) }
     }
 
-    /// The visitor only listens, and may do so for as long as he takes what he is given.
+    /// The client only listens, and may do so for as long as it takes what it is sent.
     pub(super) fn listens(&mut self) {
         self.stays(LISTENING);
     }
@@ -135,23 +135,23 @@ impl Visitor {
         self.limit.as_mut().reset(Instant::now() + long);
     }
 
-    /// Whether the visitor has to leave now.
+    /// Whether the client has to leave now.
     fn has_to_leave(&mut self, context: &mut Context<'_>) -> Option<io::Error> {
         if self.leave.as_mut().poll(context).is_ready() {
             return Some(io::Error::new(io::ErrorKind::ConnectionAborted, "the place is needed"));
         }
         let over = self.limit.as_mut().poll(context).is_ready();
-        over.then(|| io::Error::new(io::ErrorKind::TimedOut, "nothing was said"))
+        over.then(|| io::Error::new(io::ErrorKind::TimedOut, "nothing was received"))
     }
 }
 
-impl Drop for Visitor {
+impl Drop for ClientStream {
     fn drop(&mut self) {
         self.places.taken().retain(|place| !Arc::ptr_eq(place, &self.place));
     }
 }
 
-impl AsyncRead for Visitor {
+impl AsyncRead for ClientStream {
     fn poll_read(
         self: Pin<&mut Self>,
         context: &mut Context<'_>,
@@ -165,13 +165,13 @@ impl AsyncRead for Visitor {
     }
 }
 
-impl AsyncWrite for Visitor {
+impl AsyncWrite for ClientStream {
     fn poll_write(self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         let me = self.get_mut();
         let written = Pin::new(&mut me.stream).poll_write(context, bytes);
         match written {
             Poll::Ready(Ok(_)) => me.stays(STAYING),
-            // One who takes nothing any more holds a place as well as one who says nothing.
+            // A client that stops reading holds a place as much as one that sends nothing.
             Poll::Pending => {
                 if let Some(error) = me.has_to_leave(context) {
                     return Poll::Ready(Err(error));
@@ -201,17 +201,17 @@ mod tests {
     async fn who_says_nothing_makes_room_for_who_comes() {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("an address");
-        let mut door = Door::new(listener, "page");
+        let mut listener = ClientListener::new(listener, "page");
         // Given all places taken by connections that are only opened.
         let (mut silent, mut inside) = (Vec::new(), Vec::new());
         for _ in 0..PLACES {
             silent.push(TcpStream::connect(address).await.expect("connected"));
-            inside.push(door.next().await.0);
+            inside.push(listener.next().await.0);
         }
-        // When the first is answered and one more comes, then the second has to leave, and who came is inside.
+        // When the first is answered and one more comes, then the second has to leave, and the new one is admitted.
         inside[0].write_all(b"answer").await.expect("written");
         let mut late = TcpStream::connect(address).await.expect("connected");
-        let (mut visitor, _) = door.next().await;
+        let (mut visitor, _) = listener.next().await;
         late.write_all(b"question").await.expect("written");
         let mut heard = [0; 8];
         visitor.read_exact(&mut heard).await.expect("asked");
@@ -219,9 +219,9 @@ mod tests {
         assert_eq!(left.kind(), io::ErrorKind::ConnectionAborted);
         silent[0].write_all(b"more").await.expect("written");
         assert_eq!(inside[0].read(&mut heard).await.expect("still inside"), 4);
-        // When visitors go, then their places are free.
+        // When clients leave, then their places are free.
         inside.clear();
         drop(visitor);
-        assert!(door.places.taken().is_empty());
+        assert!(listener.places.taken().is_empty());
     }
 }

@@ -1,29 +1,29 @@
-//! One reading of what a device tells in several sentences.
+//! One reading from several sentences of a device.
 //!
-//! Plain NMEA tells heading, pitch and roll apart, and the heading in up to four ways (HDG, HDM, HDT, THS).
-//! Sentences of one burst make one reading: a sentence that is there already begins the next, and so does the
-//! one that was seen to follow the longest silence. A device that tells a whole attitude in a sentence of its
-//! own repeats it in the others: those say nothing more.
+//! Plain NMEA has heading, pitch and roll in separate sentences, and the heading in up to four forms (HDG, HDM, HDT,
+//! THS). The sentences of one burst make one reading. A repeated sentence begins the next reading, and so does the
+//! sentence that was seen to follow the longest silence. A device with a sentence for the whole attitude repeats it in
+//! the others, which then add nothing.
 
-use super::reading::{CompassReading, HeardAttitude, heard};
+use super::reading::{CompassReading, ReceivedAttitude, heard};
 use crate::burst::Cycle;
 use crate::counts::DecodeCounts;
 use crate::lines::LineSpan;
 use crate::sentence::Sentence;
 use windhover_base::time::{MonoTime, Span};
 
-/// Silence after which an open reading is given out.
+/// Silence after which an open reading is output.
 const QUIET: Span = Span::from_ns(300_000_000);
-/// Sentences after a whole attitude that only repeat it: more than any burst has.
+/// Most sentences after a whole attitude that only repeat it: more than any burst has.
 const AFTER_WHOLE: u32 = 16;
-/// Kinds of sentences remembered; no device sends more.
+/// Most kinds of sentences that are remembered; no device sends more.
 const KEYS_MAX: usize = 16;
-/// A mean silence before a burst: at least so long, and so many times that before any other sentence.
+/// A mean silence before a burst: at least this long, and this many times that before any other sentence.
 const BEGIN: (f64, f64) = (5.0, 2.0);
-/// How much one silence counts in the mean.
+/// Weight of one silence in the mean.
 const SILENCE_SHARE: f64 = 0.2;
 
-/// Which sentence a part is of, and of which angles.
+/// The sentence of a part, and its angles.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) struct Key {
     address: [u8; 6],
@@ -39,7 +39,7 @@ impl Key {
     }
 }
 
-/// Which heading is taken where there are several: measured before derived from it.
+/// Which heading is used where there are several: measured ones before derived ones.
 fn rank(sentence: &Sentence<'_>) -> u8 {
     match sentence.formatter() {
         Some("HPR") => 0,
@@ -50,7 +50,7 @@ fn rank(sentence: &Sentence<'_>) -> u8 {
     }
 }
 
-/// A reading being put together.
+/// A reading in progress.
 #[derive(Clone, Debug)]
 struct Draft {
     reading: CompassReading,
@@ -60,11 +60,11 @@ struct Draft {
     last: LineSpan,
 }
 
-/// Puts readings together.
+/// Combines sentences to readings.
 #[derive(Clone, Debug)]
-pub(super) struct Together {
+pub(super) struct ReadingAssembler {
     draft: Option<Draft>,
-    /// Sentences of the reading just given out.
+    /// Sentences of the reading that was output last.
     done: Vec<Key>,
     cycle: Cycle<Key>,
     /// Mean silence before each sentence, milliseconds.
@@ -73,7 +73,7 @@ pub(super) struct Together {
     since_whole: u32,
 }
 
-impl Default for Together {
+impl Default for ReadingAssembler {
     fn default() -> Self {
         Self {
             draft: None,
@@ -86,14 +86,14 @@ impl Default for Together {
     }
 }
 
-impl Together {
-    /// A sentence of the device's own: an attitude as it stands.
+impl ReadingAssembler {
+    /// A sentence of the device's own: a complete attitude.
     pub(super) fn whole(
         &mut self,
         reading: CompassReading,
         span: LineSpan,
         counts: &mut DecodeCounts,
-        out: &mut Vec<HeardAttitude>,
+        out: &mut Vec<ReceivedAttitude>,
     ) {
         self.draft = None;
         self.since_whole = 0;
@@ -108,7 +108,7 @@ impl Together {
         sentence: &Sentence<'_>,
         span: LineSpan,
         counts: &mut DecodeCounts,
-        out: &mut Vec<HeardAttitude>,
+        out: &mut Vec<ReceivedAttitude>,
     ) {
         if self.since_whole < AFTER_WHOLE {
             self.since_whole += 1;
@@ -131,15 +131,15 @@ impl Together {
         }
     }
 
-    /// Time passed: gives out an open reading the device has fallen silent after.
-    pub(super) fn tick(&mut self, now: MonoTime, counts: &mut DecodeCounts, out: &mut Vec<HeardAttitude>) {
+    /// Time has passed: outputs an open reading after which the device has fallen silent.
+    pub(super) fn tick(&mut self, now: MonoTime, counts: &mut DecodeCounts, out: &mut Vec<ReceivedAttitude>) {
         if self.draft.as_ref().is_some_and(|draft| now - draft.last.t_last >= QUIET) {
             self.close(counts, out);
         }
     }
 
     /// The open reading ends because another begins, or the stream ends.
-    pub(super) fn close(&mut self, counts: &mut DecodeCounts, out: &mut Vec<HeardAttitude>) {
+    pub(super) fn close(&mut self, counts: &mut DecodeCounts, out: &mut Vec<ReceivedAttitude>) {
         if let Some(draft) = &self.draft {
             self.cycle.ended(&draft.keys);
             self.give_out(counts, out);
@@ -147,7 +147,7 @@ impl Together {
         self.done.clear();
     }
 
-    fn give_out(&mut self, counts: &mut DecodeCounts, out: &mut Vec<HeardAttitude>) {
+    fn give_out(&mut self, counts: &mut DecodeCounts, out: &mut Vec<ReceivedAttitude>) {
         if let Some(mut draft) = self.draft.take() {
             draft.reading.flagged &= draft.reading.heading_deg.is_none();
             out.push(heard(draft.reading, draft.first, draft.last, counts));

@@ -1,27 +1,27 @@
-//! A word with a receiver before its line is read: send, and listen for a while.
+//! A dialogue with a receiver before its line is read: send, and listen for a while.
 
 use super::{Line, READ_BYTES, SerialSettings, left};
 use crate::io::clock::HostClock;
 use crate::io::device::{Fault, NoteKind, Report, Reports, wait_for};
 use windhover_base::time::Span;
 
-/// How long a receiver has to say something: it speaks once a second, or answers at once.
+/// How long a receiver has to send something: it sends once a second, or answers at once.
 const LISTEN: Span = Span::from_ns(1_500_000_000);
 
 /// The line while its speed is settled.
-pub(super) struct Talk<'a> {
+pub(super) struct Dialogue<'a> {
     pub(super) line: &'a mut Line,
     pub(super) settings: &'a SerialSettings,
     pub(super) clock: HostClock,
     pub(super) reports: Reports<'a>,
 }
 
-impl Talk<'_> {
+impl Dialogue<'_> {
     pub(super) async fn send(&mut self, bytes: &[u8]) -> Result<(), Fault> {
         self.line.write(bytes).await
     }
 
-    /// Reads the line for a while; whether `enough` was read.
+    /// Reads the line for a while; returns whether `enough` was satisfied.
     pub(super) async fn listen(&mut self, enough: impl Fn(&[u8]) -> bool + Send) -> Result<bool, Fault> {
         let limit = self.clock.now() + LISTEN;
         let (mut heard, mut buffer) = (Vec::new(), vec![0; READ_BYTES]);
@@ -37,7 +37,7 @@ impl Talk<'_> {
         }
     }
 
-    /// Tells the operator that something was, or was not, configured.
+    /// Notifies the operator that something was, or was not, configured.
     pub(super) fn note(&self, is_done: bool, text: String) {
         let kind = if is_done { NoteKind::Configured } else { NoteKind::NotConfigured };
         (self.reports)(Report::Note(kind, 1, text));

@@ -1,4 +1,4 @@
-//! First values: what the filter makes of the flight.
+//! Initial values: the filter's estimates of the flight.
 
 use nalgebra::{UnitQuaternion, Vector3};
 
@@ -7,37 +7,42 @@ use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::{MonoTime, Span};
 use windhover_estimate::{Estimator, Site};
 
-use crate::recording::{Heard, Recording};
+use crate::recording::{Measured, Recording};
 use crate::unknowns::knot;
 use crate::values::Knot;
 
-/// The filter's own state is asked for so often, s.
+/// Period of the filter's own states, s.
 const STEP_S: f64 = 0.1;
-/// And so long before what was heard last: by then late measurements are in.
+/// How far behind the last event they are requested: by then late measurements are included.
 const BEHIND: Span = Span::from_ns(300_000_000);
 
-/// What the filter made of one flight.
+/// The filter's result for one flight.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct First {
+pub(crate) struct InitialValues {
     /// In order of time, each instant once.
     pub(crate) own: Vec<Ownship>,
     /// Of each target, where it was tracked, in order of time.
     pub(crate) targets: Vec<Vec<TargetEstimate>>,
     pub(crate) felt: Option<FeltTilt>,
-    /// Why the filter began again, and when.
+    /// Why and when the filter was reset.
     pub(crate) resets: Vec<(MonoTime, String)>,
 }
 
 /// Runs the filter over a recording.
-pub(crate) fn filtered(rig: &Rig, estimator: &EstimatorConfig, site: &Site, recording: &Recording) -> First {
+pub(crate) fn filtered(
+    rig: &Rig,
+    estimator: &EstimatorConfig,
+    site: &Site,
+    recording: &Recording,
+) -> InitialValues {
     let mut filter = Estimator::new(rig, estimator, site);
-    let mut first = First { targets: vec![Vec::new(); rig.target.len()], ..First::default() };
+    let mut first = InitialValues { targets: vec![Vec::new(); rig.target.len()], ..InitialValues::default() };
     let (mut out, mut asked) = (Vec::new(), None);
     for heard in recording.in_order() {
         match heard {
-            Heard::Epoch(epoch) => filter.gnss(epoch, &mut out),
-            Heard::Reading(sample) => filter.attitude(sample, &mut out),
-            Heard::Frame(frame) => filter.frame(frame, &mut out),
+            Measured::Epoch(epoch) => filter.gnss(epoch, &mut out),
+            Measured::Reading(sample) => filter.attitude(sample, &mut out),
+            Measured::Frame(frame) => filter.frame(frame, &mut out),
         }
         let t = heard.t_recv();
         filter.tick(t, &mut out);
@@ -55,7 +60,7 @@ pub(crate) fn filtered(rig: &Rig, estimator: &EstimatorConfig, site: &Site, reco
     first
 }
 
-impl First {
+impl InitialValues {
     fn take(&mut self, out: &mut Vec<EstimatorOutput>, t: MonoTime) {
         for said in out.drain(..) {
             match said {
@@ -73,7 +78,7 @@ impl First {
         }
     }
 
-    /// From when to when the helicopter is known.
+    /// The time span in which the helicopter's state is known.
     pub(crate) fn span(&self) -> Option<(MonoTime, MonoTime)> {
         Some((self.own.first()?.t_valid, self.own.last()?.t_valid))
     }

@@ -1,4 +1,4 @@
-//! What is told of one vehicle in one round, in the units of the filter: what every message is made of.
+//! The content of one vehicle's messages in one round, in the units of the filter.
 
 use nalgebra::{UnitQuaternion, Vector3};
 
@@ -9,49 +9,50 @@ use super::motion;
 
 /// One vehicle in one round of messages.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub struct Told {
+pub struct VehicleReport {
     /// Moment of sending, since the autopilot's start where its clock is known, else since the program's.
     pub now: Span,
     /// The state at the moment of sending.
     pub state: TargetState,
-    /// Latitude and longitude then, degrees: in the autopilot's own position where that is known.
+    /// Latitude and longitude at that time, degrees: relative to the autopilot's own position where that is known.
     pub place_deg: (f64, f64),
-    /// Altitude of the ground it stands on above mean sea level, metres; likewise.
+    /// Altitude of the ground under it above mean sea level, metres; likewise.
     pub alt_msl_m: f64,
-    /// One-sigma of that place, metres: relative to the helicopter where it is in the autopilot's own position.
+    /// One-sigma of that position, metres: relative to the helicopter where it derives from the autopilot's own
+    /// position.
     pub sigma_m: f64,
-    /// How its speed changes, m/s².
+    /// Rate of its speed, m/s².
     pub rate_mps2: f64,
     /// Reported point, metres ahead of the rear axle.
     pub reference_m: f64,
-    /// Whether it is in sight: else predicted.
+    /// Whether it is in sight; otherwise predicted.
     pub seen: bool,
     /// Its number among the targets, from 0.
     pub number: u8,
-    /// Where it was seen from the helicopter; `None` where the helicopter's own state then is not known.
+    /// Its detection from the helicopter; `None` where the helicopter's own state at that time is not known.
     pub sighting: Option<Sighting>,
     /// Edge of its largest marker, metres.
     pub size_m: f64,
-    /// Where its markers are in the latest frame, as shares of the picture: left, top, right, bottom.
+    /// Box of its markers in the latest frame, as shares of the picture: left, top, right, bottom.
     pub in_picture: Option<[f32; 4]>,
 }
 
-/// A vehicle from the helicopter, at the time of a frame.
+/// A vehicle relative to the helicopter, at the time of a frame.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Sighting {
-    /// Exposure of the frame, on the clock of [`Told::now`].
+    /// Exposure of the frame, on the clock of [`VehicleReport::now`].
     pub at: Span,
     /// From the body frame's origin to the vehicle's reported point, north, east, down, metres.
     pub offset_ned_m: Vector3<f64>,
     /// Attitude of the helicopter.
     pub ned_from_body: UnitQuaternion<f64>,
-    /// The vehicle's heading then, radians.
+    /// The vehicle's heading at that time, radians.
     pub heading_rad: f64,
     /// One-sigma of the offset, horizontally and down, metres.
     pub sigma_m: (f64, f64),
 }
 
-impl Told {
+impl VehicleReport {
     /// Velocity of the reported point, north, east, down, m/s.
     pub fn velocity(&self) -> Vector3<f64> {
         motion::velocity(&self.state, self.reference_m)
@@ -68,7 +69,7 @@ impl Told {
         [2, 3, 4].map(|i| p.map_or(0.0, |p| p[(i, i)].max(0.0).sqrt()))
     }
 
-    /// Whether every figure is one that can be sent.
+    /// Whether every value is finite.
     pub fn is_finite(&self) -> bool {
         let s = &self.state;
         let (lat, lon) = self.place_deg;

@@ -1,4 +1,4 @@
-//! What goes out as MAVLink, and when: frames out of the pipeline's outputs. No sockets here, and no clock.
+//! Which MAVLink frames are sent, and when: frames from the pipeline's outputs, without sockets and clock.
 
 use mavlink::dialects::development::{MavMessage, MavType};
 
@@ -13,18 +13,18 @@ use windhover_base::time::{MonoTime, Span, UtcTime};
 use super::camera::Camera;
 use super::helicopter::Helicopter;
 use super::packet::{self, Sender, Signature, SigningKey};
-use super::told::{Sighting, Told};
-use super::vehicle::{Limits, Said, Vehicle};
+use super::report::{Sighting, VehicleReport};
+use super::vehicle::{Limits, Reportable, Vehicle};
 use super::{messages, motion};
 
 /// MAV_COMP_ID_AUTOPILOT1: ground stations draw vehicles for this component only.
 const VEHICLE: u8 = 1;
 /// MAV_COMP_ID_CAMERA.
 pub(super) const CAMERA: u8 = 100;
-/// Heartbeats, as the protocol wants them.
+/// Period of heartbeats, as the protocol requires.
 const HEARTBEAT_EVERY: Span = Span::from_ns(1_000_000_000);
 
-/// One target, and how far its system id has counted.
+/// One target, with the sequence number of its system id.
 #[derive(Clone, Debug)]
 struct System {
     vehicle: Vehicle,
@@ -33,13 +33,13 @@ struct System {
     markers: Vec<MarkerId>,
     in_picture: Option<[f32; 4]>,
     sequence: u8,
-    /// Another system uses its id: until then nothing is sent of it.
+    /// Another system uses its id: until this time nothing is sent of the target.
     stands_back: Option<MonoTime>,
 }
 
-/// Makes MAVLink's frames out of what the pipeline says.
+/// Makes MAVLink frames from the pipeline's outputs.
 #[derive(Debug)]
-pub struct Teller {
+pub struct MavlinkEncoder {
     config: MavlinkConfig,
     systems: Vec<System>,
     limits: Limits,
@@ -57,8 +57,8 @@ pub struct Teller {
     stamp: u64,
 }
 
-impl Teller {
-    /// As configured, for these targets over this ground, seen by this camera.
+impl MavlinkEncoder {
+    /// For this configuration: these targets over this ground, seen by this camera.
     pub fn new(
         config: &MavlinkConfig,
         targets: &[TargetConfig],
@@ -98,7 +98,7 @@ impl Teller {
         }
     }
 
-    /// Takes what it needs of the pipeline's outputs.
+    /// Takes the outputs that it needs.
     pub fn output(&mut self, output: &Output) {
         match output {
             Output::Estimator(EstimatorOutput::Estimate(estimate) | EstimatorOutput::Coasted(estimate)) => {
@@ -130,7 +130,7 @@ impl Teller {
         }
     }
 
-    /// How often [`Self::tell`] is to be called: at the rate of positions, and at that of heartbeats at least.
+    /// Period for calls of [`Self::tell`]: the rate of positions, and at least that of heartbeats.
     pub fn every(&self) -> Span {
         self.period.min(HEARTBEAT_EVERY)
     }
@@ -140,28 +140,28 @@ impl Teller {
         self.config.system_id.saturating_add(u8::try_from(index).unwrap_or(u8::MAX))
     }
 
-    /// UTC at `now`, where a receiver told it.
+    /// UTC at `now`, where a receiver reported it.
     pub fn utc(&self, now: MonoTime) -> Option<UtcTime> {
         let unix_ns = self.utc_from_host_ns.map(|ahead| now.ns().saturating_add(ahead));
         unix_ns.map(UtcTime::from_unix_ns)
     }
 
-    /// Says nothing of a target until `until`: another system has its id.
+    /// Sends nothing of a target until `until`: another system has its id.
     pub fn stand_back(&mut self, index: usize, until: MonoTime) {
         if let Some(system) = self.systems.get_mut(index) {
             system.stands_back = Some(until);
         }
     }
 
-    /// Appends the frames that are due at `now`: heartbeats once a second, and the state of every vehicle of which
-    /// something may be said (`vehicle.rs`); call it as often as [`Self::every`] says. Signed messages wait until the
-    /// receiver told UTC, for signatures carry the time.
+    /// Appends the frames that are due at `now`: heartbeats once a second, and the state of every vehicle with a state
+    /// that may be sent (`vehicle.rs`); called with the period of [`Self::every`]. Signed messages wait until the
+    /// receiver has reported UTC, because signatures contain the time.
     pub fn tell(&mut self, now: MonoTime, out: &mut Vec<Vec<u8>>) {
         self.started.get_or_insert(now);
         if self.key.is_some() && self.utc(now).is_none() {
             return;
         }
-        // A round that comes a little early is this one's all the same.
+        // A call that comes a little early counts for this period.
         let early = Span::from_s(0.5 * self.every().s());
         let due = |last: Option<MonoTime>, period| last.is_none_or(|last| now - last + early >= period);
         let (beat, positions) = (due(self.heartbeat, HEARTBEAT_EVERY), due(self.positions, self.period));
@@ -172,12 +172,12 @@ impl Teller {
             if self.systems[index].stands_back.is_some_and(|until| now < until) {
                 continue;
             }
-            let said = self.systems[index].vehicle.said(now, &self.limits);
+            let reportable = self.systems[index].vehicle.reportable(now, &self.limits);
             if beat {
-                self.put(index, &messages::heartbeat(status(&said)), now, out);
+                self.put(index, &messages::heartbeat(status(&reportable)), now, out);
             }
-            if let Some(told) = self.told(index, &said, now).filter(|_| positions) {
-                self.put_state(index, &told, now, out);
+            if let Some(report) = self.report(index, &reportable, now).filter(|_| positions) {
+                self.put_state(index, &report, now, out);
             }
         }
         self.heartbeat = if beat { Some(now) } else { self.heartbeat };
@@ -190,9 +190,9 @@ impl Teller {
         self.helicopter.on_its_clock(t).unwrap_or(since)
     }
 
-    /// What is told of a vehicle at `now`; `None` where nothing may be.
-    fn told(&self, index: usize, said: &Said, now: MonoTime) -> Option<Told> {
-        let (Said::Seen(t, state) | Said::Predicted(t, state)) = said else { return None };
+    /// The content of a vehicle's messages at `now`; `None` where nothing may be sent.
+    fn report(&self, index: usize, reportable: &Reportable, now: MonoTime) -> Option<VehicleReport> {
+        let (Reportable::Seen(t, state) | Reportable::Predicted(t, state)) = reportable else { return None };
         let (system, frame) = (&self.systems[index], self.frame.as_ref()?);
         let rate_mps2 = system.vehicle.rate_mps2();
         let at_now = motion::ahead(state, rate_mps2, system.reference_m, now - *t);
@@ -204,7 +204,7 @@ impl Teller {
         let absolute = at_now.covariance.map_or(0.0, |p| p[(0, 0)].max(p[(1, 1)]).max(0.0).sqrt());
         let heard = difference.is_some_and(|(_, fresh)| fresh);
         let relative = state.relative_sigma_m.filter(|_| heard);
-        let told = Told {
+        let report = VehicleReport {
             now: self.since_start(now),
             state: at_now,
             place_deg: (place.lat_deg, place.lon_deg),
@@ -215,13 +215,13 @@ impl Teller {
             sigma_m: relative.unwrap_or(absolute),
             rate_mps2,
             reference_m: system.reference_m,
-            seen: matches!(said, Said::Seen(..)),
+            seen: matches!(reportable, Reportable::Seen(..)),
             number: u8::try_from(index).unwrap_or(u8::MAX),
             sighting: self.sighting(*t, state, down),
             size_m: system.size_m,
             in_picture: system.in_picture,
         };
-        told.is_finite().then_some(told)
+        report.is_finite().then_some(report)
     }
 
     fn sighting(&self, t: MonoTime, state: &TargetState, down: f64) -> Option<Sighting> {
@@ -237,39 +237,39 @@ impl Teller {
     }
 
     /// Altitude of the ground under a vehicle above mean sea level: of level ground as configured, else by the geoid,
-    /// higher or lower by what the terrain is there. Where the receiver tells no geoid, the height above the ellipsoid
-    /// stands in.
+    /// plus the terrain's difference there. Where the receiver reports no geoid, the height above the ellipsoid is
+    /// used.
     fn ground_msl_m(&self, state: &TargetState, frame: &LocalFrame) -> f64 {
         let datum_m = frame.datum().height_m;
         let level = self.elevation_msl_m.unwrap_or_else(|| datum_m - self.geoid_m.unwrap_or(0.0));
         level + state.height_m - datum_m
     }
 
-    fn put_state(&mut self, index: usize, told: &Told, now: MonoTime, out: &mut Vec<Vec<u8>>) {
+    fn put_state(&mut self, index: usize, report: &VehicleReport, now: MonoTime, out: &mut Vec<Vec<u8>>) {
         use MavlinkMessage as M;
-        let down_m = self.frame.map_or(0.0, |frame| frame.datum().height_m - told.state.height_m);
+        let down_m = self.frame.map_or(0.0, |frame| frame.datum().height_m - report.state.height_m);
         let landing = self.config.landing_frame;
         for kind in self.config.messages.clone() {
-            let seen = told.sighting.as_ref().filter(|_| told.seen);
+            let seen = report.sighting.as_ref().filter(|_| report.seen);
             match kind {
-                M::GlobalPositionInt => self.put(index, &messages::global_position_int(told), now, out),
-                M::Attitude => self.put(index, &messages::attitude(told), now, out),
-                M::FollowTarget => self.put(index, &messages::follow_target(told), now, out),
-                M::Odometry => self.put(index, &messages::odometry(told, down_m), now, out),
-                M::TargetAbsolute => self.put_camera(&messages::target_absolute(told), now, out),
+                M::GlobalPositionInt => self.put(index, &messages::global_position_int(report), now, out),
+                M::Attitude => self.put(index, &messages::attitude(report), now, out),
+                M::FollowTarget => self.put(index, &messages::follow_target(report), now, out),
+                M::Odometry => self.put(index, &messages::odometry(report, down_m), now, out),
+                M::TargetAbsolute => self.put_camera(&messages::target_absolute(report), now, out),
                 M::TargetRelative => {
-                    let message = seen.map(|seen| messages::target_relative(told, seen));
+                    let message = seen.map(|seen| messages::target_relative(report, seen));
                     message.into_iter().for_each(|message| self.put_camera(&message, now, out));
                 }
                 M::LandingTarget => {
-                    let message = seen.map(|seen| messages::landing_target(told, seen, landing));
+                    let message = seen.map(|seen| messages::landing_target(report, seen, landing));
                     message.into_iter().for_each(|message| self.put_camera(&message, now, out));
                 }
                 M::CameraTrackingGeoStatus if index == 0 => {
-                    self.put_camera(&messages::camera_tracking_geo_status(told), now, out);
+                    self.put_camera(&messages::camera_tracking_geo_status(report), now, out);
                 }
                 M::CameraTrackingImageStatus if index == 0 => {
-                    self.put_camera(&messages::camera_tracking_image_status(told), now, out);
+                    self.put_camera(&messages::camera_tracking_image_status(report), now, out);
                 }
                 M::CameraTrackingGeoStatus | M::CameraTrackingImageStatus => {}
             }
@@ -286,7 +286,7 @@ impl Teller {
         })
     }
 
-    /// Answers a command that a ground station sends to the camera.
+    /// Answers a command of a ground station to the camera.
     pub fn asked(&mut self, from: Sender, message: &MavMessage, now: MonoTime, out: &mut Vec<Vec<u8>>) {
         if !self.has_camera() {
             return;
@@ -303,7 +303,7 @@ impl Teller {
         out.push(self.encode(sequence, sender, message, now));
     }
 
-    /// A message of the camera that the helicopter carries.
+    /// A message of the helicopter's camera.
     fn put_camera(&mut self, message: &MavMessage, now: MonoTime, out: &mut Vec<Vec<u8>>) {
         let sender = Sender { system: self.config.autopilot_id, component: CAMERA };
         let sequence = self.camera.next_sequence();
@@ -324,7 +324,7 @@ impl Teller {
     }
 }
 
-/// What the detector calls a marker of the configuration.
+/// The detector's identity of a configured marker.
 fn seen_as(marker: &MarkerConfig, target: usize, index: usize) -> MarkerId {
     match (marker.family, marker.id) {
         (Some(family), Some(id)) => MarkerId::Tag { family, id },
@@ -332,12 +332,12 @@ fn seen_as(marker: &MarkerConfig, target: usize, index: usize) -> MarkerId {
     }
 }
 
-/// The track that a heartbeat tells: it is active while positions of a vehicle in sight go out, critical while
-/// predicted ones do, and on standby where none do.
-fn status(said: &Said) -> TrackStatus {
-    match said {
-        Said::Seen(..) => TrackStatus::Tracking,
-        Said::Predicted(..) => TrackStatus::Coasting,
-        Said::Nothing => TrackStatus::Lost,
+/// The track status for a heartbeat: active while positions of a visible vehicle are sent, critical while predicted
+/// ones are, and standby where none are.
+fn status(reportable: &Reportable) -> TrackStatus {
+    match reportable {
+        Reportable::Seen(..) => TrackStatus::Tracking,
+        Reportable::Predicted(..) => TrackStatus::Coasting,
+        Reportable::Nothing => TrackStatus::Lost,
     }
 }
