@@ -6,7 +6,7 @@ VENV  ?= target/venv
 DEMO  ?= demo
 
 .PHONY: help setup setup-python build debug demo test test-python test-web test-real test-zenoh test-clients fuzz soak proofs check lint docs configs \
-        licences oldest processors bench load misfit-table clean deb cargo-deb dist reproducible sbom hil hil-long hil-short hil-tools
+        licences oldest aarch64 processors bench load misfit-table clean deb cargo-deb dist reproducible sbom hil hil-long hil-short hil-tools
 
 help:
 	@echo "make demo     build, simulate a flight, replay it, compare with the truth, write a report page"
@@ -19,12 +19,13 @@ help:
 	@echo "make test-zenoh the station on Zenoh, met by the Python client (builds the feature zenoh: minutes)"
 	@echo "make proofs   the long tests: hundreds of power cuts, mounts, drawn tags, flights (half an hour)"
 	@echo "make check    format, lints of all features, documentation, shipped configurations, licences and"
-	@echo "              advisories, the oldest Rust stated, detector and estimator for arm64 under QEMU"
+	@echo "              advisories, the oldest Rust stated, the detector's NEON kernels under QEMU"
 	@echo "make bench    the benchmarks under benches/"
 	@echo "make load     five minutes of raw frames at full pace: latency, processor time, memory, losses"
 	@echo "make misfit-table  flights that their configuration does not fit, against nominal twins (an hour)"
 	@echo "make deb      a Debian package in target/debian"
 	@echo "make dist     packages and archives for amd64, arm64, armhf with bills of materials, in target/dist"
+	@echo "make processors  detector and estimator for arm64 and armhf under QEMU, compared with this processor"
 	@echo "make reproducible  two builds of the last commit, byte for byte equal"
 	@echo "make sbom     what is built in, as CycloneDX, in target/windhover.cdx.json"
 	@echo "make hil      the virtual payload computer: install, boot, fly, compare (as root)"
@@ -109,7 +110,7 @@ proofs: setup
 	$(CARGO) build --locked --release --example store_load
 	$(CARGO) test --locked --release --no-fail-fast --lib --tests -- --ignored --nocapture --skip make_
 
-check: lint docs configs licences oldest processors
+check: lint docs configs licences oldest aarch64
 
 lint: setup
 	$(CARGO) fmt --all --check
@@ -129,8 +130,12 @@ licences:
 oldest: setup
 	sh .ci/oldest
 
-# Detector and estimator on other processors: PROCESSORS="arm64 armhf".
-PROCESSORS ?= arm64
+# The one part of the program that is written anew for another processor.
+aarch64: setup
+	sh .ci/aarch64 target/tools/cross
+
+# Detector and estimator on other processors, compared with this one to the last bit.
+PROCESSORS ?= arm64 armhf
 processors: setup
 	sh .ci/processors $(PROCESSORS)
 

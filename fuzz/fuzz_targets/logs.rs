@@ -1,4 +1,5 @@
-//! Any bytes as a log of an autopilot or a camera (ULog, DataFlash, tlog, SRT): no panic, no endless loop, memory in proportion.
+//! Any bytes as a log of an autopilot or a camera (ULog, DataFlash, tlog, SRT): no panic, no endless loop, memory in
+//! proportion.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;

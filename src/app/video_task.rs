@@ -1,5 +1,5 @@
-//! The video's thread: frames to H.264 with their metadata, to the network and into the flight. It is slower than the pipeline
-//! now and then; frames that come meanwhile are left out, and nothing waits for it.
+//! The video's thread: frames to H.264 with their metadata, to the network and into the flight. Frames that arrive while
+//! it is busy are left out; nothing waits for it.
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -25,6 +25,8 @@ use windhover_base::time::MonoTime;
 const ROUND: Duration = Duration::from_millis(250);
 /// The thread yields to all others of the program.
 const NICE: i32 = 10;
+/// The flight has no name yet when its film begins.
+const MISSION: &str = "windhover";
 
 /// Inputs of the thread.
 pub struct VideoTask {
@@ -45,7 +47,7 @@ pub fn run(task: VideoTask) {
     let VideoTask { config, context, queue, flight_store, heartbeat } = task;
     process::be_nice(NICE);
     let known = Known::new(&config.target);
-    let mut film = Film::new(String::new(), Some(config.camera.clone()), Some(config.video.rate_hz), known);
+    let mut film = Film::new(MISSION.into(), Some(config.camera.clone()), Some(config.video.rate_hz), known);
     let mut sender = None;
     while !context.stop.is_cancelled() {
         heartbeat.beat();

@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 use super::ConfigError;
 use super::check::{refuse, within};
 
-/// `[video]`: H.264 in an MPEG transport stream with KLV (MISB ST 0601, 0903, 0604). Off where it is neither sent nor recorded.
+/// `[video]`: H.264 in an MPEG transport stream with KLV (MISB ST 0601, 0903, 0604). Off where it is neither sent nor
+/// recorded.
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct VideoConfig {

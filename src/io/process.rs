@@ -8,7 +8,8 @@ pub fn resident_mb() -> Option<f64> {
     Some(kb * 1024.0 / 1e6)
 }
 
-/// Lowers the priority of the calling thread by so many steps (of 19). Where the system does not allow it, nothing changes.
+/// Lowers the priority of the calling thread by this number of steps (19 at most). Without effect where the system does
+/// not allow it.
 pub fn be_nice(steps: i32) {
     // On Linux it is the thread's own.
     let _ = rustix::process::nice(steps);

@@ -1,5 +1,6 @@
-//! What the detector makes of drawn tags and the filter of a simulated flight, every figure to its last bit, so that processors can
-//! be compared: `cargo run -p windhover-estimate --example bits`. One line each, begun by its kind: `tag`, `input`, `estimate`.
+//! Prints the detector's output for drawn tags and the filter's output for a simulated flight with all bits, to compare
+//! processors: `cargo run -p windhover-estimate --example bits`. Each line begins with its kind: `tag`, `input`,
+//! `estimate`.
 
 use std::sync::Arc;
 

@@ -1,4 +1,4 @@
-//! What is known of the helicopter and the targets at each frame, out of the records of a flight or of the running daemon.
+//! States of the helicopter and the targets at each frame, from the records of a flight or of the running daemon.
 
 use std::collections::BTreeMap;
 

@@ -1,5 +1,5 @@
-//! Films: H.264 in an MPEG transport stream, with packets of KLV for each frame (MISB ST 0601, 0903, 0604). `export` makes one
-//! of a flight, the daemon sends one while it flies.
+//! Video with its metadata: H.264 in an MPEG transport stream, with KLV packets for each frame (MISB ST 0601, 0903,
+//! 0604). `export` makes it from a flight; the daemon sends it live.
 
 mod known;
 mod view;
@@ -103,8 +103,8 @@ impl Film {
 }
 
 impl Stream {
-    /// By how much a frame's time does not continue that of the frame before, microseconds; what the fit of the receiver's clock moves it
-    /// by is none.
+    /// Step of the time between the previous frame and this one, microseconds; changes by the fit of the receiver's
+    /// clock are no step.
     fn step_us(&mut self, t: MonoTime, unix_us: u64) -> i64 {
         let (before, before_us) = self.last.replace((t, unix_us)).unwrap_or((t, unix_us));
         let step =

@@ -8,8 +8,8 @@ use crate::io::mcap_read::{McapReader, RawMessage};
 use crate::io::records::topic;
 use windhover_base::time::MonoTime;
 
-/// The messages of `FLIGHT.refined.mcap` on the topics that a refinement writes, in order of time; none where there is no such file,
-/// the flight was changed after it, or it cannot be read.
+/// The messages of `FLIGHT.refined.mcap` on the topics of a refinement, in order of time; none where there is no such
+/// file, the flight was changed after it, or it cannot be read.
 pub struct RefinedBeside {
     messages: Peekable<Box<dyn Iterator<Item = RawMessage>>>,
     /// Why the file is not used, for the user.

@@ -75,7 +75,7 @@ impl VideoSink {
         Self { queue, every: Span::from_s(1.0 / rate_hz), held: None, due: None }
     }
 
-    /// Whether a frame of that time is one of the film. Frames arrive with jitter: a quarter of the interval early is in time.
+    /// Whether a frame of that time is sent. Stamps have jitter: a frame may be early by a quarter of the interval.
     fn is_due(&mut self, t: MonoTime) -> bool {
         let early = Span::from_ns(self.every.ns() / 4);
         let due = *self.due.get_or_insert(t);

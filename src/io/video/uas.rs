@@ -17,7 +17,7 @@ const WIDTH: (f64, f64) = (0.0, 10_000.0);
 /// A frame as the camera sees it. Angles are degrees, heights above the ellipsoid.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct SensorView {
-    /// Name of the flight; empty where there is none.
+    /// Name of the flight.
     pub mission: String,
     /// The camera's core identifier.
     pub core_id: Vec<u8>,
@@ -58,9 +58,7 @@ fn turn_deg(angle: f64) -> f64 {
 pub fn sensor_packet(view: &SensorView) -> Vec<u8> {
     let mut set = LocalSet::default();
     set.item(2, &view.unix_us.to_be_bytes());
-    if !view.mission.is_empty() {
-        set.item(3, &ascii(&view.mission));
-    }
+    set.item(3, &ascii(&view.mission));
     if let Some([heading, pitch, roll]) = view.platform_deg {
         set.known(5, unsigned::<2>(turn_deg(heading), 0.0, 360.0));
         set.known(6, signed::<2>(pitch, 20.0));
