@@ -1,4 +1,4 @@
-# Everything a newcomer needs: `make demo` shows it, `make test` proves it.
+# Entry points for newcomers: `make demo` shows the program, `make test` runs its tests.
 # System packages are installed when missing (with sudo only where needed); nothing is done when present.
 
 CARGO ?= cargo
@@ -6,23 +6,30 @@ VENV  ?= target/venv
 DEMO  ?= demo
 
 .PHONY: help setup setup-python build debug demo test test-python test-web test-real test-zenoh test-clients fuzz soak proofs check lint docs configs \
-        licences oldest aarch64 processors bench load misfit-table clean deb cargo-deb dist reproducible sbom hil hil-long hil-short hil-tools
+        licences oldest aarch64 processors bench bench-compare load misfit-table book pictures release mutants semver coverage clean deb cargo-deb dist reproducible sbom hil hil-long hil-short hil-tools
 
 help:
-	@echo "make demo     build, simulate a flight, replay it, compare with the truth, write a report page"
+	@echo "make demo     build, simulate a flight, replay it, compare with the truth, open a report page"
 	@echo "make test     every test"
 	@echo "make test-web the station's page in headless Chromium (half a minute)"
 	@echo "make test-real DATA=FOLDER  real recordings, photographs and flights against bars (tests/real)"
 	@echo "make test-clients  gpsd, GDAL, MAVProxy, readers of ROS bags against a payload, its station, its flights"
-	@echo "make fuzz     every parser of strangers' bytes under a fuzzer, a minute each (FUZZ_S=600: ten)"
-	@echo "make soak     an hour with hostile peers, slow readers, flapping devices, a card that comes and goes"
-	@echo "make test-zenoh the station on Zenoh, met by the Python client (builds the feature zenoh: minutes)"
+	@echo "make fuzz     every parser of foreign bytes under a fuzzer, a minute each (FUZZ_S=600: ten)"
+	@echo "make soak     an hour with hostile peers, slow readers, flapping devices, a card that is removed and returned"
+	@echo "make test-zenoh the station on Zenoh, with the Python client (builds the feature zenoh: minutes)"
 	@echo "make proofs   the long tests: hundreds of power cuts, mounts, drawn tags, flights (half an hour)"
 	@echo "make check    format, lints of all features, documentation, shipped configurations, licences and"
 	@echo "              advisories, the oldest Rust stated, the detector's NEON kernels under QEMU"
 	@echo "make bench    the benchmarks under benches/"
+	@echo "make bench-compare  their ratios against those kept in benches/figures.csv"
 	@echo "make load     five minutes of raw frames at full pace: latency, processor time, memory, losses"
 	@echo "make misfit-table  flights that their configuration does not fit, against nominal twins (an hour)"
+	@echo "make book     the book of docs in target/book"
+	@echo "make pictures the pictures of README and book, from the running program"
+	@echo "make release  every check, then the packages (make dist)"
+	@echo "make mutants  mutation tests of decode's and align's small files (half an hour)"
+	@echo "make semver   changes of the crates' public items against the last tag"
+	@echo "make coverage lines that the tests of the crates reach"
 	@echo "make deb      a Debian package in target/debian"
 	@echo "make dist     packages and archives for amd64, arm64, armhf with bills of materials, in target/dist"
 	@echo "make processors  detector and estimator for arm64 and armhf under QEMU, compared with this processor"
@@ -32,12 +39,12 @@ help:
 	@echo "make hil-long the same with every scenario"
 	@echo "make hil-short the same with cold boot, unplugged devices and landing; skips where it cannot run (a check)"
 
-# What the build needs of the system: a C compiler for the compression libraries, CMake and an assembler
+# System packages of the build: a C compiler for the compression libraries, CMake and an assembler
 # for JPEG, and clang's library for the camera bindings.
 setup:
 	@sh tests/setup/packages.sh build-essential cmake nasm libclang-dev pkg-config
 
-# What tests in other languages need: readers of our files written by other people.
+# Tests in other languages: readers of our files written by others.
 setup-python: setup
 	@sh tests/setup/packages.sh python3 python3-venv iproute2 nftables
 	@sh tests/setup/venv.sh $(VENV) tests/python/requirements.txt
@@ -51,14 +58,17 @@ build: setup
 debug: setup
 	$(CARGO) build --locked --bins --examples
 
-demo: build
+# The first build takes minutes on two processors: 380 crates, libjpeg-turbo and OpenH264 among them.
+demo: setup
+	@test -x target/release/windhover || echo "== building the program, once: some minutes on two processors (about 380 crates, two video libraries)"
+	$(CARGO) build --release --locked --bin windhover
 	@sh tests/demo.sh target/release/windhover $(DEMO)
 
 test: setup-python
 	$(CARGO) test --locked --no-fail-fast
 	$(MAKE) test-python
 
-# The flight file opened by readers that know nothing of us.
+# The flight file opened by independent readers.
 test-python: setup-python debug
 	$(VENV)/bin/python -m unittest discover -s tests/python -p 'test_*.py' -v
 	$(VENV)/bin/python -m unittest discover -s python/tests -p 'test_*.py' -v
@@ -78,12 +88,12 @@ test-clients: setup debug
 	@sh tests/setup/venv.sh $(VENV)-clients tests/clients/requirements.txt each
 	$(VENV)-clients/bin/python tests/clients/run.py $(CLIENTS)
 
-# An hour of everything that goes wrong at once; SOAK_S=120 for two minutes.
+# An hour of many faults at once; SOAK_S=120 for two minutes.
 SOAK_S ?= 3600
 soak: setup-python debug
 	$(VENV)/bin/python tests/soak/soak.py --seconds $(SOAK_S)
 
-# Every parser of strangers' bytes under a fuzzer, a minute each; FUZZ_S=600 for ten.
+# Every parser of foreign bytes under a fuzzer, a minute each; FUZZ_S=600 for ten.
 FUZZ_S ?= 60
 fuzz: setup
 	test -x target/tools/bin/cargo-fuzz || $(CARGO) install cargo-fuzz --locked --root target/tools
@@ -92,20 +102,20 @@ fuzz: setup
 	    PATH="$$PWD/target/tools/bin:$$PATH" RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run -s none $$target -- \
 	        -max_total_time=$(FUZZ_S) -rss_limit_mb=3000 || exit 1; done
 
-# Real recordings and frames, and what the program must make of them: make test-real DATA=FOLDER.
+# Real recordings and frames against limits: make test-real DATA=FOLDER.
 test-real: debug
 	@sh tests/setup/packages.sh python3
 	@if [ -d "$(DATA)" ]; then python3 tests/real/run.py target/debug/windhover "$(DATA)"; \
 	else sh .ci/skip "real data" "no folder $(if $(DATA),$(DATA),is named: make test-real DATA=FOLDER)"; fi
 
-# The station built with the feature `zenoh`, met by the Python client. Not part of `make test`: the feature
+# The station built with the feature `zenoh`, with the Python client. Not part of `make test`: the feature
 # adds a hundred crates to the build; `make lint` compiles it.
 test-zenoh: setup-python
 	@sh tests/setup/venv.sh $(VENV)-zenoh tests/zenoh/requirements.txt
 	$(CARGO) build --locked --bins --examples --features zenoh
 	$(VENV)-zenoh/bin/python -m unittest discover -s tests/zenoh -p 'test_*.py' -v
 
-# Tests that take minutes each and prove more of the same; two ignored ones make goldens and captures anew.
+# Tests that take minutes each; two ignored ones make goldens and captures again.
 proofs: setup
 	$(CARGO) build --locked --release --example store_load
 	$(CARGO) test --locked --release --no-fail-fast --lib --tests -- --ignored --nocapture --skip make_
@@ -130,7 +140,7 @@ licences:
 oldest: setup
 	sh .ci/oldest
 
-# The one part of the program that is written anew for another processor.
+# The part of the program that has code for another processor.
 aarch64: setup
 	sh .ci/aarch64 target/tools/cross
 
@@ -142,12 +152,17 @@ processors: setup
 bench: setup
 	$(CARGO) bench --locked
 
-# Latency and load of the daemon. Figures mean something on an idle machine only; the load is printed.
+# Ratios of the benchmarks, which compare between machines; KEEP=--keep appends them to benches/figures.csv.
+KEEP ?=
+bench-compare: bench
+	python3 benches/compare.py $(KEEP)
+
+# Latency and load of the daemon. The figures are valid on an idle machine only; the load is printed.
 load: PARTS = --bin windhover --example daemon_load
 load: build
 	target/release/examples/daemon_load
 
-# What the pipeline makes of flights that their configuration does not fit: the table of docs/estimator.md. An hour and
+# The pipeline on flights that their configuration does not fit: the table of docs/estimator.md. An hour and
 # more for all rows and four seeds; `ROWS="two people" SEEDS=1` for some.
 ROWS  ?=
 SEEDS ?= 1,2,3,4
@@ -176,6 +191,42 @@ reproducible: setup cargo-deb
 
 cargo-deb:
 	test -x target/tools/bin/cargo-deb || $(CARGO) install cargo-deb --version 3.8.0 --locked --root target/tools
+
+# The pages of docs as a book. mdBook is built once, into target/tools.
+MDBOOK = target/tools/bin/mdbook
+$(MDBOOK):
+	$(CARGO) install mdbook --version 0.4.52 --locked --no-default-features --features search --root target/tools
+
+book: $(MDBOOK)
+	$(MDBOOK) build docs/book
+
+pictures: setup-python debug
+	@sh tests/setup/packages.sh chromium
+	$(VENV)/bin/python tests/web/pictures.py
+
+# A release: every check, then the packages. The version, its section of the changelog and the tag are set before
+# (CONTRIBUTING.md).
+release:
+	.ci/run
+	$(MAKE) dist
+
+# Mutations of small files with much logic; survivors are listed in target/mutants.out.
+mutants: setup
+	test -x target/tools/bin/cargo-mutants || $(CARGO) install cargo-mutants --locked --root target/tools
+	PATH="$$PWD/target/tools/bin:$$PATH" $(CARGO) mutants --output target -p windhover-decode -p windhover-estimate \
+	    --file 'crates/decode/src/burst.rs' --file 'crates/decode/src/calendar.rs' --file 'crates/decode/src/sentence.rs' \
+	    --file 'crates/decode/src/lines.rs' --file 'crates/estimate/src/align/*.rs'
+
+# Public items of the crates against those of the last tag.
+semver: setup
+	test -x target/tools/bin/cargo-semver-checks || $(CARGO) install cargo-semver-checks --locked --root target/tools
+	for crate in base decode detect estimate refine simulate calibrate; do \
+	    PATH="$$PWD/target/tools/bin:$$PATH" $(CARGO) semver-checks -p windhover-$$crate --baseline-rev $$(git describe --tags --abbrev=0) || exit 1; done
+
+coverage: setup
+	test -x target/tools/bin/cargo-llvm-cov || $(CARGO) install cargo-llvm-cov --locked --root target/tools
+	PATH="$$PWD/target/tools/bin:$$PATH" $(CARGO) llvm-cov --locked -p windhover-base -p windhover-decode -p windhover-detect \
+	    -p windhover-estimate -p windhover-refine -p windhover-calibrate --summary-only
 
 # Every crate that is built into the program, with licence, place and checksum. The same sources give the same bytes.
 sbom:

@@ -4,14 +4,19 @@ set -eu
 windhover="$1"
 folder="$2"
 mkdir -p "$folder"
-echo "== a helicopter follows a vehicle for half a minute: serial bytes, camera frames, and the truth"
+echo "== a simulated helicopter follows a vehicle for half a minute: serial bytes, camera frames, and the truth"
 "$windhover" simulate "$folder/capture.mcap" --scenario follow --duration 30 --seed 1
 echo
-echo "== the capture through the pipeline, with the log an operator would tail"
+echo "== the pipeline on the capture, with the operator's log"
 "$windhover" replay "$folder/capture.mcap" --out "$folder/flight.mcap" --log
 echo
-echo "== how far the estimates are from the truth"
+echo "== the estimates against the truth"
 "$windhover" report "$folder/flight.mcap" --truth "$folder/capture.truth.csv" --out "$folder/report.html"
 "$windhover" export "$folder/flight.mcap" --format csv --out "$folder/tables"
 echo
+# On a desktop the report opens by itself.
+if [ -n "${DISPLAY:-}${WAYLAND_DISPLAY:-}" ] && command -v xdg-open > /dev/null; then
+    xdg-open "$folder/report.html" > /dev/null 2>&1 || true
+fi
 echo "Open $folder/report.html in a browser; $folder/flight.mcap opens in Foxglove."
+echo "The same live, with a map: $windhover simulate --live --duration 120"

@@ -28,12 +28,12 @@ pub enum ConfigFileError {
         /// What is wrong.
         source: ConfigError,
     },
-    /// The terrain it names could not be read.
+    /// The terrain tile that it names could not be read.
     #[error("configuration {}: ground.terrain: {source}", path.display())]
     Terrain {
         /// The file.
         path: PathBuf,
-        /// The terrain tile that it names could not be read.
+        /// What is wrong.
         source: TileError,
     },
 }

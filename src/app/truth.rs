@@ -11,12 +11,12 @@ pub enum TruthError {
     /// The file could not be read.
     #[error("cannot read truth {}: {source}", path.display())]
     Unreadable {
-        /// The system's error.
+        /// The file.
         path: PathBuf,
-        /// The header or a row is malformed.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// The header or a row is not as it should be.
+    /// The header or a row is malformed.
     #[error("truth {}, line {line}: {reason}", path.display())]
     Malformed {
         /// The file.

@@ -1,4 +1,7 @@
-//! `windhover generate`: manual pages and shell completions from the command line's definition.
+//! `windhover generate`: manual pages and shell completions from the command line's definition, the reference of the
+//! configuration from its types.
+
+mod reference;
 
 use std::path::{Path, PathBuf};
 
@@ -7,7 +10,7 @@ use clap_complete::Shell;
 
 use super::{Cli, CliError, CliResult};
 
-/// Write manual pages or shell completions, made from the command line's definition, into a directory.
+/// Write manual pages, shell completions or the reference of the configuration, made from the program itself, into a directory.
 #[derive(clap::Args, Debug)]
 pub(super) struct Args {
     /// What to write
@@ -23,6 +26,8 @@ enum What {
     Man,
     /// Completions for bash, zsh and fish
     Completions,
+    /// The reference of the configuration, configuration.md
+    Reference,
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
@@ -33,6 +38,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     match args.what {
         What::Man => man(&args.directory),
         What::Completions => completions(&args.directory),
+        What::Reference => std::fs::write(args.directory.join("configuration.md"), reference::page()),
     }
     .map_err(failed)
 }

@@ -75,10 +75,10 @@ pub enum JpegError {
         width: usize,
         /// Rows.
         height: usize,
-        /// The error of the compressor.
+        /// Layout.
         layout: Layout,
     },
-    /// The compressor's own words.
+    /// The error of the compressor.
     #[error(transparent)]
     Refused(#[from] turbojpeg::Error),
 }

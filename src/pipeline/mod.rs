@@ -1,8 +1,8 @@
-//! The one path from events to outputs, live and in replay.
+//! The single path from events to outputs, live and in replay.
 //!
-//! [`Pipeline::handle`] takes what was heard, in the order it was heard, and appends what follows
-//! from it. It reads no clock: time is what the events say, and so are the ticks at which time-outs are
-//! looked at, so a replay of the same events gives the same outputs to the last bit.
+//! [`Pipeline::handle`] takes received events in the order of their reception and appends the outputs that follow. It
+//! reads no clock: time comes from the events, and so do the ticks at which time-outs are checked. A replay of the same
+//! events therefore gives the same outputs to the last bit.
 
 mod frame_pace;
 mod lines;
@@ -40,7 +40,8 @@ use windhover_base::time::{FrameClock, MonoTime, Span};
 use windhover_detect::tracking::FrameDetector;
 use windhover_estimate::{Estimator, PaperEstimator};
 
-/// What is seen so near to a lost part of a frame is not used: the neighbourhood a feature is known by.
+/// What is seen nearer than this to a lost part of a frame is not used: the size of the neighbourhood by which a
+/// feature is recognised.
 const LOST_MARGIN_PX: f64 = 12.0;
 
 /// Most readings held until the datum is settled: some seconds of both lines.
@@ -56,9 +57,9 @@ pub struct Pipeline {
     prediction: FramePrediction,
     finder: SiteFinder,
     estimators: Option<Estimators>,
-    /// What was measured since the first of the fixes that agree: the filter begins with it.
+    /// Measurements since the first of the fixes that agree: the filter begins with them.
     held: Vec<SensorReading>,
-    /// An earlier run's filter, until there is one to continue it.
+    /// The filter state of an earlier run, until there is a filter to continue it.
     warm: Option<WarmFilter>,
     monitor: Monitor,
     seen: SeenMarkers,
@@ -74,7 +75,7 @@ pub struct Pipeline {
     papered: Vec<TargetEstimate>,
 }
 
-/// What needs to know where the flight is.
+/// The parts that need the site of the flight.
 struct Estimators {
     joint: Estimator,
     paper: PaperEstimator,
@@ -87,7 +88,7 @@ impl Pipeline {
         Self::with_terrain(settings, None)
     }
 
-    /// The same over the terrain tile that `ground.terrain` of the configuration names.
+    /// The same, over the terrain tile that `ground.terrain` of the configuration names.
     pub fn with_terrain(settings: PipelineSettings, terrain: Option<Arc<Tile>>) -> Self {
         let rig = &settings.rig;
         let mut lines = SourceLines::new(rig);
@@ -117,7 +118,7 @@ impl Pipeline {
         }
     }
 
-    /// What a restarted program should continue from; `None` while the site is not settled.
+    /// The state from which a restarted program continues; `None` while the site is not settled.
     pub fn warm_state(&self) -> Option<WarmState> {
         let estimators = self.estimators.as_ref()?;
         Some(WarmState {
@@ -127,18 +128,18 @@ impl Pipeline {
         })
     }
 
-    /// Takes an event; appends what follows from it and from the time that passed before it.
+    /// Takes an event; appends the outputs that follow from it and from the time that passed before it.
     pub fn handle(&mut self, event: &Event, out: &mut Vec<TimedOutput>) {
         self.handle_prepared(event, None, out);
     }
 
-    /// The latest tick that is due at `now`; `None` where it was made already. Where nothing arrives, an
-    /// [`EventBody::Tick`] of this time lets time pass.
+    /// The latest tick that is due at `now`; `None` if it was already made. Where no events arrive, an
+    /// [`EventBody::Tick`] with this time lets time pass.
     pub fn tick_due(&mut self, now: MonoTime) -> Option<MonoTime> {
         self.schedule.due(now)
     }
 
-    /// The first tick after `now`: so long whoever feeds the pipeline may wait for an event.
+    /// The first tick after `now`: the caller may wait for an event until then.
     pub fn next_tick(&self, now: MonoTime) -> MonoTime {
         self.schedule.next(now)
     }
@@ -165,7 +166,7 @@ impl Pipeline {
         self.outputs = outputs;
     }
 
-    /// What followed from what happened at `t`.
+    /// Passes on the outputs of what happened at `t`.
     fn pass_on(&mut self, t: MonoTime, outputs: &mut Vec<Output>, out: &mut Vec<TimedOutput>) {
         self.now = t;
         out.extend(outputs.drain(..).map(|output| TimedOutput { t_cause: t, output }));
@@ -181,7 +182,8 @@ impl Pipeline {
         }
         if let Some(estimators) = &mut self.estimators {
             estimators.joint.tick(t, &mut self.estimated);
-            // While no frame comes, targets coast and are lost all the same; what is lost already is not said again.
+            // Also while no frame arrives, targets coast and are lost; a target that is already lost is not reported
+            // again.
             if let Some(frame) = self.pace.missing_after(t)
                 && self.monitor.is_any_known()
             {
@@ -194,7 +196,7 @@ impl Pipeline {
         self.take_estimated(t, out);
     }
 
-    /// The helicopter's own state, whether there are frames or not.
+    /// Outputs the helicopter's own state, with or without frames.
     fn ownship(&mut self, t: MonoTime, out: &mut Vec<Output>) {
         let told = self.estimators.as_mut().and_then(|estimators| estimators.joint.ownship(t));
         out.extend(told.map(|own| Output::Estimator(EstimatorOutput::Ownship(own))));
@@ -227,12 +229,12 @@ impl Pipeline {
         }
     }
 
-    /// Whether frames are wanted with their colours.
+    /// Whether frames are needed in colour.
     pub fn wants_rgb(&self) -> bool {
         self.want_rgb
     }
 
-    /// The recording ends here: what was still held back follows.
+    /// The recording ends here: outputs that were still held back follow.
     pub fn finish(&mut self, out: &mut Vec<TimedOutput>) {
         let mut outputs = std::mem::take(&mut self.outputs);
         for &source in Source::ALL {
@@ -248,8 +250,8 @@ impl Pipeline {
         self.pass_on(self.now, &mut outputs, out);
     }
 
-    /// Continues from what an earlier run of the same flight had learnt: site, clock fit, sensors' slow
-    /// errors. A state of another place or configuration is not used, nor one that comes too late.
+    /// Continues from what an earlier run of the same flight had estimated: site, clock fit, the sensors' slow errors.
+    /// A state of another place or configuration is not used, nor one that is too old.
     fn resume(&mut self, warm: &WarmState) {
         if self.estimators.is_some() {
             return;
@@ -266,7 +268,7 @@ impl Pipeline {
         let (refused, why) = lines::refused(line.counts());
         self.monitor.refused(source, t, refused, &why, out);
         self.take_readings(source, t, out);
-        // What is refused of bytes for two was told once.
+        // Refused bytes of a line that two sources share are reported once.
         let beside = self.lines.beside(source);
         if let Some((source, line)) = beside.and_then(|source| Some((source, self.lines.of(source)?))) {
             line.push(bytes, t, event.seq, &mut self.readings);
@@ -274,7 +276,7 @@ impl Pipeline {
         }
     }
 
-    /// Samples go to the filter as they are: the flight has them as they were received.
+    /// Passes a sample to the filter; the flight has samples as they were received.
     fn sample<T: Sample>(
         &mut self,
         source: Source,
@@ -356,7 +358,7 @@ impl Pipeline {
         }
     }
 
-    /// Holds a fix that agrees with `agreed` before it; one that does not begins anew.
+    /// Holds a fix that agrees with `agreed` fixes before it; a fix that does not agree starts the count again.
     fn hold_fix(&mut self, epoch: &Stamped<GnssEpoch>, agreed: usize) {
         let agreeing = self.finder.agreeing();
         if agreeing == 1 {
@@ -468,7 +470,7 @@ impl Pipeline {
         self.estimate(t_valid, event, out);
     }
 
-    /// Leaves out what was seen where parts of the frame are lost.
+    /// Removes what was seen where parts of the frame are lost.
     fn keep_whole(&mut self, frame: &DecodedFrame) {
         self.observations
             .features
@@ -495,7 +497,7 @@ impl Pipeline {
         }
     }
 
-    /// One estimate a frame and target, whatever was seen.
+    /// One estimate for each frame and target, whatever was seen.
     fn estimate(&mut self, t_valid: MonoTime, event: &Event, out: &mut Vec<Output>) {
         let Some(estimators) = &mut self.estimators else {
             for target in 0..self.settings.rig.target.len() {
@@ -545,7 +547,7 @@ impl Pipeline {
     }
 }
 
-/// Colours matter only where a disc is told by its colour.
+/// Colours are needed only where a disc is identified by its colour.
 fn wants_rgb(targets: &[TargetConfig]) -> bool {
     let mut markers = targets.iter().flat_map(|t| &t.marker);
     markers.any(|m| m.kind == MarkerKind::Disc && m.color.is_some())

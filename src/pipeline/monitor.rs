@@ -1,4 +1,4 @@
-//! Health once a second, and notices where something changes.
+//! Health once a second, and notices of changes.
 
 use std::collections::BTreeMap;
 
@@ -11,10 +11,10 @@ use windhover_base::time::{MonoTime, PulseTrouble, Span};
 
 use super::misfits::Misfits;
 
-/// Health is told this often.
+/// Period of the health message.
 const HEALTH_PERIOD: Span = Span::from_ns(1_000_000_000);
 
-/// Counts one source.
+/// Counts of one source.
 #[derive(Clone, Copy, Default)]
 struct SourceCount {
     total: u64,
@@ -26,7 +26,7 @@ struct SourceCount {
     silent: bool,
 }
 
-/// Watches what flows and says what an operator should know.
+/// Watches the flow of data and reports what an operator should know.
 pub(super) struct Monitor {
     names: Vec<String>,
     misfits: Misfits,
@@ -77,13 +77,13 @@ impl Monitor {
         }
     }
 
-    /// Whether any target was tracked so far.
+    /// Whether any target has been tracked so far.
     pub(super) fn has_tracked(&self) -> bool {
         self.tracked
     }
 
-    /// Time has come to `t`: health that is due, silences that have lasted long enough. Both fall on
-    /// the recording's own clock, so that a replay says the same.
+    /// Time has advanced to `t`: reports health that is due and silences that have lasted long enough. Both follow the
+    /// recording's own clock, so that a replay reports the same.
     pub(super) fn advance(&mut self, t: MonoTime, out: &mut Vec<Output>) {
         let began = *self.began.get_or_insert(t);
         let mut due = *self.next_health.get_or_insert(began + HEALTH_PERIOD);
@@ -96,7 +96,7 @@ impl Monitor {
             out.push(Output::Health(Box::new(self.health(due))));
             let next = due + HEALTH_PERIOD;
             if next <= due {
-                // The end of time, which a wild stamp can name: nothing follows it.
+                // The end of representable time, which a wrong stamp can give: nothing follows it.
                 break;
             }
             due = next;
@@ -112,7 +112,7 @@ impl Monitor {
             if !count.silent && quiet >= source.silent_after() {
                 count.silent = true;
                 if source == Source::Gps {
-                    // What a receiver said before it fell silent is no fix of now.
+                    // The fix that a receiver gave before it fell silent is not a current fix.
                     (self.fix, self.sats, self.hdop) = (FixKind::None, None, None);
                 }
                 let detail = format!("nothing to use from the {} for {:.1} s", source.name(), quiet.s());
@@ -152,7 +152,7 @@ impl Monitor {
         health
     }
 
-    /// A source gave something that can be used.
+    /// A source delivered data that can be used.
     pub(super) fn heard(&mut self, source: Source, t: MonoTime, out: &mut Vec<Output>) {
         let count = &mut self.sources[source];
         count.total += 1;
@@ -165,7 +165,7 @@ impl Monitor {
         count.last = Some(t);
     }
 
-    /// How many pieces of a source's bytes were refused so far, and the last reason.
+    /// The number of refused pieces of a source's bytes so far, and the last reason.
     pub(super) fn refused(
         &mut self,
         source: Source,
@@ -196,7 +196,7 @@ impl Monitor {
         out.push(notice(t, NoticeKind::Dropped, Some(source), detail));
     }
 
-    /// The receiver's fix and the state of the time fit, with one-sigma where the epoch was put in time by it.
+    /// The receiver's fix and the state of the time fit, with its one-sigma where the fit gave the epoch its time.
     pub(super) fn fix(
         &mut self,
         t: MonoTime,
@@ -223,7 +223,7 @@ impl Monitor {
         self.geoid_m = epoch.value.geoid_m.or(self.geoid_m);
     }
 
-    /// Why the receiver's pulses are not used, if they are not.
+    /// The reason why the receiver's pulses are not used, if they are not.
     pub(super) fn pulses(&mut self, t: MonoTime, trouble: Option<PulseTrouble>, out: &mut Vec<Output>) {
         if let Some(trouble) = trouble.filter(|trouble| self.pulses_unused != Some(*trouble)) {
             out.push(notice(t, NoticeKind::PulseUnused, Some(Source::Gps), trouble.words().to_owned()));
@@ -243,7 +243,7 @@ impl Monitor {
         self.targets.get(target).is_none_or(|target| target.last.status == TrackStatus::Lost)
     }
 
-    /// Whether something is known of any target.
+    /// Whether there is an estimate of any target.
     pub(super) fn is_any_known(&self) -> bool {
         (0..self.targets.len()).any(|target| !self.is_lost(target))
     }
@@ -274,7 +274,7 @@ impl Monitor {
         out.push(Output::Notice(Notice { t, kind, source: None, target, detail, misfit: None }));
     }
 
-    /// Something does not fit.
+    /// The configuration does not fit the measurements.
     pub(super) fn misfit(&mut self, misfit: &Misfit, t: MonoTime, out: &mut Vec<Output>) {
         let Some(words) = self.misfits.take(misfit, t) else { return };
         let (kind, detail) = (NoticeKind::ModelMisfit, words.to_string());
@@ -282,7 +282,7 @@ impl Monitor {
         out.push(Output::Notice(Notice { t, kind, source: None, target: None, detail, misfit }));
     }
 
-    /// What became of a measurement.
+    /// The result of a measurement in the filter.
     pub(super) fn disposition(&mut self, disposition: Disposition) {
         *self.dispositions.entry(disposition).or_default() += 1;
     }
@@ -343,12 +343,12 @@ mod tests {
         let mut out = Vec::new();
         let at = |s: f64| MonoTime::from_ns(0) + Span::from_s(s);
         monitor.advance(at(0.0), &mut out);
-        // When frames come and nothing else.
+        // When only frames arrive.
         for n in 1..=40 {
             monitor.heard(Source::Camera, at(0.1 * f64::from(n)), &mut out);
             monitor.advance(at(0.1 * f64::from(n)), &mut out);
         }
-        // Then the receiver is silent, once, and health is of the two.
+        // Then the receiver's silence is reported once, and health names both sources.
         let silent = out.iter().filter_map(|o| match o {
             Output::Notice(notice) if notice.kind == NoticeKind::SourceSilent => notice.source,
             _ => None,

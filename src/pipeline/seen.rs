@@ -6,13 +6,13 @@ use windhover_base::time::{MonoTime, Span};
 
 use super::misfit_words::marker_name;
 
-/// The same marker is told again no sooner than after this.
+/// The same marker is reported again no sooner than after this time.
 const AGAIN: Span = Span::from_ns(10_000_000_000);
 
 /// The markers of a rig, as they are seen.
 pub(super) struct SeenMarkers {
     rig: Rig,
-    /// Markers seen twice, and when that was told last.
+    /// Markers seen twice, and when each was last reported.
     told: Vec<(MarkerId, MonoTime)>,
 }
 
@@ -39,7 +39,7 @@ impl SeenMarkers {
         }
     }
 
-    /// What to tell of markers of the targets that are seen more than once in a frame.
+    /// The report of target markers that are seen more than once in a frame.
     pub(super) fn twice(&mut self, frame: &FrameObservations, now: MonoTime) -> Vec<String> {
         let mut words = Vec::new();
         for (number, first) in frame.markers.iter().enumerate() {
@@ -112,7 +112,7 @@ mod tests {
         );
         assert!(seen.twice(&doubled, at(5.0)).is_empty());
         assert_eq!(seen.twice(&doubled, at(11.0)).len(), 1);
-        // Somebody else's tags are nobody's concern.
+        // Tags that belong to no target are not reported.
         assert!(seen.twice(&frame(vec![tag(99, 10.0), tag(99, 300.0)]), at(20.0)).is_empty());
     }
 }

@@ -10,7 +10,7 @@ pub struct PipelineSettings {
     pub rig: Rig,
     /// The ground that the vehicle drives on.
     pub ground: GroundConfig,
-    /// Origin of the NED frame, where it is given.
+    /// Origin of the NED frame, if it is configured.
     pub datum: Option<Datum>,
     /// Marker detection.
     pub detector: DetectorConfig,

@@ -1,4 +1,4 @@
-//! Where the flight is: the NED origin, the ground, the declination, settled by the first fixes that agree.
+//! The site of the flight: NED origin, ground, declination, settled by the first fixes that agree.
 
 use std::sync::Arc;
 
@@ -10,20 +10,20 @@ use windhover_estimate::Site;
 
 /// Fixes in a row that agree before one of them is the datum.
 const AGREE_FIRST: usize = 3;
-/// The same before a datum moves that others agreed on.
+/// Fixes in a row that must agree before a datum moves on which others had agreed.
 const AGREE_MOVE: usize = 5;
-/// How far fixes that agree lie from the first of them, horizontally and vertically, metres: a fast helicopter
-/// on a slow receiver.
+/// Greatest distance of agreeing fixes from the first of them, horizontally and vertically, metres: enough for a fast
+/// helicopter with a slow receiver.
 const AGREE_M: (f64, f64) = (500.0, 200.0);
-/// Farther from the datum than this the flight is elsewhere, metres.
+/// Farther than this from the datum, the flight is elsewhere, metres.
 const ELSEWHERE_M: f64 = 50_000.0;
-/// No receiver stands nearer to latitude 0, longitude 0 than this, degrees; what says so has no position.
+/// A position nearer than this to latitude 0, longitude 0 is no position, degrees: receivers without a fix give it.
 const NULL_ISLAND_DEG: f64 = 0.001;
-/// Fixes in a row that are of no use before a word is due, and between words.
+/// Number of unusable fixes in a row before a report is due, and between reports.
 const UNUSED_WORD: (usize, usize) = (25, 250);
-/// Fixes whose median height is the ground where the ground is where the aircraft took off.
+/// Number of fixes whose median height is the ground, where the ground is configured as the place of take-off.
 const TAKEOFF_FIXES: usize = 5;
-/// Fixes to wait for a date before the World Magnetic Model is given up.
+/// Number of fixes to wait for a date before the World Magnetic Model is given up.
 const DATE_PATIENCE: usize = 50;
 
 /// Collects first fixes until the site is settled.
@@ -42,7 +42,7 @@ pub(super) struct SiteFinder {
     warm: Option<WarmSite>,
 }
 
-/// Fixes in a row that were of no use, and why the last was.
+/// Unusable fixes in a row, and the reason for the last.
 #[derive(Default)]
 struct Unused {
     count: usize,
@@ -51,7 +51,7 @@ struct Unused {
 }
 
 impl Unused {
-    /// One more, for this reason.
+    /// Counts one more, with this reason.
     fn note(&mut self, why: &'static str) {
         if self.why != Some(why) {
             *self = Self { why: Some(why), ..Self::default() };
@@ -59,7 +59,7 @@ impl Unused {
         self.count += 1;
     }
 
-    /// The word that is due now, once.
+    /// The report that is due at this time, once.
     fn word(&mut self) -> Option<&'static str> {
         let (first, then) = UNUSED_WORD;
         let due = self.count != self.told
@@ -76,13 +76,13 @@ pub(super) struct SettledSite {
     pub(super) site: Site,
     /// The same as plain numbers, for a warm start.
     pub(super) warm: WarmSite,
-    /// Whether it is an earlier run's.
+    /// Whether the site is that of an earlier run.
     pub(super) continued: bool,
     pub(super) declination_notice: Option<String>,
     pub(super) ground_notice: Option<String>,
 }
 
-/// Where a recorded flight took place: its datum as it was told, ground and declination by the fixes that settled it.
+/// The site of a recorded flight: its datum as it was reported, ground and declination by the fixes that settled it.
 pub fn site_of<'a>(
     settings: &PipelineSettings,
     terrain: Option<Arc<Tile>>,
@@ -121,7 +121,7 @@ impl SiteFinder {
         self.warm = Some(warm);
     }
 
-    /// Takes a fix; the site when it is settled.
+    /// Takes a fix; returns the site once it is settled.
     pub(super) fn offer(&mut self, epoch: &GnssEpoch) -> Option<SettledSite> {
         let at = match position(epoch)? {
             Ok(at) => at,
@@ -137,8 +137,8 @@ impl SiteFinder {
         self.settle(epoch, at, first, AGREE_FIRST)
     }
 
-    /// Takes a fix of a settled flight; a new site where several fixes agree that the flight is elsewhere. The
-    /// datum moves only where it is not configured, and as long as nothing was tracked.
+    /// Takes a fix of a settled flight; returns a new site where several fixes agree that the flight is elsewhere. The
+    /// datum moves only if it is not configured, and only while nothing has been tracked.
     pub(super) fn offer_again(
         &mut self,
         epoch: &GnssEpoch,
@@ -159,12 +159,12 @@ impl SiteFinder {
         self.settle(epoch, at, first, AGREE_MOVE)
     }
 
-    /// How many fixes in a row agree so far.
+    /// Number of agreeing fixes in a row so far.
     pub(super) fn agreeing(&self) -> usize {
         self.agreeing
     }
 
-    /// Why fixes in a row were of no use, when that is worth a word.
+    /// The reason why fixes in a row were unusable, when a report is due.
     pub(super) fn unused_word(&mut self) -> Option<&'static str> {
         self.unused.word()
     }
@@ -239,7 +239,7 @@ impl SiteFinder {
         });
         let ground = match tile {
             Some(tile) => Ground::Terrain(Arc::new(Terrain::new(tile, &frame, warm.geoid_m))),
-            // Far from the datum its tangent plane stands above the curve of the Earth.
+            // Far from the datum its tangent plane lies above the curved surface of the Earth.
             None => {
                 Ground::Flat { down_m: frame.ned(Geodetic { height_m: warm.ground_height_m, ..first }).z }
             }
@@ -248,7 +248,7 @@ impl SiteFinder {
         SettledSite { site, warm, continued: false, declination_notice, ground_notice }
     }
 
-    /// Declination in radians and what to say of it; `None` while waiting for a date.
+    /// Declination in radians and its report; `None` while waiting for a date.
     fn declination(&self, epoch: &GnssEpoch, at: Geodetic) -> Option<(f64, Option<String>)> {
         if let Some(figure) = self.declination_deg {
             return Some((figure.to_radians(), None));
@@ -272,7 +272,7 @@ impl SiteFinder {
         })
     }
 
-    /// Whether an earlier run's site is here and is what the configuration asks for.
+    /// Whether an earlier run's site is at this place and agrees with the configuration.
     fn agrees(&self, warm: &WarmSite, at: &Geodetic) -> bool {
         let [lat_deg, lon_deg, height_m] = warm.datum;
         let near = (lat_deg - at.lat_deg).abs() < SAME_FLIGHT_DEG
@@ -288,10 +288,10 @@ impl SiteFinder {
     }
 }
 
-/// Farthest from an earlier run's datum that a flight is still the same one, degrees (some 10 km).
+/// Greatest distance from an earlier run's datum within which a flight is still the same one, degrees (some 10 km).
 const SAME_FLIGHT_DEG: f64 = 0.1;
 
-/// What is said of positions that are not used.
+/// Reports of positions that are not used.
 const NO_HEIGHT: &str = "its fixes are two-dimensional by its own word (GSA or PGRMF): without a height there is no \
                          datum, and nothing is estimated until a fix has one";
 const NO_ALTITUDE: &str = "its sentences tell no altitude (is GGA or GNS on?): without a height there is no datum, and \
@@ -302,7 +302,7 @@ const FAR_TRACKED: &str = "its positions are more than 50 km from the datum, whi
                            from it: restart to fly here";
 const FAR_CONFIGURED: &str = "its positions are more than 50 km from the datum of the configuration";
 
-/// A three-dimensional position above the ellipsoid, or why what is said is none; `None` without a fix.
+/// A three-dimensional position above the ellipsoid, or the reason why the fix gives none; `None` without a fix.
 fn position(epoch: &GnssEpoch) -> Option<Result<Geodetic, &'static str>> {
     let (lat_deg, lon_deg) = epoch.lat_deg.zip(epoch.lon_deg).filter(|_| epoch.fix.has_position())?;
     Some(match epoch.alt_msl_m {
@@ -315,10 +315,10 @@ fn position(epoch: &GnssEpoch) -> Option<Result<Geodetic, &'static str>> {
     })
 }
 
-/// Distance between two places, across and up, metres.
+/// Distance between two places, horizontally and vertically, metres.
 fn distance_m(from: Geodetic, to: Geodetic) -> (f64, f64) {
     let ned = LocalFrame::new(from).ned(Geodetic { height_m: from.height_m, ..to });
-    // Beyond some kilometres the second leaves the plane of the first.
+    // At a distance of some kilometres the second place is off the tangent plane of the first.
     (ned.norm(), (to.height_m - from.height_m).abs())
 }
 
@@ -363,7 +363,7 @@ mod tests {
 
     #[test]
     fn level_ground_lies_under_the_first_fix_however_far_the_datum_is() {
-        // Given a datum 10 km away, where the tangent plane stands 8 m above the ground.
+        // Given a datum 10 km away, where the tangent plane is 8 m above the ground.
         let mut finder = finder(|config| {
             config.datum = Some(Datum { lat_deg: 30.0, lon_deg: -85.5, height_m: 20.0 });
         });
@@ -390,7 +390,7 @@ mod tests {
         let island = vec![fix(0.0, 0.0); 100];
         let mut lost = finder(|_| {});
         assert_eq!(datum_of(&mut lost, &island), None);
-        // On the equator and on the meridian there are places.
+        // Places on the equator and on the prime meridian are accepted.
         assert!(datum_of(&mut finder(|_| {}), &[fix(0.0, -9.2); 5]).is_some());
         assert!(datum_of(&mut finder(|_| {}), &[fix(51.5, 0.0); 5]).is_some());
     }

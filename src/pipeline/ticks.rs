@@ -1,25 +1,25 @@
-//! When time passes: the instants at which the pipeline does something by itself, live and in replay alike.
+//! When time passes: the instants at which the pipeline acts by itself, live and in replay alike.
 
 use windhover_base::time::{MonoTime, Span};
 
-/// Time between two looks at time-outs.
+/// Time between two checks of time-outs.
 const TIME_OUTS: Span = Span::from_ns(100_000_000);
 
-/// In a gap between two events, all that time alone brings about has come about after so long: the filter gives up
+/// In a gap between two events, everything that time alone causes has happened after this long: the filter gives up
 /// after a minute.
 const EVENTFUL: Span = Span::from_ns(120_000_000_000);
 
-/// What is due at an instant; at the same one in this order.
+/// What is due at an instant; at the same instant in this order.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 pub(super) enum Due {
-    /// Time-outs are looked at.
+    /// Time-outs are checked.
     TimeOuts,
-    /// The helicopter's own state is told.
+    /// The helicopter's own state is output.
     Ownship,
 }
 
-/// Instants at whole multiples of a period of host time, between one event and the next. They follow from
-/// the events' times alone, so a replay has the same ones at the same places.
+/// Instants at whole multiples of a period of host time, between one event and the next. They depend on the events'
+/// times only, so a replay has the same instants at the same places.
 #[derive(Clone, Copy, Debug)]
 struct Ticks {
     period: Span,
@@ -31,8 +31,8 @@ impl Ticks {
         Self { period, last: None }
     }
 
-    /// Instants after the last call's `t` and not after this one's, in order. A longer gap gets those of its first
-    /// [`EVENTFUL`] only.
+    /// Instants after the `t` of the last call up to and including this one's, in order. In a longer gap only those of
+    /// its first [`EVENTFUL`] are given.
     fn until(&mut self, t: MonoTime) -> impl Iterator<Item = MonoTime> + use<> {
         let (most, period) = (EVENTFUL.ns() / self.period.ns(), self.period);
         let from = self.last.map_or_else(|| self.grid(t), |last| self.grid(last));
@@ -41,7 +41,7 @@ impl Ticks {
         (from + 1..=to.min(from + most)).map(move |n| MonoTime::from_ns(n * period.ns()))
     }
 
-    /// The latest instant that is due at `now` and was not passed yet. The first call begins the count.
+    /// The latest instant that is due at `now` and has not passed yet. The first call begins the count.
     fn due(&mut self, now: MonoTime) -> Option<MonoTime> {
         let passed = *self.last.get_or_insert(now);
         let due = self.grid(now);
@@ -53,13 +53,13 @@ impl Ticks {
         MonoTime::from_ns((self.grid(now) + 1) * self.period.ns())
     }
 
-    /// Periods from zero to `t`.
+    /// Number of periods from zero to `t`.
     fn grid(&self, t: MonoTime) -> i64 {
         t.ns().div_euclid(self.period.ns())
     }
 }
 
-/// Everything that is due by itself.
+/// Everything that is due by time alone.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Schedule {
     time_outs: Ticks,
@@ -67,12 +67,12 @@ pub(super) struct Schedule {
 }
 
 impl Schedule {
-    /// With the helicopter's own state so many times a second.
+    /// With the helicopter's own state `ownship_hz` times a second.
     pub(super) fn new(ownship_hz: f64) -> Self {
         Self { time_outs: Ticks::every(TIME_OUTS), ownship: Ticks::every(Span::from_s(1.0 / ownship_hz)) }
     }
 
-    /// What came due after the last call's `t` and not after this one's, in order.
+    /// What became due after the `t` of the last call up to and including this one's, in order.
     pub(super) fn until(&mut self, t: MonoTime) -> Vec<(MonoTime, Due)> {
         let time_outs = self.time_outs.until(t).map(|t| (t, Due::TimeOuts));
         let mut due: Vec<_> = time_outs.chain(self.ownship.until(t).map(|t| (t, Due::Ownship))).collect();
@@ -80,7 +80,7 @@ impl Schedule {
         due
     }
 
-    /// The latest instant at which something is due at `now` that did not pass yet. The first call begins the count.
+    /// The latest instant at which something is due at `now` and has not passed yet. The first call begins the count.
     pub(super) fn due(&mut self, now: MonoTime) -> Option<MonoTime> {
         self.time_outs.due(now).max(self.ownship.due(now))
     }
@@ -106,7 +106,7 @@ mod tests {
             events.iter().flat_map(|&ms| ticks.until(at(ms))).map(|t| t.ns() / 1_000_000).collect::<Vec<_>>()
         };
         assert_eq!(run(&[1_250, 1_260, 1_400, 1_650]), [1_300, 1_400, 1_500, 1_600]);
-        // More frequent looks give the same ticks.
+        // More frequent calls give the same ticks.
         let often: Vec<i64> = (1_250..=1_650).step_by(7).chain([1_650]).collect();
         assert_eq!(run(&often), [1_300, 1_400, 1_500, 1_600]);
         assert_eq!(run(&[1_000, 900, 1_050]), Vec::<i64>::new());

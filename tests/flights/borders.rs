@@ -271,5 +271,5 @@ fn a_configuration_has_so_many_targets() {
     std::fs::write(dir.path().join("c.toml"), config).unwrap();
     let run = windhover(&["check-config", "c.toml"], dir.path());
     assert_eq!(run.status.code(), Some(78));
-    assert!(said(&run).contains("watches 32 at most"), "{}", said(&run));
+    assert!(said(&run).contains("the most for one helicopter is 32"), "{}", said(&run));
 }

@@ -1,4 +1,4 @@
-//! Every command of `docs/calibration.md`, run as it stands there by the real binary.
+//! Every command of `docs/calibration.md` and of the book's first flight, run as it stands there by the real binary.
 
 use std::path::Path;
 use std::process::Command;
@@ -20,14 +20,7 @@ fn every_command_of_the_page_works() {
         .expect("writable");
     let commands = commands_of(DOC);
     assert!(commands.len() >= 12, "{commands:?}");
-    for command in commands {
-        // The page is ours and its readers use a shell: it expands photos/*.png.
-        let bin = env!("CARGO_BIN_EXE_windhover");
-        let line = command.replacen("windhover", &format!("'{bin}'"), 1);
-        let run = Command::new("sh").arg("-c").arg(&line).current_dir(dir.path()).output().expect("a shell");
-        let said = String::from_utf8_lossy(&run.stderr);
-        assert!(run.status.success(), "{command}\n{said}");
-    }
+    run(&commands, dir.path());
     for file in [
         "board.svg",
         "tags.svg",
@@ -44,6 +37,32 @@ fn every_command_of_the_page_works() {
         assert!(page.contains(&format!("<h2>{section}</h2>")), "{section}");
     }
     assert!(page.len() < 3_000_000, "{}", page.len());
+}
+
+#[test]
+fn every_command_of_the_first_flight_works() {
+    let dir = tempfile::tempdir().expect("a scratch directory");
+    let commands = commands_of(include_str!("../../docs/book/first-flight.md"));
+    assert!(commands.len() >= 6, "{commands:?}");
+    let messages = run(&commands, dir.path());
+    assert!(messages.contains("event=model_misfit"), "{messages}");
+    let page = std::fs::read_to_string(dir.path().join("report.html")).expect("the report");
+    assert!(page.contains("<h2>Errors</h2>"), "the estimates are compared with the truth");
+}
+
+/// Runs commands in a directory; returns what they wrote to standard error.
+fn run(commands: &[&str], dir: &Path) -> String {
+    let mut messages = String::new();
+    for command in commands {
+        // The page is ours and its readers use a shell: it expands photos/*.png.
+        let bin = env!("CARGO_BIN_EXE_windhover");
+        let line = command.replacen("windhover", &format!("'{bin}'"), 1);
+        let run = Command::new("sh").arg("-c").arg(&line).current_dir(dir).output().expect("a shell");
+        let text = String::from_utf8_lossy(&run.stderr);
+        assert!(run.status.success(), "{command}\n{text}");
+        messages.push_str(&text);
+    }
+    messages
 }
 
 /// The lines of the page's `sh` blocks.

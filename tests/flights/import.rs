@@ -97,7 +97,8 @@ fn tables_of_samples_merge_with_the_rest() {
     let (imported, got) = run(folder.path(), sources).unwrap();
     assert_eq!((imported.imu_samples, imported.attitude_samples), (2, 1));
     assert!(
-        imported.warnings[0].contains("imu.csv: 1 row ") && imported.warnings[0].contains("line 4 first")
+        imported.warnings[0].contains("imu.csv: 1 row ")
+            && imported.warnings[0].contains("the first at line 4")
     );
     let times: Vec<i64> = got.iter().map(|(ms, _)| *ms).collect();
     assert_eq!(times, [0, 20, 30, 40]);

@@ -1,6 +1,6 @@
-//! What a frame costs the detector: whole frames at two smallest sizes, a region, a tracked frame with and without
-//! ground features. `cargo bench -p windhover-detect`. The frame is generated: textured ground, noise, two tags of
-//! 40 and 90 px.
+//! Time that the detector needs for a frame: whole frames at two smallest sizes, a region, a tracked frame with and
+//! without ground features. `cargo bench -p windhover-detect`. The frame is generated: textured ground, noise, two tags
+//! of 40 and 90 px.
 
 use std::hint::black_box;
 
@@ -19,8 +19,8 @@ mod common;
 #[path = "../tests/detector/bound.rs"]
 mod bound;
 
-/// The least that corners of a tag can err by, in focus: what the detector's page lists, beside which the proof
-/// `corners_beside_the_least_error_that_there_can_be` measures.
+/// The smallest possible error of a tag's corners, in focus: the figures of the detector's page, with which the proof
+/// `corners_beside_the_least_error_that_there_can_be` compares.
 fn bounds(_: &mut Criterion) {
     let pattern = tag_pattern(TagFamily::Tag36h11, 3);
     let blur = (0.7f64.powi(2) + 1.0 / 12.0).sqrt();
@@ -108,7 +108,7 @@ fn moved(image: &GrayImage, by: usize) -> ImageView<'_> {
     view
 }
 
-/// A frame while tracking: both tags where they were foretold, one strip of the rest, eight ground features.
+/// A frame while tracking: both tags at their predicted places, one strip of the rest, eight ground features.
 fn tracked(c: &mut Criterion) {
     let image = frame();
     let family = TagFamily::Tag36h11;

@@ -1,12 +1,12 @@
-//! Corners worth following: places where the picture changes both ways (Shi and Tomasi 1994).
+//! Corners that can be followed: places where the picture changes in both directions (Shi and Tomasi 1994).
 
 use super::pyramid::Level;
 use super::simd::{Kernel, Simd};
 
-/// Half width of the square whose gradients count, pixels of the level.
+/// Half width of the square over which gradients are summed, pixels of the level.
 const REACH: usize = 3;
 const SIDE: usize = 2 * REACH + 1;
-/// Every so many pixels a place is tried, each way.
+/// Distance between places that are tried, in both directions, pixels.
 const STEP: usize = 2;
 /// Least smaller eigenvalue over the square, from differences two pixels apart: about six grey levels a pixel.
 const LEAST: f32 = (SIDE * SIDE) as f32 * 36.0 * 2.0;
@@ -22,13 +22,13 @@ pub(super) type Corner = (f32, [f32; 2]);
 pub(super) struct Corners {
     /// Products of the gradients along u and v: u u, u v, v v, row by row.
     products: [Vec<i32>; 3],
-    /// Their sums over the rows of the square at hand.
+    /// Their sums over the rows of the square being tested.
     sums: [Vec<i32>; 3],
 }
 
 impl Corners {
-    /// The place of a part of a level with the largest smaller eigenvalue of the gradients' matrix, of those that
-    /// are `wanted` (told in frame coordinates).
+    /// The place of a part of a level with the largest smaller eigenvalue of the gradients' matrix, of those that are
+    /// `wanted` (given in frame coordinates).
     pub fn best(
         &mut self,
         level: Level<'_>,

@@ -1,4 +1,4 @@
-//! What is known of a tag that was found.
+//! A tag that was found, and its accuracy.
 
 use nalgebra::{Matrix2, Vector2};
 use windhover_base::msg::{MarkerDetection, MarkerId, TagFamily};
@@ -29,7 +29,7 @@ pub struct TagDetection {
 }
 
 impl TagDetection {
-    /// The same in an image of which the searched one is the part that begins at `origin`.
+    /// The same in an image of which the searched image is the part that begins at `origin`.
     pub(crate) fn moved(mut self, origin: Vector2<f64>) -> Self {
         self.center_px += origin;
         self.corners_px.iter_mut().for_each(|corner| *corner += origin);

@@ -7,7 +7,7 @@ pub(super) fn union(parents: &mut [u32], a: u32, b: u32) {
     parents[a.max(b) as usize] = a.min(b);
 }
 
-/// The root of a set; the way to it is halved.
+/// The root of a set; the path to it is halved.
 #[inline(always)]
 fn root(parents: &mut [u32], mut i: u32) -> u32 {
     loop {

@@ -1,15 +1,15 @@
-//! Where in the image the edges between a decoded tag's cells are, along their normals, and what the tag's
-//! parameters do there; in single precision and side by side, for there are many.
+//! Where in the image the edges between a decoded tag's cells are, along their normals, and how the tag's parameters
+//! move them; in single precision and in vectors, because there are many.
 
 use super::quad::Point;
 use super::simd::Kernel;
 use windhover_base::msg::ImageView;
 
-/// Of a tag's model: a homography, a bow, a barrel, a twist, what neighbouring cells do to edges along ξ and along η,
-/// and by how much light spreads.
+/// Number of parameters of a tag's model: a homography, a bow, a barrel, a twist, the effect of neighbouring cells on
+/// edges along ξ and along η, and how far light spreads.
 pub(super) const PARAMETERS: usize = 16;
 
-/// How many edges are dealt with side by side, in loops that a compiler turns into vector instructions.
+/// Number of edges that are processed together, in loops that a compiler turns into vector instructions.
 pub(super) const LANES: usize = 16;
 pub(super) type Lanes = [f32; LANES];
 
@@ -22,7 +22,7 @@ pub(super) struct EdgePoint {
     pub light: f32,
     /// 1 where the dark cell is one wide and the light one is not, −1 where it is the other way round.
     pub narrow: f32,
-    /// Which part of the tag it is in.
+    /// The part of the tag in which it lies.
     pub block: u8,
 }
 
@@ -33,14 +33,15 @@ pub(super) struct Located {
     pub rows: [Lanes; PARAMETERS],
     /// How far along the normal the image has the edge, pixels.
     pub residual: Lanes,
-    /// Weight, inverse to its error; nought where no edge was found.
+    /// Weight, inverse to its error; zero where no edge was found.
     pub strength: Lanes,
-    /// Share of the edge's height in its slope: 1 where it is narrow against the window, 0 where it fills it.
+    /// Share of the edge's height that lies in its slope: 1 where the slope is narrow compared with the window, 0 where
+    /// it fills the window.
     pub sharpness: Lanes,
     pub block: [u8; LANES],
     /// Crossed along ξ (0) or η (1).
     pub axis: usize,
-    /// How many were found.
+    /// Number of edges found.
     pub count: usize,
 }
 
@@ -53,12 +54,12 @@ pub(super) struct NarrowModel {
     pub spreads: f32,
 }
 
-/// Edge points in the image: pixels, normals from dark to light, what the parameters do along those.
+/// Edge points in the image: pixels, normals from dark to light, and how the parameters move them along the normals.
 #[derive(Default)]
 struct Projected {
     at: [Lanes; 2],
     normal: [Lanes; 2],
-    /// How far from there neighbouring cells let the edge appear, along the normal.
+    /// How far neighbouring cells move the visible edge from there, along the normal.
     shift: Lanes,
     rows: [Lanes; PARAMETERS],
 }
@@ -68,7 +69,7 @@ impl NarrowModel {
     fn project(&self, points: &[EdgePoint; LANES], axis: usize, to: &mut Projected) {
         let t = &self.theta;
         let [a, b] = self.sides;
-        // Of the edge's own direction, across which the normal is, and of the one that crosses it.
+        // Of the edge's own direction, to which the normal is perpendicular, and of the direction that crosses it.
         let (lx, ly) = if axis == 0 { (1.0, 0.0) } else { (0.0, 1.0) };
         let (xis, etas): (Lanes, Lanes) = (points.map(|p| p.xi), points.map(|p| p.eta));
         let lights: Lanes = points.map(|p| p.light);
@@ -82,7 +83,7 @@ impl NarrowModel {
             let (even, odd) = (q[0] * q[0] - q[1] * q[1], 2.0 * q[0] * q[1]);
             to.at[0][lane] = self.origin[0] + u + far * bend[0] + t[11] * even - t[12] * odd;
             to.at[1][lane] = self.origin[1] + v + far * bend[1] - t[11] * odd - t[12] * even;
-            // Images of the directions of ξ and η; of the twist it is too little.
+            // Images of the directions of ξ and η; of the twist the effect is too small.
             let (farther_xi, farther_eta) =
                 (2.0 * (q[0] * a[0] + q[1] * a[1]), 2.0 * (q[0] * b[0] + q[1] * b[1]));
             let bow = far * t[10];
@@ -149,7 +150,7 @@ impl Profile {
     fn sample(&mut self, image: ImageView<'_>, points: &Projected) -> Lanes {
         let (mut first, mut step) = ([[0.0; LANES]; 2], [[0.0; LANES]; 2]);
         let mut inside = [0.0; LANES];
-        // A point and one a pixel further right and below are in the image.
+        // A point is in the image where the pixel one further right and below is too.
         let (right, below) = (image.width as f32 - 1.01, image.height as f32 - 1.01);
         let reach = self.reach as f32;
         for lane in 0..LANES {
@@ -164,7 +165,7 @@ impl Profile {
                 & (us[1] < right)
                 & (vs[0] < below)
                 & (vs[1] < below);
-            // What is not, is sampled in the corner and not used.
+            // A point outside is sampled in the corner and not used.
             first[0][lane] = if is_inside { us[0] } else { 0.0 };
             first[1][lane] = if is_inside { vs[0] } else { 0.0 };
             step[0][lane] = if is_inside { du } else { 0.0 };
@@ -185,12 +186,12 @@ impl Profile {
         inside
     }
 
-    /// Where along the normal the image steps up, pixels, how well that is known (inverse to its error; nought
-    /// where it does not step up), and the edge's sharpness: where the gradient is balanced under a biweight window
-    /// (ψ(d) = d (1 − d²/h²)²). A blurred edge is symmetric, and so is the window: the place is not biased by where
-    /// the search began. An edge that motion has smeared over more than the window is level inside it; it is found
-    /// by Newton's steps, not by the centre of mass, which would stay where it was put, and the slope of its
-    /// balance tells what it is worth.
+    /// Where along the normal the image steps up, pixels, the strength of this result (inverse to its error; zero where
+    /// there is no step), and the edge's sharpness: where the gradient is balanced under a biweight window (ψ(d) = d (1
+    /// − d²/h²)²). A blurred edge is symmetric, and so is the window: the place is not biased by where the search
+    /// began. An edge that motion has smeared over more than the window is level inside it; it is found by Newton's
+    /// steps, not by the centre of mass, which would stay where the search began; the slope of its balance gives its
+    /// accuracy.
     #[inline(always)]
     fn balance(&self, inside: &Lanes) -> (Lanes, Lanes, Lanes) {
         let (mut center, mut strength, mut sharpness) = ([0.0; LANES], *inside, [0.0; LANES]);
@@ -241,7 +242,7 @@ fn bilinear(image: ImageView<'_>, first: &[Lanes; 2], step: &[Lanes; 2], along: 
     let stride = image.stride as u32;
     for lane in 0..LANES {
         let (u, v) = (first[0][lane] + along * step[0][lane], first[1][lane] + along * step[1][lane]);
-        // The whole number below, or where a place is on a pixel, that or the one before it.
+        // The whole number below; where a place is exactly on a pixel, that one or the one before it.
         let (below_u, below_v) = (u - 0.5 + WHOLE, v - 0.5 + WHOLE);
         (fu[lane], fv[lane]) = (u - (below_u - WHOLE), v - (below_v - WHOLE));
         let [iu, iv] = [below_u, below_v].map(|x| x.to_bits().wrapping_sub(WHOLE.to_bits()));
@@ -287,7 +288,7 @@ impl Kernel for Locate<'_> {
         for (axis, points) in self.points.iter().enumerate() {
             let mut profile = Profile::new(self.half[axis]);
             for chunk in points.chunks(LANES * self.every) {
-                // What the last chunk lacks is its first point, not counted again.
+                // Missing points of the last chunk are filled with its first point, which is not counted again.
                 let lanes = std::array::from_fn(|lane| *chunk.get(lane * self.every).unwrap_or(&chunk[0]));
                 self.model.project(&lanes, axis, &mut projected);
                 let mut inside = profile.sample(self.image, &projected);

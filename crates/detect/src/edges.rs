@@ -6,12 +6,12 @@ use windhover_base::msg::ImageView;
 /// Most points taken along a side.
 const MOST_POINTS: usize = 24;
 
-/// How an edge is looked for.
+/// Parameters of the search for an edge.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(super) struct EdgeSearch {
     /// How far from the side given, pixels.
     pub reach: f32,
-    /// Smallest step that counts, grey levels.
+    /// Smallest step that is accepted, grey levels.
     pub least_step: f32,
 }
 
@@ -54,7 +54,7 @@ fn fit_side(image: ImageView<'_>, a: Point, b: Point, search: EdgeSearch) -> Opt
     let steps = &mut steps[..found];
     let (mut at_middle, mut slope) = fit(steps)?;
     for _ in 0..2 {
-        // Cauchy weights at half a pixel: clutter that touches a side must not pull it.
+        // Cauchy weights at half a pixel: an object that touches a side must not move it.
         let weighed = |s: &Step| {
             let r = (s.offset - at_middle - slope * s.t) * 2.0;
             Step { weight: s.weight / (1.0 + r * r), ..*s }

@@ -56,7 +56,7 @@ impl Equations {
         total(&self.squares)
     }
 
-    /// Mean slope of the weighted residuals over the mean weight: how much Cauchy's weights flatten them.
+    /// Mean slope of the weighted residuals over the mean weight: the factor by which Cauchy's weights reduce them.
     pub fn flattening(&self) -> f64 {
         total(&self.slopes) / total(&self.weights)
     }
@@ -92,7 +92,7 @@ pub(super) fn weigh(edges: &Located, spread: f32) -> (Lanes, Lanes) {
     (weights, slopes)
 }
 
-/// Sums the equations of edges up.
+/// Sums the equations of edges.
 pub(super) struct Accumulate<'a> {
     pub located: &'a [Located],
     pub spread: f32,
@@ -127,7 +127,7 @@ fn add_product(to: &mut Lanes, a: &Lanes, b: &Lanes) {
     *to = std::array::from_fn(|lane| to[lane] + a[lane] * b[lane]);
 }
 
-/// Moves the residuals by what a step of the parameters does to them.
+/// Changes the residuals by the effect of a step of the parameters.
 pub(super) struct Advance<'a> {
     pub located: &'a mut [Located],
     pub step: [f32; PARAMETERS],

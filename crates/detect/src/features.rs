@@ -1,7 +1,7 @@
-//! Static ground features followed from frame to frame: corners found where nothing else is, carried over by
-//! pyramidal Lucas–Kanade (Bouguet 2000), then put where the patch they were born with is found, however it is
-//! turned, scaled or slanted by now ([`Template`]). A feature whose patch is no longer found ends; what is found
-//! later at its place is another one, so that no drift adds up within one.
+//! Static ground features followed from frame to frame: corners found where nothing else is, carried to the next frame
+//! by pyramidal Lucas–Kanade (Bouguet 2000), then placed where the patch of their first frame is found, also if it is
+//! now turned, scaled or slanted ([`Template`]). A feature whose patch is no longer found ends; what is found later at
+//! its place is another one, so that no drift adds up within one.
 
 use nalgebra::Vector2;
 
@@ -12,24 +12,24 @@ use super::simd::Simd;
 use super::template::{Template, Warp};
 use windhover_base::msg::{FeatureTrack, ImageView};
 
-/// Least correlation with the patch a feature was born with.
+/// Least correlation with the patch of a feature's first frame.
 const LEAST_CORRELATION: f32 = 0.85;
 
 /// Most that the contrast of a patch changes from one frame to the next, as a factor.
 const MOST_GAIN: f32 = 2.0;
 
-/// Largest sigma of a place at birth for a noise of one grey level, pixels.
+/// Largest sigma of a new feature's place for a noise of one grey level, pixels.
 const MOST_SIGMA_A_LEVEL: f32 = 0.02;
 
 /// Parts of the frame, across and down; each is to have a feature before any has two.
 const PARTS: (usize, usize) = (4, 3);
 
-/// Most features followed, those that move among them, as a multiple of those wanted.
+/// Most features that are followed, moving ones included, as a multiple of the wanted number.
 const MOST_MOVING: usize = 2;
 
 const UPRIGHT: [f32; 4] = [1.0, 0.0, 0.0, 1.0];
 
-/// What interpolation leaves, pixels.
+/// Error that interpolation leaves, pixels.
 const LEAST_SIGMA: f32 = 0.03;
 
 /// A feature followed.
@@ -40,14 +40,14 @@ struct Track {
     /// By how much it moved from the frame before, pixels.
     shift: [f32; 2],
     template: Template,
-    /// Contrast over that at birth, in the last frame.
+    /// Contrast in the last frame, relative to that in its first frame.
     gain: f32,
     sigma: f32,
-    /// Whether it is of something that moves. It is followed on to keep others off.
+    /// Whether it lies on something that moves. It is followed further, so that no new feature is found there.
     moves: bool,
 }
 
-/// Keeps a number of features alive; keeps its buffers.
+/// Maintains a number of features; reuses its buffers.
 #[derive(Clone, Debug)]
 pub(super) struct FeatureTracker {
     wanted: usize,
@@ -57,31 +57,31 @@ pub(super) struct FeatureTracker {
     size: (usize, usize),
     pyramid: Pyramid,
     before: Pyramid,
-    /// By how much the features found in this frame have moved.
+    /// Shifts of the features found in this frame.
     shifts: Vec<[f32; 2]>,
-    /// And by what their patches have turned; the whole view turns about alike.
+    /// Turns of their patches; the whole view turns by about the same.
     turns: Vec<[f32; 4]>,
-    /// By what the view turned from frame to frame the last time it was seen to.
+    /// Turn of the view from frame to frame when it was last measured.
     turn: [f32; 4],
     search: Corners,
     corners: Vec<Corner>,
     simd: Simd,
 }
 
-/// A place that features keep off: centre and radius, pixels.
+/// A place where no features are wanted: centre and radius, pixels.
 pub(super) type Circle = (Vector2<f64>, f64);
 
-/// What features keep off: circles, and what moves.
+/// Places where no features are wanted: circles, and what moves.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Obstacles<'a> {
     pub occupied: &'a [Circle],
-    /// Features that were found to be of something that moves, and how far others keep off them, pixels.
+    /// Features that were found to lie on something that moves, and the distance that others keep from them, pixels.
     pub moving: &'a [u64],
     pub moving_radius_px: f64,
 }
 
 impl FeatureTracker {
-    /// Keeps `wanted` features alive.
+    /// Maintains `wanted` features.
     pub fn new(wanted: usize) -> Self {
         Self {
             wanted,
@@ -99,8 +99,8 @@ impl FeatureTracker {
         }
     }
 
-    /// Follows the features into a frame and finds new ones off the obstacles, in the place of those that move.
-    /// A frame of another size than the last starts anew.
+    /// Follows the features into a frame and finds new ones away from the obstacles, as replacements of those that
+    /// move. A frame of another size than the last starts anew.
     pub fn process(&mut self, image: ImageView<'_>, off: Obstacles<'_>, out: &mut Vec<FeatureTrack>) {
         if self.wanted == 0 {
             return;
@@ -150,7 +150,7 @@ impl FeatureTracker {
         });
     }
 
-    /// How many features are not known to move.
+    /// Number of features that are not known to move.
     fn still(&self) -> usize {
         self.tracks.iter().filter(|track| !track.moves).count()
     }
@@ -197,14 +197,14 @@ impl FeatureTracker {
 /// The median of each element.
 fn middle(turns: &[[f32; 4]]) -> [f32; 4] {
     std::array::from_fn(|k| {
-        // The element that half of the others lie on either side of; of two middle ones the lower.
+        // The lower of two middle elements: half of the others lie on each side.
         let below = |x: f32| turns.iter().filter(|t| t[k] < x).count();
         let rank = |x: f32| below(x).abs_diff(turns.len() / 2);
         turns.iter().map(|t| t[k]).min_by_key(|x| rank(*x)).unwrap_or(UPRIGHT[k])
     })
 }
 
-/// Whether a place is off all obstacles.
+/// Whether a place is away from all obstacles.
 fn clear(at: [f32; 2], tracks: &[Track], off: Obstacles<'_>) -> bool {
     let apart = |track: &Track| f64::from((at[0] - track.warp.at[0]).hypot(at[1] - track.warp.at[1]));
     let beside = |track: &Track| track.moves && apart(track) < off.moving_radius_px;
@@ -225,7 +225,7 @@ mod tests {
 
     const SIZE: (usize, usize) = (400, 320);
 
-    /// A view of ground without end, of waves of many lengths and directions: `frame = view · ground`.
+    /// A view of unlimited ground with waves of many lengths and directions: `frame = view · ground`.
     fn frame(view: &Similarity2<f64>, light: f64) -> GrayImage {
         let back = view.inverse();
         let mut image = GrayImage::new(SIZE.0, SIZE.1);
@@ -242,7 +242,7 @@ mod tests {
         image
     }
 
-    /// Helicopter that drifts, turns and sinks: the picture moves 6 px, turns 2° and grows 1 % a frame.
+    /// A helicopter that drifts, turns and sinks: the picture moves 6 px, turns 2° and grows 1 % a frame.
     fn view(n: i32) -> Similarity2<f64> {
         let middle = nalgebra::Translation2::new(200.0, 160.0);
         let turned = Rotation2::new(f64::from(2 * n).to_radians());

@@ -1,5 +1,5 @@
-//! Where a place in one frame about is in the next: Lucas–Kanade from coarse levels to fine (Bouguet 2000), begun at
-//! the most similar of the shifts that are likely.
+//! The approximate place in the next frame of a place in one frame: Lucas–Kanade from coarse levels to fine (Bouguet
+//! 2000), started at the most similar of the likely shifts.
 
 use super::pyramid::Pyramid;
 use windhover_base::msg::ImageView;
@@ -15,12 +15,12 @@ const LEVELS: std::ops::Range<usize> = 1..5;
 /// Level on which shifts are compared.
 const COMPARED: usize = 3;
 
-/// Less than this correlation is another place.
+/// Below this correlation it is another place.
 const LEAST_CORRELATION: f32 = 0.5;
 
 type Patch = [f32; AREA];
 
-/// Two frames, and the later one itself.
+/// Two frames, and the image of the later one.
 pub(super) struct Flow<'a> {
     pub from: &'a Pyramid,
     pub to: &'a Pyramid,
@@ -80,7 +80,7 @@ fn inside(image: ImageView<'_>, at: [f32; 2]) -> bool {
         && at[1] + margin < image.height as f32
 }
 
-/// Grey levels around a place that is inside: all of them lie alike between pixels.
+/// Grey levels around a place that is inside the image: all samples have the same position between pixels.
 fn patch(image: ImageView<'_>, at: [f32; 2]) -> Patch {
     let (u, v) = (at[0] as usize - HALF, at[1] as usize - HALF);
     let (fu, fv) = (at[0].fract(), at[1].fract());
@@ -97,7 +97,7 @@ fn patch(image: ImageView<'_>, at: [f32; 2]) -> Patch {
     patch
 }
 
-/// Inverse compositional alignment of a patch, mean taken off (Baker and Matthews 2004).
+/// Inverse compositional alignment of a patch, with the mean subtracted (Baker and Matthews 2004).
 fn align(image: ImageView<'_>, reference: &Patch, guess: [f32; 2]) -> Option<[f32; 2]> {
     let (gx, gy) = gradients(reference);
     let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);

@@ -1,17 +1,17 @@
-//! How noisy a frame is, from the frame itself.
+//! The noise of a frame, measured in the frame itself.
 
 use windhover_base::msg::ImageView;
 
-/// Rows looked at.
+/// Number of rows that are used.
 const ROWS: usize = 24;
 
-/// Places looked at in a row, about.
+/// Approximate number of places that are used in a row.
 const PLACES: usize = 200;
 
 /// Standard deviation of a pixel's noise, grey levels.
 ///
-/// From `|p − 2q + r|` of neighbours along rows, whose standard deviation is √6 of a pixel's where the scene
-/// is smooth. Texture only makes it larger, so the first quartile is used: 0.3186 σ of a normal.
+/// From `|p − 2q + r|` of neighbours along rows, whose standard deviation is √6 of a pixel's where the scene is smooth.
+/// Texture makes it larger only, so the first quartile is used: 0.3186 σ of a normal.
 pub(super) fn noise_sigma(image: ImageView<'_>) -> f32 {
     if image.width < 3 {
         return 0.0;

@@ -1,4 +1,4 @@
-//! What a quadrilateral says: its cells sampled, told white from black, and looked up.
+//! Decoding of a quadrilateral: its cells are sampled, separated into white and black, and looked up.
 
 use super::family::{Cell, Family, Word};
 use super::homography::{Homography, narrow, wide};
@@ -9,29 +9,29 @@ use windhover_base::msg::ImageView;
 /// Largest grid side: tag36h11 with a border of two cells and its ring.
 const MOST: usize = 12;
 
-/// A word read from a quadrilateral.
+/// A code word read from a quadrilateral.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(super) struct Reading {
     pub word: Word,
-    /// Mean distance of the cells from the threshold, of the white or the black ones, whichever is less.
+    /// Mean distance of the cells from the threshold, of the white or the black ones, whichever is smaller.
     pub margin: f32,
     /// Whether most white cells are as light as a pixel can be: light spreads from them over the black ones.
     pub is_over_exposed: bool,
 }
 
-/// From where on a cell is as light as a pixel can be, grey levels.
+/// From this grey level on a cell is as light as a pixel can be.
 const OVER_EXPOSED: f32 = 250.0;
 
 /// Least step from black border to white ring, grey levels.
 const LEAST_CONTRAST: f32 = 5.0;
 
-/// Share of border and ring cells that may lie on the wrong side of the threshold; of families with few bits, whose
-/// words chance makes often, less.
+/// Share of border and ring cells that may lie on the wrong side of the threshold; less for families with few bits,
+/// whose code words often occur by chance.
 const MOST_WRONG_BORDER: f32 = 0.2;
 const MOST_WRONG_OF_FEW: f32 = 0.04;
 const FEW_BITS: usize = 20;
 
-/// And how far every cell of theirs must be from the threshold, over the mean.
+/// For those families: the least distance of every cell from the threshold, relative to the mean.
 const CLEAR_OF_FEW: f32 = 0.45;
 
 fn most_wrong(family: &Family) -> f32 {
@@ -49,7 +49,8 @@ impl Grid {
     fn sample(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family: &Family) -> Option<Self> {
         let h = Homography::of_square(family.width as f64, &wide(quad))?;
         let longest = (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).fold(1.0, f32::max);
-        // Averaging over the cell: the level in which a cell is two to four pixels wide, seen aslant the narrow way.
+        // Averaging over the cell: the level in which a cell is two to four pixels wide, across the narrow direction
+        // where the tag is seen at an angle.
         let cell = polygon_area(quad) / longest / family.width as f32;
         let level = pyramid.for_size(image, cell, 2.0);
         let (side, pad) = (family.grid_side(), family.pad);
@@ -105,7 +106,7 @@ impl Grid {
         Some(thresholds)
     }
 
-    /// Halfway levels between the border and the ring outside it, one a border cell of each side: top, right,
+    /// Levels halfway between the border and the ring outside it, one for each border cell of each side: top, right,
     /// bottom, left, by x or y.
     fn border_levels(&self) -> [[f32; MOST]; 4] {
         let (low, high) = (self.pad, self.side - 1 - self.pad);
@@ -174,8 +175,8 @@ impl Grid {
         Some(thresholds)
     }
 
-    /// The border's levels carried inwards: the mean of what left and right, above and below say, each
-    /// weighed by its nearness.
+    /// The border's levels interpolated inwards: the mean of the levels left and right, above and below, each weighted
+    /// by its nearness.
     fn blended_threshold(&self, border: &[[f32; MOST]; 4]) -> [f32; MOST * MOST] {
         let (low, high) = (self.pad, self.side - 1 - self.pad);
         let mut thresholds = [0.0; MOST * MOST];
@@ -196,7 +197,7 @@ impl Grid {
         thresholds
     }
 
-    /// The same with each cell's difference from its four neighbours doubled: what blur took away.
+    /// The same with each cell's difference from its four neighbours doubled, to undo blur.
     fn sharpened(&self) -> Self {
         let mut values = self.values;
         let side = self.side;
@@ -237,7 +238,7 @@ impl Grid {
         Some(Reading { word, margin: mean(white).min(mean(black)), is_over_exposed })
     }
 
-    /// Whether the cells are those of tag `id`, as nearly as they must be to be read.
+    /// Whether the cells are those of tag `id`, as exactly as reading requires.
     fn agrees(&self, thresholds: &[f32; MOST * MOST], family: &Family, id: u32) -> bool {
         let (mut wrong_data, mut wrong, mut all) = (0, 0.0, 0.0);
         for i in 0..self.side * self.side {
@@ -256,9 +257,9 @@ impl Grid {
     }
 }
 
-/// Whether a quadrilateral in the tag's own order holds tag `id`: what `read` says of a candidate, asked once more of
-/// what was made of it. A fit that took hold of other edges than the tag's fails here: the border of two cells that
-/// Kalibr prints has another square inside, without light around it.
+/// Whether a quadrilateral in the tag's own order holds tag `id`: the test that `read` makes of a candidate, repeated
+/// for the refined result. A fit to other edges than the tag's fails here: the border of two cells that Kalibr prints
+/// has another square inside, without light around it.
 pub(super) fn agrees(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family: &Family, id: u32) -> bool {
     let Some(grid) = Grid::sample(image, pyramid, quad, family) else { return false };
     let Some(plane) = grid.plane_threshold() else { return false };
@@ -271,8 +272,8 @@ pub(super) fn agrees(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, famil
             || grid.agrees(&grid.blended_threshold(&border), family, id))
 }
 
-/// Reads a quadrilateral given in frame coordinates. Illumination is tried as a plane, then as lit and shaded
-/// halves, then as what the border says of each row and column; the first that gives a word counts.
+/// Reads a quadrilateral given in frame coordinates. Illumination is tried as a plane, then as lit and shaded halves,
+/// then by the border's levels in each row and column; the first that gives a code word is used.
 pub(super) fn read(image: ImageView<'_>, pyramid: &Pyramid, quad: &Quad, family: &Family) -> Option<Reading> {
     let grid = Grid::sample(image, pyramid, quad, family)?;
     let thresholds = grid.plane_threshold()?;

@@ -6,10 +6,10 @@
 use super::simd::Simd;
 use windhover_base::msg::{GrayImage, ImageView};
 
-/// How the first level comes from the frame.
+/// How the first level is computed from the frame.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) enum Base {
-    /// It is the frame.
+    /// It is the frame itself.
     Full,
     /// Three pixels become two.
     TwoThirds,
@@ -17,16 +17,16 @@ pub(super) enum Base {
     Half,
 }
 
-/// What becomes of a last row or column that does not fill a pixel of the next level.
+/// Treatment of a last row or column that does not fill a pixel of the next level.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) enum Rim {
-    /// It is left out: all pixels are means of what is in the frame.
+    /// It is left out: all pixels are means of pixels of the frame.
     LeftOut,
-    /// It is repeated: all of the frame is there.
+    /// It is repeated: the whole frame is covered.
     Kept,
 }
 
-/// An image and how many frame pixels are one of its own.
+/// An image, and the number of frame pixels across one of its pixels.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(super) struct Level<'a> {
     pub image: ImageView<'a>,
@@ -45,7 +45,7 @@ impl Level<'_> {
     }
 }
 
-/// Levels below the frame itself, biggest first; keeps its buffers.
+/// Levels below the frame itself, largest first; reuses its buffers.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Pyramid {
     levels: Vec<GrayImage>,
@@ -90,7 +90,7 @@ impl Pyramid {
         }
     }
 
-    /// How many levels there are, the frame included.
+    /// Number of levels, the frame included.
     pub fn len(&self) -> usize {
         self.scales.len() + 1
     }
@@ -103,7 +103,7 @@ impl Pyramid {
         }
     }
 
-    /// The coarsest level in which something `size` frame pixels wide still is `least` pixels wide.
+    /// The coarsest level in which an object `size` frame pixels wide is still `least` pixels wide.
     pub fn for_size<'a>(&'a self, image: ImageView<'a>, size: f32, least: f32) -> Level<'a> {
         let n = self.scales.iter().take_while(|&&scale| size >= least * scale).count();
         self.level(image, n)
@@ -124,7 +124,7 @@ fn halve(from: ImageView<'_>, to: &mut GrayImage, simd: Simd) {
     }
 }
 
-/// Averages blocks of 3/2×3/2; beyond what is left over on the right and below the last pixel is repeated.
+/// Averages blocks of 3/2×3/2; the last pixel is repeated where the frame does not fill a block on the right and below.
 fn two_thirds(from: ImageView<'_>, to: &mut GrayImage, simd: Simd) {
     let (whole, width) = (from.width / 3, to.width);
     for (k, rows) in to.data.chunks_exact_mut(2 * width).enumerate() {

@@ -1,4 +1,4 @@
-//! Quadrilaterals from the outlines of dark regions, and the cheap reasons to refuse one.
+//! Quadrilaterals from the outlines of dark regions, and quick tests that refuse most of them.
 
 use super::components::{Component, Outline};
 use windhover_base::msg::ImageView;
@@ -9,7 +9,7 @@ pub(super) type Point = [f32; 2];
 /// Corners of a quadrilateral, clockwise as seen (u right, v down).
 pub(super) type Quad = [Point; 4];
 
-/// What sizes are looked for in one level, pixels of that level.
+/// Range of sizes that are searched in one level, pixels of that level.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(super) struct SizeLimits {
     /// Smallest mean edge.
@@ -18,16 +18,17 @@ pub(super) struct SizeLimits {
     pub most: f32,
 }
 
-/// Shortest side over longest at which a square is still read: 80° off its normal, and blur.
+/// Shortest side over longest with which a square can still be decoded: 80° off its normal, and blur.
 const LEAST_ASPECT: f32 = 0.13;
 
-/// Narrowest way across a border, pixels of a level, that still counts however large the least edge: seen aslant.
+/// Narrowest width across a border, pixels of a level, that is accepted whatever the least edge is, for tags seen at an
+/// angle.
 const LEAST_SHORT: f32 = 5.0;
 
-/// Largest share of its hull that a border with the dark cells it holds together covers.
+/// Largest share of its hull that a border, with the dark cells connected to it, covers.
 const MOST_FILL: f32 = 0.93;
 
-/// Fewest times that a row of a border is crossed, in the mean: twice, but for the rows above and below the
+/// Fewest times that a row of a border is crossed, in the mean: it is twice except in the rows above and below the
 /// inside.
 const LEAST_CROSSINGS: f32 = 1.3;
 
@@ -35,12 +36,12 @@ const LEAST_CROSSINGS: f32 = 1.3;
 pub(super) fn may_be_border(c: &Component, limits: SizeLimits, width: usize, height: usize) -> bool {
     let (w, h) = (c.width() as f32, c.height() as f32);
     let (short, long) = (w.min(h), w.max(h));
-    // A square's box is 1 to √2 of its edge; blur and threshold may eat a pixel. A tag of the least size
-    // seen aslant is shorter one way and longer the other.
+    // A square's box is 1 to √2 of its edge; blur and threshold may remove a pixel. A tag of the least size seen at an
+    // angle is shorter in one direction and longer in the other.
     let size_fits = long + 1.0 >= limits.least && short <= 1.5 * limits.most;
     let is_wide = short + 1.0 >= 0.55 * limits.least || (short >= LEAST_SHORT && long >= 1.6 * limits.least);
     let shape_fits = is_wide && short >= 0.6 * LEAST_ASPECT * long;
-    // A border is a quarter to a half of its tag; of a large one only a rim is dark against what is near.
+    // A border is a quarter to a half of its tag; of a large one only a rim is dark compared with its surroundings.
     let area = c.area as f32;
     let fill_fits = area >= (0.17 * w * h).min(2.0 * (w + h)) && area <= MOST_FILL * w * h;
     // Pebbles are crossed once.
@@ -50,31 +51,31 @@ pub(super) fn may_be_border(c: &Component, limits: SizeLimits, width: usize, hei
     size_fits && shape_fits && fill_fits && is_open && inside
 }
 
-/// Finds quadrilaterals in outlines; keeps its buffers.
+/// Finds quadrilaterals in outlines; reuses its buffers.
 #[derive(Clone, Debug, Default)]
 pub(super) struct QuadFinder {
     hull: Vec<Point>,
 }
 
 impl QuadFinder {
-    /// The quadrilateral that a component's hull nearly is, half a pixel outside the centres of its
-    /// outermost pixels; `None` where the hull is of another shape.
+    /// The quadrilateral that approximates a component's hull, half a pixel outside the centres of its outermost
+    /// pixels; `None` where the hull has another shape.
     pub fn quad(&mut self, component: &Component, outline: Outline<'_>, limits: SizeLimits) -> Option<Quad> {
-        // Solid blobs, most of what there is, are told by their rows alone: a tag has light cells inside, at
-        // least a seventh of its square.
+        // Most components are solid; their rows alone show it: a tag has light cells inside, at least a seventh of its
+        // square.
         let rows: u32 = outline.iter().map(|(left, right)| u32::from(right - left) + 1).sum();
         if component.area as f32 > MOST_FILL * rows as f32 {
             return None;
         }
         self.find_hull(component, outline);
         let hull_area = polygon_area(&self.hull);
-        // What its pixels cover, not only their centres.
+        // The area that its pixels cover, not only that between their centres.
         let perimeter = perimeter(&self.hull);
         let covered = hull_area + 1.0 + 0.5 * perimeter;
         if covered < 0.5 * limits.least * limits.least {
             return None;
         }
-        // Corners are blunt by about a pixel, sharp ones by more: allow their area, and a tenth for bent edges.
+        // Corners are rounded by about a pixel, acute ones by more: allow for their area, and a tenth for bent edges.
         let blunt = 0.375 * perimeter * perimeter / hull_area.max(1.0);
         let enough = (0.9 * hull_area - blunt).max(6.0);
         let inscribed = largest_quad(&self.hull).filter(|quad| polygon_area(quad) >= enough);
@@ -138,8 +139,8 @@ fn perimeter(points: &[Point]) -> f32 {
     points.iter().map(|&p| distance(std::mem::replace(&mut previous, p), p)).sum()
 }
 
-/// The largest quadrilateral with corners among hull points: the farthest point from the middle, the
-/// farthest from that, the farthest to either side; then each corner in turn moves to where it adds most.
+/// The largest quadrilateral with corners among hull points: the farthest point from the middle, the farthest from
+/// that, the farthest to either side; then each corner in turn moves to where it adds the largest area.
 fn largest_quad(hull: &[Point]) -> Option<Quad> {
     if hull.len() < 4 {
         return None;
@@ -161,18 +162,18 @@ fn largest_quad(hull: &[Point]) -> Option<Quad> {
     convex.then_some(quad)
 }
 
-/// Area that blur takes off the four corners of a small tag, px², and its most in shares of the whole.
+/// Area that blur takes off the four corners of a small tag, px², and the largest share of the whole that it may be.
 const BLUNT_AREA: f32 = 24.0;
 const BLUNT_SHARE: f32 = 0.25;
 
-/// Square of the length over the longest's from which a side of a hull may be a rectangle's.
+/// Square of the least length, relative to the longest, of a hull's side that may be a rectangle's side.
 const LONG_SQUARED: f32 = 0.3;
 
-/// The smallest rectangle around a hull, where the hull fills it but for its corners: motion and blur round those
-/// of a small tag off by several pixels, and no four points of the hull are near them.
+/// The smallest rectangle around a hull, where the hull fills it except its corners: motion and blur round those of a
+/// small tag off by several pixels, and no four points of the hull are near them.
 fn blunt_rectangle(hull: &[Point], hull_area: f32) -> Option<Quad> {
     let mut best: Option<(f32, Quad)> = None;
-    // One of its sides is along one of the hull's; short ones are of corners.
+    // One of its sides is along one of the hull's; short sides of the hull belong to corners.
     let side = |i: usize| (hull[i], hull[(i + 1) % hull.len()]);
     let square = |(a, b): (Point, Point)| (a[0] - b[0]) * (a[0] - b[0]) + (a[1] - b[1]) * (a[1] - b[1]);
     let longest = (0..hull.len()).map(|i| square(side(i))).fold(0.0, f32::max);
@@ -256,9 +257,9 @@ pub(super) fn corners_of(lines: &[Line; 4]) -> Option<Quad> {
     Some(quad)
 }
 
-/// Whether a quadrilateral looks like a tag at a glance: 13 of 16 pairs of pixels across its sides are darker
-/// inside, by `least_step` and by `least_share` of what the outer one is, and among 36 pixels further in some are
-/// about as light as outside and some about as dark as the border.
+/// Whether a quadrilateral looks like a tag in a quick test: 13 of 16 pairs of pixels across its sides are darker
+/// inside, by `least_step` and by `least_share` of what the outer one is, and among 36 pixels further in some are about
+/// as light as outside and some about as dark as the border.
 ///
 /// `reach` is how far inside and outside the side the pairs lie, pixels.
 pub(super) fn looks_like_tag(
@@ -274,7 +275,7 @@ pub(super) fn looks_like_tag(
         let n = Line::through(a, b).n;
         for t in [0.2, 0.4, 0.6, 0.8] {
             let at = [a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])];
-            // At the image's rim the last pixel stands for what is beyond it.
+            // At the image's rim the last pixel is used for what is outside.
             let pixel = |d: f32| f32::from(nearest_inside(image, [at[0] + d * n[0], at[1] + d * n[1]]));
             let (inside, outside) = (pixel(-reach), pixel(reach));
             wrong += u32::from(outside - inside < least_step.max(least_share * outside));

@@ -29,7 +29,7 @@ use windhover_base::msg::ImageView;
 /// distorts by 0.18 r², is 10⁻⁴ to 2·10⁻⁴ on the way to the rim.
 const LENS_CURVATURE: f64 = 1.5e-4;
 
-/// What a wide lens bends a tag's sides outwards by, over the third power of half their length, 1/px²: 0.3 r² at a
+/// How far a wide lens bends a tag's sides outwards, over the third power of half their length, 1/px²: 0.3 r² at a
 /// focal length of 1000 px.
 const LENS_BARREL: f64 = 3e-7;
 
@@ -37,17 +37,17 @@ const LENS_BARREL: f64 = 3e-7;
 /// what it shrinks lengths by along the radius and across, a third where it shrinks them by 5 and 15 %.
 const LENS_TWIST: f64 = 2.5e-5;
 
-/// Parameters after the homography's eight, which are held near nought: their sigmas are given.
+/// Parameters after the homography's eight, which have a prior at zero with given sigmas.
 const HELD: usize = PARAMETERS - 8;
 
-/// How many blocks' worth the fit takes up, for each parameter, of the errors it is made from.
+/// Share of the errors, in blocks, that the fit absorbs for each parameter.
 const TAKEN_UP: f64 = 0.375;
 
-/// Most that a neighbouring cell's nearness shifts an edge, in cells: what the shift is held near nought by.
+/// Most that a neighbouring cell's nearness shifts an edge, in cells: the sigma of its prior at zero.
 const NARROW_SHIFT: f64 = 0.1;
 
-/// How far light spreads over the edges of cells, in cells, where white is over-exposed or ink has run: held near
-/// nought by this.
+/// How far light spreads over the edges of cells, in cells, where white is over-exposed or ink has run: the sigma of
+/// its prior at zero.
 const SPREAD: f64 = 0.1;
 
 /// Error that neighbouring cells leave on all edges of one direction alike, their shift being fitted: pixels, at a
@@ -56,7 +56,7 @@ const SPREAD: f64 = 0.1;
 const NEIGHBOURS: f64 = 1.2;
 const SHIFT_ERROR: f64 = 0.3;
 
-/// A round that moves no corner further is the last, pixels: another would move them by a twentieth of it.
+/// The round that moves no corner farther than this is the last, pixels: another would move them by a twentieth of it.
 const SETTLED_PX: f64 = 0.08;
 const MOST_ROUNDS: usize = 10;
 
@@ -65,9 +65,9 @@ const MOST_ROUNDS: usize = 10;
 const MOST_STEPS: usize = 4;
 const LEAST_STEP_PX: f64 = 0.005;
 
-/// Share of the edges between a tag's cells that are seen where the fit is right. Where fewer are and windows reach
-/// from cell to cell, edges were taken for their neighbours: blur is wider than a cell then, and corners are wrong
-/// by so much of one (the same proof).
+/// Share of the edges between a tag's cells that are seen where the fit is right. Where fewer are seen and windows
+/// reach from cell to cell, edges were confused with neighbouring ones: blur is then wider than a cell, and corners are
+/// wrong by this part of a cell (the same proof).
 const ENOUGH_SEEN: f64 = 0.93;
 const MISTAKEN: f64 = 0.25;
 
@@ -88,8 +88,8 @@ impl Refiner {
         Self { simd, edges: TagEdges::default(), located: Vec::new(), equations: Equations::default() }
     }
 
-    /// Refines corners given in the tag's own order; `None` where too few edges are seen or the fit leaves
-    /// what was given. Where white `spreads`, by how much is fitted too.
+    /// Refines corners given in the tag's own order; `None` where too few edges are seen or the fit moves away from the
+    /// given corners. Where white `spreads`, the distance is fitted too.
     pub fn refine(
         &mut self,
         image: ImageView<'_>,
@@ -122,8 +122,8 @@ impl Refiner {
 
     /// Moves a model to where the edges are; the covariance of its parameters.
     ///
-    /// First with few points and wide windows, until the corners are nearly right; then with all, in windows as
-    /// narrow as the blur allows: in one narrower than a smear, edges stay where they are put.
+    /// First with few points and wide windows, until the corners are nearly right; then with all, in windows as narrow
+    /// as the blur allows: in a window narrower than a smear, edges stay where the search begins.
     fn fit(
         &mut self,
         image: ImageView<'_>,
@@ -166,7 +166,7 @@ impl Refiner {
         Some((self.covariance(&last?, spread)?, windows))
     }
 
-    /// Moves a model to where the located edges have it, their places left as they are.
+    /// Moves a model to fit the located edges, whose places are not searched again.
     fn settle(&mut self, model: &mut Model, held: [f64; HELD], spread: f64) -> Option<Solved> {
         let mut last = None;
         for _ in 0..MOST_STEPS {
@@ -188,13 +188,13 @@ impl Refiner {
         self.simd.run(Locate { points: &edges.points, located, image, model: model.narrow(), half, every });
     }
 
-    /// How many edges are located.
+    /// Number of located edges.
     fn count(&self) -> usize {
         self.located.iter().map(|l| l.count).sum()
     }
 
-    /// Makes strengths relative to their mean. Strong edges are located better, up to the point where noise no
-    /// longer tells.
+    /// Makes strengths relative to their mean. Strong edges are located better, up to the point where noise no longer
+    /// matters.
     fn normalise(&mut self) {
         let mean = self.located.iter().flat_map(|l| l.strength).sum::<f32>() / self.count() as f32;
         for strength in self.located.iter_mut().flat_map(|l| &mut l.strength) {
@@ -271,19 +271,20 @@ impl Refiner {
             blocks += 1.0;
         }
         let inverse = solved.information.inverse();
-        // As many parameters as the image tells: of those held, the share that is not what they are held by.
+        // The number of parameters that the image determines: of those with a prior, the share that does not come from
+        // the prior.
         let held =
             solved.holds.iter().zip(PARAMETERS - HELD..).map(|(hold, k)| hold * inverse[(k, k)]).sum::<f64>();
         let told = PARAMETERS as f64 - held;
-        // The fit takes up some of it, most in the corners.
+        // The fit absorbs some of it, most in the corners.
         let lambda = sum / told / (1.0 - TAKEN_UP * told / blocks).max(0.5);
         let flattening = solved.flattening.clamp(0.4, 1.0);
         (blocks > 4.0).then(|| inverse * (lambda / (flattening * flattening)))
     }
 }
 
-/// Sigmas by which the parameters after the homography's are held near nought, for a tag of so long a half side and cells
-/// so wide, pixels.
+/// Sigmas of the priors at zero of the parameters after the homography's, for a tag with this half side and these
+/// cells, pixels.
 fn held(half: f64, cell: f64) -> [f64; HELD] {
     let (bow, barrel) = (LENS_CURVATURE * half.powi(2) / 2.0, LENS_BARREL * half.powi(3));
     let (twist, shift) = (LENS_TWIST * half.powi(2), NARROW_SHIFT * cell);
@@ -294,7 +295,7 @@ fn held(half: f64, cell: f64) -> [f64; HELD] {
 struct Solved {
     step: Row,
     information: Cholesky<f64, Const<PARAMETERS>>,
-    /// What of the information is not the image's.
+    /// The part of the information that comes from the priors.
     holds: [f64; HELD],
     flattening: f64,
 }

@@ -1,16 +1,16 @@
-//! The edges between the cells of a decoded tag, and how wide the cells beside them are.
+//! The edges between the cells of a decoded tag, and the widths of the cells beside them.
 
 use super::edge_points::EdgePoint;
 use super::family::Family;
 
-/// Cells on a side of a block: the errors of edges that near each other are alike, for they share pixels.
+/// Cells on a side of a block: edges so near each other have similar errors, because they share pixels.
 const BLOCK: usize = 2;
 
 /// Blocks of the largest grid.
 pub(super) const MOST_BLOCKS: usize = 64;
 
-/// How far the ground beside a tag is from the light of its ring towards the dark of its border: most ground
-/// reflects a fifth to a half of the light, paper 85 %, ink 7 %.
+/// How far the ground beside a tag is from the light of its ring towards the dark of its border: most ground reflects a
+/// fifth to a half of the light, paper 85 %, ink 7 %.
 const GROUND: f32 = 0.6;
 
 /// Pixels from one point to the next along an edge, and most points of an edge.
@@ -48,7 +48,7 @@ impl TagEdges {
             if before == after {
                 continue;
             }
-            // How far what is beyond a cell is from it to the other colour.
+            // The distance in brightness of what is beyond a cell from the cell, relative to the other colour.
             let contrast = |beyond: i32, cell: bool| {
                 let beyond = (-1..=w).contains(&beyond).then(|| light(beyond)).flatten();
                 beyond.map_or(GROUND, |light| f32::from(u8::from(light != cell)))

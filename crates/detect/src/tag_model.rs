@@ -19,7 +19,7 @@ pub(super) struct Refined {
     pub center_cov: Matrix2<f64>,
 }
 
-/// What stays of an edge's error when noise is averaged away: sampling, neighbouring cells, print. Pixels.
+/// Part of an edge's error that remains when noise is averaged out: sampling, neighbouring cells, print. Pixels.
 pub(super) const FLOOR_PX: f64 = 0.02;
 
 /// Homography in ξ, η (row by row, last entry 1), the bow, the barrel, the twist, the shifts of edges and
@@ -29,7 +29,7 @@ pub(super) struct Model {
     pub theta: Row,
     /// Half sides over the root mean square of their lengths: a and b.
     sides: [Vector2<f64>; 2],
-    /// Of the pixels meant here: near the tag, so that the parameters are of one size.
+    /// Origin of the pixel coordinates used here: near the tag, so that the parameters have similar size.
     origin: Vector2<f64>,
     /// Whether light spreads from white cells.
     spreads: bool,
@@ -56,7 +56,7 @@ impl Model {
         Some(Self { theta, sides: sides.map(|s| s / length.max(1e-9)), origin: origin.into(), spreads })
     }
 
-    /// How far a corner is from where another model has it, at most.
+    /// Largest distance between a corner and the same corner of another model.
     pub fn moved(&self, other: &Self) -> f64 {
         let moved = |(x, y): (f64, f64)| (self.at(x, y).0 - other.at(x, y).0).norm();
         CORNERS.into_iter().map(moved).fold(0.0, f64::max)
@@ -100,8 +100,8 @@ impl Model {
         [area / d_eta.norm().max(1e-9), area / d_xi.norm().max(1e-9)]
     }
 
-    /// By how much blur lets edges beside cells that are one wide appear nearer the other cell, of edges crossed along
-    /// ξ (0) or η (1), pixels.
+    /// How far blur moves the visible edges beside cells that are one wide towards the other cell, for edges crossed
+    /// along ξ (0) or η (1), pixels.
     pub fn shift(&self, axis: usize) -> f64 {
         self.theta[13 + axis]
     }

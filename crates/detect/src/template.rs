@@ -1,6 +1,6 @@
-//! A patch of ground as a feature was born with it, found again however the view has turned, come nearer or
-//! tilted since: an affine warp by inverse composition (Baker and Matthews 2004), with gain and offset of the light
-//! projected out (Hager and Belhumeur 1998).
+//! The patch of ground of a feature's first frame, found again after the view has turned, come nearer or tilted: an
+//! affine warp by inverse composition (Baker and Matthews 2004), with gain and offset of the light eliminated (Hager
+//! and Belhumeur 1998).
 
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
@@ -10,7 +10,7 @@ use windhover_base::msg::ImageView;
 /// Half width of the patch, pixels.
 const HALF: usize = 12;
 const SIDE: usize = 2 * HALF + 1;
-/// The patch in whole lanes; what is left over is zero.
+/// The patch in whole vector lanes; the remainder is zero.
 const LANES: usize = 8;
 const AREA: usize = (SIDE * SIDE).div_ceil(LANES) * LANES;
 /// The patch with a rim for smoothing.
@@ -21,10 +21,10 @@ const PARAMETERS: usize = 6;
 const BLOCK: usize = 5;
 const BLOCKS: usize = SIDE / BLOCK;
 const STEPS: usize = 12;
-/// Weight of the matrix foretold: what residuals of four grey levels are to a hundredth of its elements. A disc says
-/// nothing of its turning, a corner little of its scale.
+/// Weight of the predicted matrix: residuals of four grey levels against a hundredth of its elements. A disc does not
+/// show its turn, and a corner hardly shows its scale.
 const FORETOLD: f32 = 4.0 * 4.0 * 1e4;
-/// Farthest a patch may be from where it was guessed, pixels.
+/// Farthest a patch may be from the initial guess, pixels.
 const FARTHEST: f32 = 3.0;
 
 type Patch = [f32; AREA];
@@ -43,13 +43,13 @@ impl Warp {
         Self { at, matrix: [1.0, 0.0, 0.0, 1.0] }
     }
 
-    /// The same at another place, its matrix turned, scaled and slanted by `turn` (row by row) besides.
+    /// The same at another place, its matrix turned, scaled and slanted by `turn` (row by row) in addition.
     pub fn moved(&self, at: [f32; 2], turn: &[f32; 4]) -> Self {
         let ([a, b, c, d], [ta, tb, tc, td]) = (self.matrix, *turn);
         Self { at, matrix: [ta * a + tb * c, ta * b + tb * d, tc * a + td * c, tc * b + td * d] }
     }
 
-    /// What turned the matrix of an earlier warp into that of this: `self before⁻¹`.
+    /// The matrix that leads from an earlier warp's to this one's: `self before⁻¹`.
     pub fn turn_since(&self, before: &Self) -> Option<[f32; 4]> {
         let [a, b, c, d] = self.matrix;
         let [oa, ob, oc, od] = before.matrix;
@@ -77,7 +77,7 @@ impl Warp {
         (0.3..3.0).contains(&determinant) && squares < 2.6 * determinant
     }
 
-    /// By what its matrix differs from another's, in the patch's coordinates: `other⁻¹ self − 1`.
+    /// The difference of its matrix from another's, in the patch's coordinates: `other⁻¹ self − 1`.
     fn apart(&self, other: &Self) -> Option<[f32; 4]> {
         let [a, b, c, d] = self.matrix;
         let [oa, ob, oc, od] = other.matrix;
@@ -109,17 +109,17 @@ pub(super) struct Found {
     pub sigma: f32,
 }
 
-/// What is looked for, with all that can be computed once.
+/// The patch that is searched, with everything that can be computed once.
 #[derive(Clone, Debug)]
 pub(super) struct Template {
     /// Grey levels less their mean.
     grey: Patch,
     power: f32,
-    /// Grey levels' derivatives by the parameters, less what gain and offset of the light explain.
+    /// Grey levels' derivatives by the parameters, without the part that gain and offset of the light explain.
     steepest: [Patch; PARAMETERS],
-    /// `(Σ sᵀ s + Λ)⁻¹` with the steepest descent s and the weight Λ of what is foretold of the matrix.
+    /// `(Σ sᵀ s + Λ)⁻¹` with the steepest descent s and the weight Λ of the predicted matrix.
     inverse: SMatrix<f32, PARAMETERS, PARAMETERS>,
-    /// By how much a residual moves the place found along u and along v, pixels a grey level.
+    /// How far a residual moves the found place along u and along v, pixels a grey level.
     influence: [Patch; 2],
     /// Larger variance of the place for residuals of variance one.
     spread: f32,
@@ -131,8 +131,8 @@ impl Template {
         Warp::upright(at).is_inside(image)
     }
 
-    /// The patch around the point nearest to a place that its edges point at, a whole pixel, so that nothing is
-    /// interpolated in what is to be found again; `None` where it has too little structure.
+    /// The patch around the point at which its edges point, nearest to a place, at a whole pixel, so that the patch
+    /// itself is not interpolated; `None` where it has too little structure.
     pub fn new(image: ImageView<'_>, near: [f32; 2], simd: Simd) -> Option<(Self, Warp)> {
         let mut warp = Warp::upright(near.map(f32::round));
         let mut gradient = gradients(image, &warp, simd)?;
@@ -189,7 +189,7 @@ impl Template {
         self.spread.sqrt()
     }
 
-    /// The patch near a guess, whose matrix counts as foretold; `None` where it runs away or out of the image.
+    /// The patch near a guess, whose matrix is the predicted one; `None` where the search diverges or leaves the image.
     pub fn find(&self, image: ImageView<'_>, guess: Warp, simd: Simd) -> Option<Found> {
         let mut warp = guess;
         let mut seen = [0.0; AREA];
@@ -229,9 +229,9 @@ impl Template {
         Some(Found { warp, correlation, gain, sigma })
     }
 
-    /// One sigma of the place along its worse axis, from what is left unexplained. Pixels near each other are wrong
-    /// together (blur is another one, the ground is not flat), so what whole blocks of them pull the place by counts,
-    /// as often as it occurs: `Σ (Σ w e)²`, the inner sum over a block, with the influence w of a residual e.
+    /// One sigma of the place along its worse axis, from the residuals. Pixels near each other have common errors (blur
+    /// has changed, the ground is not flat), so the effect of whole blocks on the place is summed: `Σ (Σ w e)²`, the
+    /// inner sum over a block, with the influence w of a residual e.
     fn sigma(&self, seen: &Patch, gain: f32) -> f32 {
         let mut pulls = [[0.0f32; BLOCKS * BLOCKS]; 2];
         for i in 0..SIDE * SIDE {
@@ -246,7 +246,7 @@ impl Template {
             (product(&pulls[0], &pulls[0]), product(&pulls[1], &pulls[1]), product(&pulls[0], &pulls[1]));
         let half = 0.5 * (uu + vv);
         let most = half + (half * half - (uu * vv - uv * uv)).max(0.0).sqrt();
-        // The fit has taken its share of them.
+        // The fit has absorbed its share of them.
         let share = (BLOCKS * BLOCKS) as f32 / (BLOCKS * BLOCKS - PARAMETERS) as f32;
         (share * most).sqrt()
     }
@@ -275,8 +275,8 @@ fn gradients(image: ImageView<'_>, warp: &Warp, simd: Simd) -> Option<[Patch; 2]
     }))
 }
 
-/// The point with the least weighted sum of squared distances from the lines across the gradients, `(Σ g gᵀ)⁻¹ Σ g gᵀ x`
-/// (Förstner and Gülch 1987): about it a patch may be scaled without being shifted.
+/// The point with the least weighted sum of squared distances from the lines across the gradients, `(Σ g gᵀ)⁻¹ Σ g gᵀ
+/// x` (Förstner and Gülch 1987): scaling a patch about it does not shift the patch.
 fn pointed_at(gradient: &[Patch; 2]) -> Option<[f32; 2]> {
     let (mut matrix, mut sum) = (Matrix2::<f32>::zeros(), Vector2::zeros());
     for i in 0..SIDE * SIDE {
@@ -294,7 +294,7 @@ fn center(patch: &mut Patch) {
     patch[..SIDE * SIDE].iter_mut().for_each(|x| *x -= mean);
 }
 
-/// Sums lane by lane, so that every instruction set gives the same.
+/// Sums lane by lane, so that every instruction set gives the same result.
 fn dot(a: &Patch, b: &Patch) -> f32 {
     let mut sums = [0.0f32; LANES];
     for (a, b) in a.chunks_exact(LANES).zip(b.chunks_exact(LANES)) {

@@ -1,14 +1,14 @@
-//! The windows in which a tag's edges are looked for: as narrow as the blur allows, in either direction.
+//! The windows in which a tag's edges are searched: as narrow as the blur allows, in either direction.
 
 /// Cells wider than this, pixels, have windows no wider: sharp edges are sampled too coarsely in wider ones.
 pub(super) const WIDEST_CELL: f64 = 5.7;
 
-/// Sharpness of edges that need a wider window, and of those that do with a narrower one: a Gaussian's whose
-/// sigma is 0.42 and 0.3 of the half width.
+/// Sharpness below which edges need a wider window, and above which a narrower one: that of a Gaussian whose sigma is
+/// 0.42 and 0.3 of the half width.
 const SMEARED: f64 = 0.5;
 const NARROW: f64 = 0.68;
 
-/// Half widths of the windows in which edges are looked for, along ξ and along η.
+/// Half widths of the windows in which edges are searched, along ξ and along η.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Windows {
     /// Over the width of a cell.
@@ -35,7 +35,7 @@ impl Windows {
         })
     }
 
-    /// Widens where edges fill the window, as far as the neighbours allow; whether it did.
+    /// Widens where edges fill the window, as far as the neighbours allow; returns whether it did.
     pub fn widen(&mut self) -> bool {
         let mut widened = false;
         for axis in 0..2 {
@@ -47,7 +47,7 @@ impl Windows {
         widened
     }
 
-    /// Narrows where edges are narrow: less of the neighbours.
+    /// Narrows where edges are narrow, so that neighbours matter less.
     pub fn narrow(&mut self) {
         for axis in 0..2 {
             if self.sharpness[axis] > NARROW {
@@ -56,8 +56,8 @@ impl Windows {
         }
     }
 
-    /// Variance of the blur, px², from what the windows say: `q = 1 / (1 + (2 σ / h)²)`, nearly. From it σ comes out
-    /// 6 % too large at 0.2 of the half width and 29 % at 1.
+    /// Variance of the blur, px², from the sharpness in the windows: `q = 1 / (1 + (2 σ / h)²)`, nearly. From it σ
+    /// comes out 6 % too large at 0.2 of the half width and 29 % at 1.
     pub fn blurs_squared(&self) -> [f64; 2] {
         [0, 1].map(|axis| {
             let (half, q) = (f64::from(self.half[axis]), self.sharpness[axis].clamp(0.2, 1.0));
@@ -94,7 +94,7 @@ mod tests {
     fn the_blur_is_read_off_the_windows_to_a_third() {
         for (sigma, too_large) in [(0.2, 1.06), (0.3, 1.12), (0.5, 1.22), (1.0, 1.29)] {
             let sharpness = sharpness(sigma);
-            // Below 0.2 sharpness says no more than that blur fills the window.
+            // Below 0.2, sharpness shows only that blur fills the window.
             let windows = Windows { half: [1.0; 2], sharpness: [sharpness; 2], ..Windows::default() };
             let factor = windows.blurs_squared()[0].sqrt() / sigma;
             let most = if sharpness < 0.2 { 1.01 } else { too_large };

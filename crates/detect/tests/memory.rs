@@ -1,5 +1,4 @@
-//! The detector takes no memory after its first frames, for tags, discs and ground features: an allocator that
-//! counts.
+//! After its first frames the detector allocates no memory, for tags, discs and ground features: a counting allocator.
 
 #[path = "detector/common.rs"]
 mod common;
@@ -13,29 +12,29 @@ use windhover_base::settings::{Brightness, DetectorConfig};
 use windhover_detect::tracking::FrameDetector;
 use windhover_detect::{Detector, GrayImage, Limits, Roi, TagFamily, tag_pattern};
 
-/// Counts what the calling thread asks for.
+/// Counts the allocations of the calling thread.
 struct Counting;
 
 thread_local! {
     static ASKED: Cell<usize> = const { Cell::new(0) };
 }
 
-// SAFETY: everything is handed on to the system's allocator.
+// SAFETY: every call is passed to the system's allocator.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         ASKED.with(|n| n.set(n.get() + 1));
-        // SAFETY: as the caller promises.
+        // SAFETY: as the caller guarantees.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn realloc(&self, at: *mut u8, layout: Layout, size: usize) -> *mut u8 {
         ASKED.with(|n| n.set(n.get() + 1));
-        // SAFETY: as the caller promises.
+        // SAFETY: as the caller guarantees.
         unsafe { System.realloc(at, layout, size) }
     }
 
     unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
-        // SAFETY: as the caller promises.
+        // SAFETY: as the caller guarantees.
         unsafe { System.dealloc(at, layout) }
     }
 }
@@ -43,7 +42,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// Speckled ground with two tags, one of them `at` a place of its own.
+/// Speckled ground with two tags, one of them at the place numbered `at`.
 fn frame(at: usize) -> GrayImage {
     let mut image = GrayImage::new(640, 480);
     for (i, p) in image.data.iter_mut().enumerate() {
@@ -115,7 +114,7 @@ fn full_frame(n: usize) -> (GrayImage, RgbImage) {
     (image, RgbImage { width: 640, height: 480, data })
 }
 
-/// Where everything of a frame is foretold.
+/// The prediction for everything in a frame.
 fn foretold(n: usize) -> FramePrediction {
     let tag = |id, u: usize, v: usize, cell: usize| MarkerPrediction {
         marker: MarkerId::Tag { family: TagFamily::Tag36h11, id },
@@ -145,7 +144,7 @@ fn whole_frames_with_discs_and_features_take_none_either() {
     let mut detector = detector_of_all();
     let mut seen = FrameObservations::default();
     let mut pass = |detector: &mut FrameDetector| {
-        // Tracked after the first, and over a cut in which most features are lost.
+        // Tracked after the first frame, and over a cut at which most features are lost.
         for (k, n) in [0, 1, 2, 1, 0, 2].into_iter().enumerate() {
             let (gray, rgb) = &frames[n];
             let prediction = (k > 0).then_some(&predictions[n]);

@@ -52,7 +52,7 @@ pub struct Bound {
 }
 
 impl Bound {
-    /// A bound with the noise figures of a configuration, taken as they stand: nothing is learnt.
+    /// A bound with the noise figures of a configuration, unchanged: nothing is learnt.
     pub fn new(rig: &Rig, estimator: &EstimatorConfig, site: &Site) -> Self {
         let mut core = Core::new(rig, estimator, site);
         core.learning.on = false;

@@ -7,8 +7,8 @@ use super::filter::Estimator;
 use super::track::Circumstances;
 
 impl Estimator {
-    /// Gives one estimate a target at `now` as a frame that shows nothing would give it, and leaves the filter as it
-    /// is: frames that come late still find their place. `frame` is the number of the last one.
+    /// Gives one estimate a target at `now` as a frame without sightings would give it, and does not change the filter:
+    /// frames that arrive late are still inserted at their time. `frame` is the number of the last one.
     pub fn coast(&mut self, now: MonoTime, frame: u32, out: &mut Vec<EstimatorOutput>) {
         let Self { core, ahead, .. } = self;
         ahead.copy_present(&core.state);

@@ -30,7 +30,7 @@ struct Given {
 }
 
 impl Innovations {
-    /// Room for so many.
+    /// With capacity for so many.
     pub(crate) fn with_room(most: usize) -> Self {
         let grid = Grid::zeros(2 * most, 2 * most);
         let value = vec![Vector2::zeros(); most];
@@ -61,7 +61,7 @@ impl Innovations {
         self.best[i]
     }
 
-    /// Finds those inside a gate, each by itself.
+    /// Finds those inside a gate, each one alone.
     pub(crate) fn inside(&mut self, gate: f64) {
         self.given.value[..self.n].copy_from_slice(&self.value[..self.n]);
         self.given.cov.copy_from(&self.cov);
@@ -79,9 +79,9 @@ impl Innovations {
         }
     }
 
-    /// Finds the largest set that agrees within a gate (a chi-square value of two degrees), and of equal ones the one with
-    /// the smallest sum of normalised squares; how many it has. A first member is taken whatever the prior says of it: a
-    /// gust moves all of them alike.
+    /// Finds the largest set that agrees within a gate (a chi-square value of two degrees), and of equal ones the one
+    /// with the smallest sum of normalised squares; returns their number. A first member is taken whatever its prior
+    /// is: a gust moves all of them in the same way.
     pub(crate) fn agreeing(&mut self, gate: f64) -> usize {
         let (mut most, mut least) = (0, f64::INFINITY);
         self.best[..self.n].fill(false);
@@ -134,7 +134,7 @@ impl Given {
         square.is_finite().then_some(square)
     }
 
-    /// Takes a member: what it says of all others is taken off them.
+    /// Takes a member: its information on all others is subtracted from them.
     fn take(&mut self, k: usize, n: usize) {
         self.taken[k] = true;
         let Some(inverse) = self.block(k, k).try_inverse() else { return };
@@ -188,7 +188,8 @@ mod tests {
     #[test]
     fn the_few_that_move_otherwise_are_left_out_whoever_comes_first() {
         let still = (1.0, 1.0);
-        // Two that walk, each its own way, before and among five that stand; each alone is within the prior.
+        // Two that walk in different directions, placed before and among five that stand; each alone is within the
+        // prior.
         let found = seen(&[(6.0, 1.0), still, still, (1.0, -4.0), still, still, still]);
         assert_eq!(found, [false, true, true, false, true, true, true]);
     }

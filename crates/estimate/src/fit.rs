@@ -1,8 +1,9 @@
-//! Whether what is measured fits what is said of it: for each source of own motion a running mean and spread of normalised
-//! innovations.
+//! Whether measurements fit their configured accuracy: for each source of own motion a running mean and spread of
+//! normalised innovations.
 //!
-//! Where model and noise are right, `νᵀ S⁻¹ ν / m` has a mean of one at most (less where a sensor's slow error is allowed
-//! for and small) and `ν/√S` one of zero. The scale of tilt does not show here (gusts take it up): see `kind.rs`.
+//! Where model and noise are right, `νᵀ S⁻¹ ν / m` has a mean of one at most (less where a sensor's slow error is
+//! allowed for and small) and `ν/√S` one of zero. The scale of tilt does not show here (gusts absorb it): see
+//! `kind.rs`.
 
 use windhover_base::msg::{FusionSource, MisfitCause};
 use windhover_base::time::MonoTime;
@@ -18,12 +19,12 @@ const OVER_S: f64 = 30.0;
 const LONGEST_S: f64 = 1.0;
 /// The most that one counts: a single wild measurement is no misfit.
 const MOST: f64 = 20.0;
-/// Mean square above which what is told is not believed, and above which that is said.
+/// Mean square above which the stated variances are enlarged, and above which a misfit is reported.
 const INFLATE: f64 = 1.3;
 const TELL: f64 = 2.0;
-/// Mean innovation over its spread that is said.
+/// Mean innovation over its spread from which a misfit is reported.
 const TELL_MEAN: f64 = 0.7;
-/// Nothing is said before so much was seen, s.
+/// Time of observation before anything is reported, s.
 const SEEN_S: f64 = 20.0;
 
 /// The sources that are looked at.
@@ -38,7 +39,7 @@ pub(crate) const WATCHED: [FusionSource; 8] = [
     FusionSource::ImuForce,
 ];
 
-/// Where fixes stand among them.
+/// Index of fixes among them.
 pub(crate) const WATCHED_POSITION: usize = 0;
 
 /// How one source fits.
@@ -82,12 +83,12 @@ impl Fit {
         }
     }
 
-    /// Factor on the variances that are told of what this source shows: one where it fits.
+    /// Factor on the reported variances of what this source measures: one where it fits.
     pub(crate) fn inflation(&self) -> f64 {
         (self.square / INFLATE).max(1.0)
     }
 
-    /// What is to be said of it; `noise_factor` is by how much its noise was already found larger than configured.
+    /// The misfit to report; `noise_factor` is the factor by which its noise was already found larger than configured.
     pub(crate) fn misfit(&self, noise_factor: f64) -> Option<(MisfitCause, f64)> {
         if self.seen_s < SEEN_S {
             return None;
@@ -105,7 +106,7 @@ impl Fit {
 }
 
 impl State {
-    /// Factors on the variances that are told of position, velocity and attitude: one where their sources fit.
+    /// Factors on the reported variances of position, velocity and attitude: one where their sources fit.
     pub(crate) fn told_factors(&self) -> [f64; 3] {
         let of = |sources: &[FusionSource]| {
             let fits = WATCHED.iter().zip(&self.fits).filter(|(source, _)| sources.contains(source));
@@ -125,7 +126,7 @@ impl State {
 }
 
 impl Core {
-    /// Sources of own motion that do not fit what is said of them: what does not, and the figure that shows it.
+    /// Sources of own motion that do not fit their configured accuracy: the cause, and the figure that shows it.
     pub(crate) fn misfits(&self) -> impl Iterator<Item = (FusionSource, MisfitCause, f64)> {
         let Core { state, learning, .. } = self;
         let (now, start) = (&state.learnt, &learning.start);
@@ -188,7 +189,7 @@ mod tests {
         assert!(noisy.inflation() > 2.0);
         let (cause, figure) = fed(0.5, -1.0).misfit(1.0).expect("off to one side");
         assert!(cause == MisfitCause::Bias && (-1.0..-0.8).contains(&figure), "{figure}");
-        // What the filter has found by itself counts too.
+        // The noise that the filter has learnt counts too.
         assert!(fed(1.0, 0.0).misfit(4.0).is_some());
     }
 

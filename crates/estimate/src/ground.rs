@@ -1,4 +1,4 @@
-//! Ground features: what stands still on the ground is fused, anything else is not.
+//! Ground features: what is at rest on the ground is fused, everything else is not.
 //!
 //! Anything with corners may be followed: people, another vehicle, the vehicle itself with its tag unread. What moves
 //! turns heading by degrees, so a feature must prove that it is ground:
@@ -28,11 +28,12 @@ use super::measurement::Measurement;
 use super::models::Models;
 use super::state::{Feature, GUESSED_VAR, State};
 
-/// How long a feature must stand where it was, s, and the frames beside the first that it must be seen in, where nothing
-/// proven judges it: somebody who strolls goes half a metre in this time.
+/// How long a feature must stay at its place, s, and the number of frames after the first in which it must be seen,
+/// where no proven features can be compared: a person who walks slowly moves half a metre in this time.
 const PROBATION: (f64, u32) = (0.8, 3);
-/// Likewise where [`JUDGES`] proven ones agree on how the helicopter moved: a walk of one frame is ten pixels beside their
-/// tenth of one. Features of rendered ground live for a second or two, so that waiting would cost a third of them.
+/// The same where [`JUDGES`] proven features agree on how the helicopter moved: a walk of one frame is ten pixels,
+/// compared with their tenth of one. Features of rendered ground exist for a second or two, so that waiting would lose
+/// a third of them.
 const JUDGED_PROBATION: (f64, u32) = (0.1, 1);
 /// What ground may seem to move by: m/s, and as a share of the helicopter's own speed (ground that is not level: 2 % is a
 /// quarter of a metre at 12 m). What creeps slower than this does no harm that the gate would not find.
@@ -126,7 +127,7 @@ impl Core {
     fn fuse_proven(&mut self, tracks: &[FeatureTrack]) -> usize {
         let n = self.expect_features(tracks, true);
         let agreed = self.ground.innovations.agreeing(self.models.gates[2]);
-        // Without a majority nobody knows which of them are ground.
+        // Without a majority it is not known which of them are ground.
         let believed = 2 * agreed > n;
         for k in 0..n {
             let slot = self.ground.slots[k];
@@ -151,7 +152,7 @@ impl Core {
         if judged {
             self.ground.innovations.inside(gate);
         } else {
-            // All of them may ride on the same vehicle, which the helicopter's own motion tells.
+            // All of them may be on the same vehicle; the helicopter's own motion shows it.
             self.ground.innovations.agreeing(gate);
             self.ground.innovations.keep_inside(gate);
         }
@@ -167,7 +168,8 @@ impl Core {
         }
     }
 
-    /// What a frame says of a feature: proven once it has stood long enough, refused twice in a row elsewhere.
+    /// Updates a feature by a frame: it is proven once it has stayed at its place long enough, and refused when seen
+    /// elsewhere twice in a row.
     fn judge_feature(&mut self, slot: usize, inside: bool, probation: (f64, u32)) {
         let t = self.state.t;
         let feature = &mut self.state.features[slot];

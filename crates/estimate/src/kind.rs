@@ -1,4 +1,5 @@
-//! What a tilt sensor feels, told by one statistic beside the filter: the slope of acceleration over what the reading means.
+//! What a tilt sensor measures, decided by one statistic outside the filter: the slope of acceleration over what the
+//! reading means.
 //!
 //! Were the reading z the tilt, the helicopter would accelerate by `u = Rz(ψ) (−g_z z₁, g_z z₂)`, `g_z = g/√(1 − |z|²)`,
 //! give or take the wind. Over windows of a second the receiver tells the mean acceleration a; differences of windows in
@@ -43,19 +44,19 @@ const EXPECTED: [((f64, f64), f64); 3] = [
     // A share of 0.07 to 0.4.
     ((2.5, 14.0), 0.4),
 ];
-/// Least scatter believed, m/s².
+/// Least scatter that is assumed, m/s².
 const LEAST_SCATTER: f64 = 0.12;
 /// Length of a window, s, and where it is too long or has too few readings.
 const WINDOW_S: f64 = 0.99;
 const LONGEST_S: f64 = 1.7;
 const LEAST_FILLED: f64 = 0.8;
-/// A reading stands for so long at most, s.
+/// A reading is used for at most this long, s.
 const LONGEST_READING_S: f64 = 0.2;
 /// An acceleration beyond this is a wrong velocity, m/s².
 const WILDEST_MPS2: f64 = 15.0;
 /// Differences that the sums remember.
 const MEMORY: f64 = 300.0;
-/// Decided: ahead of the next by so many nats, from so many differences on, in so many windows in a row.
+/// Conditions of a decision: lead over the next hypothesis, nats; number of differences; number of windows in a row.
 const LEAD: f64 = 2.0;
 const FEWEST: f64 = 10.0;
 const IN_A_ROW: u32 = 3;
@@ -71,7 +72,7 @@ const SHARE_READING_ERROR: (f64, f64) = (0.15 * DEGREE, 20.0);
 const UNDECIDED_TAU_S: f64 = 8.0;
 /// Largest error of a reading whose meaning is not known, rad.
 const UNDECIDED_MOST: f64 = 7.0 * DEGREE;
-/// An AHRS that was said to be something else: not the sensor it was said to be.
+/// Likewise for an AHRS that was configured as another kind of sensor.
 const MISNAMED: f64 = 2.0;
 /// A sensor that reads 15 % errs by 5.7 times its reading.
 const UNREAD: f64 = 5.7;
@@ -82,7 +83,8 @@ const NOISE_MPS2: f64 = 0.3;
 const ADAPTED_OVER: f64 = 30.0;
 const DEGREE: f64 = std::f64::consts::PI / 180.0;
 
-/// A window being filled: when and at which velocity it began, and what the readings have meant since.
+/// A window being filled: when and at which velocity it began, and the accelerations that the readings have implied
+/// since.
 #[derive(Clone, Copy, PartialEq, Debug)]
 struct Window {
     since: MonoTime,
@@ -105,7 +107,7 @@ struct Sums {
 pub(crate) struct TiltWatch {
     configured: TiltKind,
     pub(crate) felt: Felt,
-    /// Share of the tilt that is read, and its error; one and zero but for [`Felt::Share`].
+    /// Share of the tilt that is read, and its error; one and zero except for [`Felt::Share`].
     pub(crate) share: f64,
     pub(crate) share_sigma: f64,
     /// When this was decided; `None` while it is what was configured.
@@ -113,18 +115,19 @@ pub(crate) struct TiltWatch {
     /// The last reading: when, and down in the body frame as read.
     last: Option<(MonoTime, Vector3<f64>)>,
     window: Option<Window>,
-    /// Means of the last whole window: acceleration, and what the readings meant.
+    /// Means of the last whole window: acceleration, and the acceleration that the readings implied.
     before: Option<(Vector2<f64>, Vector2<f64>)>,
     sums: Sums,
     /// The kind that led in the last windows, and in how many in a row.
     leading: Option<(usize, u32)>,
-    /// Mean squares over both axes of acceleration and of what the readings meant, with the windows they are of.
+    /// Mean squares over both axes of acceleration and of the acceleration that the readings implied, with the number
+    /// of windows.
     squares: (f64, f64),
     windows: f64,
 }
 
 impl TiltWatch {
-    /// As configured, before anything was heard.
+    /// As configured, before any reading.
     pub(crate) fn new(configured: TiltKind) -> Self {
         let felt = if configured == TiltKind::Inertial { Felt::Attitude } else { Felt::Undecided };
         Self { configured, felt, share: 1.0, ..Self::default() }
@@ -275,7 +278,7 @@ impl TiltWatch {
         ned_from_body_321(heading, pitch, roll)
     }
 
-    /// Variance of tilt where it was just read off the sensor, rad². The reading is fused besides.
+    /// Variance of tilt where it was just read off the sensor, rad². The reading is also fused.
     pub(crate) fn tilt_var(&self) -> f64 {
         if self.felt == Felt::Force { HALF_READ_TILT.powi(2) } else { UNKNOWN_TILT.powi(2) }
     }
@@ -286,14 +289,14 @@ impl TiltWatch {
     }
 }
 
-/// Tilt where only a reading tells it, one sigma, rad: whatever a helicopter flies with.
+/// Tilt that only a reading shows, one sigma, rad: whatever a helicopter flies with.
 const UNKNOWN_TILT: f64 = 0.35;
-/// Likewise where half of a reading is taken for it: a sensor that feels force shows none of it or all.
+/// The same where half of a reading is taken for it: a sensor of the specific force shows none of it or all.
 const HALF_READ_TILT: f64 = 0.15;
 /// Sine of the steepest tilt that is read off a share.
 const STEEPEST: f64 = 0.6;
 
-/// The horizontal acceleration, NED, m/s², of a helicopter that tilts as a reading says.
+/// The horizontal acceleration, NED, m/s², of a helicopter that is tilted as a reading indicates.
 fn accelerates(heading: f64, down: &Vector3<f64>) -> Vector2<f64> {
     let upright = (1.0 - down.x * down.x - down.y * down.y).max(0.2).sqrt();
     let (s, c) = heading.sin_cos();

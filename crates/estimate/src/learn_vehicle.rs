@@ -1,7 +1,7 @@
 //! Intensities of the vehicles' motion, fitted in flight.
 //!
-//! The smoother, which knows what was measured later, shows how wrong the filter was; a walk is right that makes the
-//! filter as wrong as it said it was.
+//! The smoother, which knows what was measured later, shows the filter's errors; a walk is right if these errors agree
+//! with the filter's variances.
 
 use super::blocks::TargetBlock;
 use super::delayed::DelayedCopy;
@@ -30,10 +30,10 @@ impl State {
 
     /// Fits the walk of target `i`'s speed (`k` = 0) or yaw rate (`k` = 1).
     ///
-    /// Twice the filter's memory `P/q` ago (at least two frames, at most the interval) it held a value and a
-    /// variance; since then the smoother has moved that value, and knows by how much it should have: `P_f − P_s`,
-    /// and more where motion is smooth ([`more_than_found`]). The logarithm of the intensity moves by what the
-    /// ratio of the two differs from one, so that the mean ratio over time is one.
+    /// Twice the filter's memory `P/q` ago (at least two frames, at most the interval) it had a value and a variance;
+    /// since then the smoother has moved that value, and the expected size of this change is known: `P_f − P_s`, and
+    /// more where motion is smooth ([`more_than_found`]). The logarithm of the intensity moves by what the ratio of the
+    /// two differs from one, so that the mean ratio over time is one.
     fn learn_target(&mut self, learning: &Learning, i: usize, k: usize, since_s: f64) {
         let column = self.layout().target(i).motion().column(k);
         let row = TargetBlock::alone(i).motion().column(k);
@@ -69,8 +69,8 @@ impl State {
         }
     }
 
-    /// A vehicle that has stood still for a second is taken to stand: its intensities fall fast, where
-    /// the fit alone would take long, since increments that do not stand out of noise say little.
+    /// A vehicle that has stood still for a second is treated as standing: its intensities fall fast. The fit alone
+    /// would take long, because increments below the noise have little information.
     ///
     /// The test is `(v̂, ω̂) P⁻¹ (v̂, ω̂)ᵀ`, two on average for a vehicle at rest. One that creeps slower than
     /// can be seen fails it as soon as the smaller intensity has sharpened the estimate.
@@ -124,7 +124,7 @@ const RAISE: f64 = 4.0;
 
 /// How much later than the filter's memory P/q an estimate is compared with what became of it.
 const LAG: f64 = 2.0;
-/// Memories over which it is fitted at the least: what lies closer together says the same.
+/// Fewest memories over which it is fitted: values nearer to each other have the same information.
 const MEMORIES: f64 = 4.0;
 /// Least share of a variance that must have been found out since.
 const LEAST_TOLD: f64 = 0.2;
@@ -150,7 +150,8 @@ mod tests {
     use super::*;
 
     /// A steady-state filter of place and speed whose place is measured each frame, with its smoother: intensity of the
-    /// walk one, frames one second apart, so that the noise's variance alone says how many frames its memory is long.
+    /// walk one, frames one second apart, so that the length of its memory in frames depends only on the noise's
+    /// variance.
     struct SteadyState {
         noise_var: f64,
         transition: Matrix2<f64>,
@@ -189,7 +190,7 @@ mod tests {
         }
 
         /// By what share `E[(filtered − smoothed)²]` of speed exceeds `P_f − P_s` after so many frames, and the share
-        /// of `P_f` that `P_f − P_s` is; of a target at a constant acceleration that makes the filter honest.
+        /// of `P_f` that `P_f − P_s` is; of a target at a constant acceleration that makes the filter consistent.
         fn excess(&self, frames: usize) -> (f64, f64) {
             let pushed = Vector2::new(0.5, 1.0);
             let step = self.keep() * self.transition;

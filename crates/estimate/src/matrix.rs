@@ -52,7 +52,7 @@ impl Grid {
         self.at(block.column(i), block.column(i)).max(0.0).sqrt()
     }
 
-    /// What stands in the rows of one block and the columns of another.
+    /// The entries in the rows of one block and the columns of another.
     pub(crate) fn block<const N: usize, const M: usize>(
         &self,
         rows: Block<N>,

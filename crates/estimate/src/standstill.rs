@@ -1,4 +1,4 @@
-//! Whether a vehicle stands still, and whether it is about to move again.
+//! Whether a vehicle stands still, and whether it begins to move again.
 
 use windhover_base::time::MonoTime;
 
@@ -9,7 +9,7 @@ use super::update::Outcome;
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub(crate) struct Standstill(f64);
 
-/// Time over which a vehicle must have stood still to be taken to stand, s.
+/// Time for which a vehicle must have been at rest before it is treated as standing, s.
 pub(crate) const REST_S: f64 = 0.5;
 /// Value of the mean below which it stands.
 const RESTING: f64 = 2.5;
@@ -31,12 +31,12 @@ impl Standstill {
     }
 }
 
-/// Whether what is measured speaks against a vehicle at rest: excess of normalised squared innovations over the last quarter
-/// of a second. A vehicle that drives off slowly under a helicopter that hangs still leaves no gate: the filter, which is
-/// sure that it stands, takes its motion for the helicopter's.
+/// Evidence of measurements against a vehicle at rest: excess of normalised squared innovations over the last quarter
+/// of a second. A vehicle that drives off slowly under a hovering helicopter stays inside every gate: the filter, which
+/// is certain that it stands, attributes its motion to the helicopter.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub(crate) struct Unrest {
-    /// Sum of what was left over, each of variance one where the vehicle stands, and the variance of that sum.
+    /// Sum of the residuals, each of variance one where the vehicle stands, and the variance of that sum.
     sum: f64,
     var: f64,
     last: Option<MonoTime>,
@@ -64,7 +64,7 @@ impl Unrest {
 }
 
 impl Core {
-    /// A marker was compared with where its vehicle stands: one that begins to move is woken.
+    /// A marker was compared with its standing vehicle's place: a vehicle that begins to move is woken.
     pub(crate) fn note_marker_unrest(&mut self, target: usize, outcome: &Outcome) {
         let (m, t) = (self.z.m, self.state.t);
         let squared = outcome.ratio * self.models.gates[m];
@@ -74,7 +74,8 @@ impl Core {
         }
     }
 
-    /// Velocity by the receiver was compared with that over vehicles that stand: if it is not, they move.
+    /// The receiver's velocity was compared with the velocity over standing vehicles: if they differ, the vehicles
+    /// move.
     pub(crate) fn note_velocity_unrest(&mut self, outcome: &Outcome) {
         let (m, t) = (self.z.m, self.state.t);
         let squared = outcome.ratio * self.models.gates[m];

@@ -85,7 +85,7 @@ struct Scene {
     step: u32,
     /// Where the rover is: north, east; added to its heading.
     rover: [f64; 3],
-    /// What the receiver says of its errors, position and velocity.
+    /// Stated accuracy of the receiver, position and velocity.
     told: Option<(f64, f64)>,
 }
 
@@ -139,7 +139,7 @@ impl Scene {
         seen.collect()
     }
 
-    /// Lets all sensors speak for `frames` frames.
+    /// All sensors deliver for `frames` frames.
     fn hear(&mut self, frames: u32) -> Vec<EstimatorOutput> {
         let mut out = Vec::new();
         for _ in 0..frames {
@@ -252,7 +252,7 @@ fn numbers_gone_wrong_reset_the_filter_which_says_so_and_goes_on() {
 fn a_vehicle_that_comes_back_elsewhere_is_placed_anew_and_never_lost() {
     let mut scene = Scene::new();
     scene.hear(60);
-    // Carried a metre and turned while nobody could see: no motion explains it.
+    // Carried a metre and turned while it was out of sight: no motion model explains it.
     scene.rover = [-1.2, -2.4, 1.0];
     let out = scene.hear(30);
     let statuses: Vec<_> = Scene::estimates(&out, 1).iter().map(|e| e.status).collect();

@@ -29,11 +29,11 @@ use windhover_base::time::{MonoTime, Span};
 /// to linearise about. A speed taken as zero would forbid the sideways motion that a heading not yet
 /// known gives to a moving vehicle, and pass that off as knowledge of heading.
 const FRAMES_TO_START: u32 = 6;
-/// Frames a new track must be seen in before it is believed.
+/// Number of frames in which a new track must be seen before it is confirmed.
 const FRAMES_TO_TRACK: u32 = FRAMES_TO_START + 2;
-/// Frames counted of a track that was believed and is in doubt: out of sight it is not forgotten as one never believed.
+/// Frame count of a confirmed track that is in doubt: out of sight it is not dropped like one that was never confirmed.
 const BELIEVED_BEFORE: u32 = FRAMES_TO_TRACK + 1;
-/// Frames in a row outside the gate after which a track that is not believed is given up.
+/// Frames in a row outside the gate after which a track that is not confirmed is given up.
 const DOUBTED_REFUSALS: u32 = 2;
 /// Heading sigma below which a track settles, and above which it is in doubt again, rad.
 const SETTLED_HEADING: (f64, f64) = (0.25, 0.8);
@@ -41,7 +41,7 @@ const SETTLED_HEADING: (f64, f64) = (0.25, 0.8);
 const SETTLED_SPEED: (f64, f64) = (1.0, 2.5);
 /// Not seen for no longer than this is still tracking: one frame missed is no event, s.
 pub(crate) const BLINK_S: f64 = 0.15;
-/// A track not yet believed that is not seen for so long was none, s.
+/// A track that is not confirmed and not seen for this long is dropped, s.
 const MISSING_S: f64 = 1.0;
 
 /// When and where (north, east) a track was first seen.
@@ -51,7 +51,7 @@ pub(crate) struct Sighting {
     pub(crate) place: [f64; 2],
 }
 
-/// What the latest frames say of a track that is fused.
+/// Results of the latest frames for a track that is fused.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub(crate) struct Evidence {
     /// Frames in a row in which its markers lay outside the gate.
@@ -68,7 +68,7 @@ pub(crate) enum Life {
     Unknown,
     /// Started afresh by each frame that shows it.
     Started { frames: u32, first: Sighting, missing: bool },
-    /// Fused, not yet (or no longer) believed.
+    /// Fused, not yet (or no longer) confirmed.
     Acquiring { frames: u32, evidence: Evidence, missing: bool },
     /// Believed, and seen but a moment ago.
     Tracking(Evidence),
@@ -125,7 +125,7 @@ impl Certainty {
     }
 }
 
-/// What a frame knows of a track beside its life.
+/// What a frame knows of a track in addition to its state.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Circumstances {
     /// How long ago it was last seen.
@@ -164,7 +164,7 @@ impl Life {
         }
     }
 
-    /// Whether the state holds a place for it, reported or not.
+    /// Whether the filter's state has a place for it, reported or not.
     pub(crate) fn is_held(self) -> bool {
         self != Self::Unknown
     }
@@ -254,7 +254,7 @@ impl Life {
         self.evidence().refused
     }
 
-    /// After a refusal: a believed track is moved after `restart_after` frames in a row, any other given up sooner.
+    /// After a refusal: a confirmed track is moved after `restart_after` frames in a row, any other given up sooner.
     pub(crate) fn verdict(self, restart_after: u32, moves: bool) -> Verdict {
         let Evidence { refused, unconfirmed } = self.evidence();
         let believed = matches!(self, Self::Tracking(_));

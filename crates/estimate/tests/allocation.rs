@@ -14,7 +14,7 @@ thread_local! {
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
 }
 
-/// The system's allocator, counting what each thread asks of it.
+/// The system's allocator, which counts each thread's allocations.
 struct Counting;
 
 // SAFETY: every call is passed on unchanged to the system's allocator; the counter is a plain cell

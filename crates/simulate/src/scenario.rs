@@ -16,11 +16,10 @@ pub struct Scenario {
     pub name: String,
     /// Its purpose, in one line.
     pub about: String,
+    /// Length, seconds.
+    pub duration_s: f64,
     /// The instruments and targets in the pipeline's configuration. Latencies, mount, lever arms, markers and compass
     /// format are true except for the errors below.
-    pub duration_s: f64,
-    /// The instruments and targets as the pipeline is told of them. Latencies, mount, lever arms,
-    /// markers and compass format are true to it except for the errors below.
     pub rig: Rig,
     /// Origin of the truth's NED frame: on the ground, height above the ellipsoid.
     pub origin: Geodetic,

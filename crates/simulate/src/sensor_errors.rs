@@ -25,11 +25,10 @@ pub struct GpsSim {
     pub position_filter_s: f64,
     /// And on the velocity.
     pub velocity_filter_s: f64,
+    /// Jitter of the arrival, ms one-sigma.
+    pub jitter_ms: f64,
     /// Jitter that the fit of arrival times leaves in a stamp, ms one-sigma (values only: with bytes, the fit itself
     /// does this).
-    pub jitter_ms: f64,
-    /// What the fit of arrival times leaves of the jitter in a stamp, ms one-sigma (values only:
-    /// with bytes, the fit itself does this).
     pub stamp_noise_ms: f64,
     /// Probability that an epoch is not sent at all.
     pub dropout: f64,

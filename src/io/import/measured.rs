@@ -16,9 +16,9 @@ pub struct Fix {
     pub kind: u8,
     /// Latitude.
     pub lat_deg: f64,
-    /// Above the sea; above the ellipsoid where only that is given.
+    /// Longitude.
     pub lon_deg: f64,
-    /// Above the sea; above the ellipsoid where only that is told.
+    /// Above the sea; above the ellipsoid where only that is given.
     pub alt_m: f64,
     /// Above the ellipsoid.
     pub ellipsoid_m: Option<f64>,

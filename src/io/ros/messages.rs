@@ -15,7 +15,7 @@ pub trait RosMessage {
     #[doc(hidden)]
     fn write(&self, cdr: &mut CdrBody<'_>);
 
-    /// The body of a message being serialised.
+    /// The message in CDR, with its encapsulation header.
     fn to_cdr(&self) -> Vec<u8> {
         let mut cdr = CdrWriter::new();
         self.write(&mut CdrBody(&mut cdr));
@@ -23,11 +23,11 @@ pub trait RosMessage {
     }
 }
 
-/// Seconds beyond ROS's 32 bits (after 2038) become the largest that fits.
+/// The body of a message being serialised.
 pub struct CdrBody<'a>(&'a mut CdrWriter);
 
 impl CdrBody<'_> {
-    /// Seconds that do not fit ROS's 32 bits (after 2038) are the last that do.
+    /// Seconds beyond ROS's 32 bits (after 2038) become the largest that fits.
     fn time(&mut self, t: MonoTime) {
         let seconds = t.ns().div_euclid(NS_PER_S);
         self.0.i32(i32::try_from(seconds).unwrap_or(if seconds < 0 { i32::MIN } else { i32::MAX }));

@@ -12,7 +12,7 @@ pub(in crate::pipeline) struct AutopilotLine {
     config: AutopilotConfig,
     decoder: AutopilotDecoder,
     heard: Vec<ReceivedAutopilot>,
-    /// Whether it stands in for a compass, and for a receiver.
+    /// Whether it replaces the compass; the same for the receiver.
     is_compass: bool,
     is_receiver: bool,
     gps_latency: Span,

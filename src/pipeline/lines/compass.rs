@@ -14,7 +14,7 @@ pub(in crate::pipeline) struct CompassLine {
     clock: SteadyClock,
     wire: Wire,
     latency: Span,
-    /// Of its rates and forces, where these are used.
+    /// Latency of its rates and forces, where these are used.
     inertial_latency: Option<Span>,
 }
 

@@ -38,10 +38,10 @@ impl GpsLine {
             if let (true, Some(time_of_day_ns)) = (heard.opens_burst, heard.epoch.time_of_day_ns) {
                 self.clock.observe(time_of_day_ns, began);
             }
-            // An epoch without a time, or one the fit does not know, was true a latency ago.
+            // An epoch without a time, or one that the time fit cannot place, was valid one latency before its arrival.
             let fitted = heard.epoch.time_of_day_ns.and_then(|of_day| self.clock.host_time_of(of_day, began));
             if !heard.opens_burst && fitted.is_none() {
-                // Another instant within a burst, which neither its arrival nor the fit puts in time.
+                // A second instant within a burst: neither its arrival nor the fit gives it a time.
                 continue;
             }
             self.clock_sigma = fitted.map(|(_, sigma)| sigma);
@@ -51,7 +51,7 @@ impl GpsLine {
         }
     }
 
-    /// Recent arrivals, for [`Self::resume`].
+    /// Recent arrivals, as [`Self::resume`] takes them.
     pub(in crate::pipeline) fn arrivals(&self) -> Vec<WarmArrival> {
         let arrivals = self.clock.arrivals(WARM_ARRIVALS);
         arrivals.into_iter().map(|(t, offset_ns)| WarmArrival { t_ns: t.ns(), offset_ns }).collect()
@@ -68,12 +68,12 @@ impl GpsLine {
         self.clock_sigma
     }
 
-    /// Why the receiver's pulses are not used, if they are not.
+    /// The reason why the receiver's pulses are not used, if they are not.
     pub(in crate::pipeline) fn pulse_trouble(&self) -> Option<PulseTrouble> {
         self.clock.pulse_trouble()
     }
 
-    /// The receiver's pulse was seen at this host time.
+    /// The receiver's pulse arrived at this host time.
     pub(in crate::pipeline) fn pulse(&mut self, edge: MonoTime) {
         self.clock.observe_pulse(edge);
     }

@@ -1,5 +1,5 @@
-//! What sources deliver, put in time: bytes or samples in, stamped measurements out. One file a line; one that takes bytes
-//! has a row in [`SourceLines::of`].
+//! Gives data of every source its time of validity: bytes or samples in, stamped measurements out. There is one file
+//! for each line; a line that takes bytes has a row in [`SourceLines::of`].
 
 mod autopilot;
 mod compass;
@@ -16,12 +16,12 @@ use windhover_base::settings::{AutopilotUse, Framing, Rig};
 use windhover_base::time::{MonoTime, Span};
 use windhover_decode::DecodeCounts;
 
-/// A decoder, and the clock that puts what it decodes in time.
+/// A decoder, and the clock that gives times to what it decodes.
 pub(super) trait SourceLine {
     /// Takes the bytes that one read returned at `t_recv`.
     fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<SensorReading>);
 
-    /// Time has come to `now`: what waited for more bytes waits no longer.
+    /// Time has advanced to `now`: data that waited for more bytes is released.
     fn tick(&mut self, _now: MonoTime, _seq: u64, _out: &mut Vec<SensorReading>) {}
 
     /// No more bytes follow.
@@ -40,7 +40,7 @@ pub(super) struct SourceLines {
     autopilot: Option<AutopilotLine>,
     has_gps: bool,
     has_compass: bool,
-    /// Whether the receiver's line is the compass's too.
+    /// Whether receiver and compass share one line.
     is_shared: bool,
 }
 
@@ -74,7 +74,7 @@ impl SourceLines {
         }
     }
 
-    /// Other sources that the bytes of this one tell of.
+    /// The other source that the bytes of this one also contain.
     pub(super) fn beside(&self, source: Source) -> Option<Source> {
         (source == Source::Gps && self.is_shared).then_some(Source::Compass)
     }
@@ -88,7 +88,7 @@ impl SourceLines {
         }
     }
 
-    /// Whether something is to come from a source.
+    /// Whether data of a source is expected.
     pub(super) fn awaits(&mut self, source: Source) -> bool {
         match source.delivers() {
             Delivery::Bytes => self.of(source).is_some(),
@@ -98,19 +98,19 @@ impl SourceLines {
     }
 }
 
-/// Whether an autopilot delivers this.
+/// Whether an autopilot delivers this quantity.
 fn by_autopilot(rig: &Rig, what: AutopilotUse) -> bool {
     rig.autopilot.as_ref().is_some_and(|autopilot| autopilot.gives(what))
 }
 
-/// How many pieces were refused, and the reasons, with the fields left out of the others.
+/// Number of refused pieces, and the reasons, together with the fields left out of accepted ones.
 pub(super) fn refused(counts: &DecodeCounts) -> (u64, String) {
     let reasons = counts.refusals().map(|(why, n)| format!("{n} {}", why.words()));
     let fields = counts.left_out().map(|(field, n)| format!("{n} without {field}"));
     (counts.refused_total(), reasons.chain(fields).collect::<Vec<_>>().join(", "))
 }
 
-/// What bytes take on a serial line.
+/// Transmission time of bytes on a serial line.
 #[derive(Clone, Copy)]
 struct Wire {
     bits_a_byte: u32,

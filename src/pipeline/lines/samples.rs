@@ -1,17 +1,17 @@
-//! Sources that deliver samples: put in time; what cannot be is refused and counted.
+//! Sources that deliver samples: gives them times; impossible samples are refused and counted.
 
 use nalgebra::Vector3;
 
 use windhover_base::msg::{AttitudeSample, InertialSample, Stamped};
 use windhover_base::time::{MonoTime, Span};
 
-/// No helicopter turns faster, rad/s, or is pushed harder, m/s².
+/// Limits of plausible samples: no helicopter turns faster than this, rad/s, or accelerates more, m/s².
 const RATE_MAX: f64 = 100.0;
 const FORCE_MAX: f64 = 500.0;
 
 /// Something that a source of samples delivers.
 pub(in crate::pipeline) trait Sample: Copy {
-    /// Whether it says anything, and nothing that cannot be.
+    /// Whether it has a value at all, and only physically possible values.
     fn can_be(&self) -> bool;
 }
 
@@ -39,12 +39,12 @@ pub(in crate::pipeline) struct SampleLine {
 }
 
 impl SampleLine {
-    /// Of a source whose samples are heard so late.
+    /// For a source whose samples arrive this much after their time of validity.
     pub(super) fn new(latency_ms: f64) -> Self {
         Self { latency: Span::from_ms(latency_ms), refused: 0 }
     }
 
-    /// Puts a sample in time; `None` where it cannot be.
+    /// Gives a sample its time; `None` if the sample is impossible.
     pub(in crate::pipeline) fn stamp<T: Sample>(
         &mut self,
         sample: &T,
@@ -58,7 +58,7 @@ impl SampleLine {
         Some(Stamped { t_valid: t_recv - self.latency, t_recv, seq, value: *sample })
     }
 
-    /// Samples that cannot be, so far.
+    /// Number of impossible samples so far.
     pub(in crate::pipeline) fn refused(&self) -> u64 {
         self.refused
     }

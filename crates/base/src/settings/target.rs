@@ -46,7 +46,7 @@ pub struct MarkerConfig {
     /// Identity of a tag.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub id: Option<u32>,
-    /// Edge of a tag's black square, including its whole border, metres.
+    /// Width of a tag's border, cells: 1 as printed by the authors of the families, 2 as by Kalibr.
     #[serde(default = "one_cell", skip_serializing_if = "is_one_cell")]
     pub border: u8,
     /// Edge of a tag's black square, its whole border included, metres.

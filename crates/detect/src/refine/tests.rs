@@ -1,5 +1,5 @@
-//! The fitted constants of the refinement, from generated tags: turned, shifted by parts of a pixel, blurred, sampled by
-//! area. Each proof prints the table it judges by.
+//! The fitted constants of the refinement, from generated tags: turned, shifted by parts of a pixel, blurred, sampled
+//! by area. Each proof prints the table on which it is decided.
 
 use nalgebra::Vector2;
 use rand::{Rng, SeedableRng};
@@ -75,7 +75,7 @@ fn smooth(image: &mut [f32], side: usize, sigma: f64) {
     }
 }
 
-/// What the refinement of many tags came to.
+/// Results of the refinement of many tags.
 #[derive(Default)]
 struct Tally {
     refined: usize,

@@ -1,4 +1,4 @@
-//! AVX2 kernels. What is left over at the end of a row goes to the scalar twin.
+//! AVX2 kernels. The rest at the end of a row is computed by the scalar form.
 
 use std::arch::x86_64::*;
 

@@ -63,7 +63,7 @@ impl Simd {
             // SAFETY: `best` made this variant only where the processor has these.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx2 => unsafe { avx2::run(kernel) },
-            // What aarch64 is compiled for by default has NEON.
+            // On aarch64 the default target has NEON.
             #[cfg(target_arch = "aarch64")]
             Kind::Neon => kernel.run(),
         }
@@ -110,7 +110,7 @@ impl Simd {
         }
     }
 
-    /// Bit `u` of `words`, lowest first, tells whether pixel `u` is below its tile's threshold.
+    /// Bit `u` of `words`, lowest first, is set if pixel `u` is below its tile's threshold.
     pub(super) fn pack_below(self, row: &[u8], thresholds: &[u8], words: &mut [u64]) {
         match self.0 {
             Kind::Scalar => scalar::pack_below(row, thresholds, words),

@@ -1,4 +1,4 @@
-//! NEON kernels. What is left over at the end of a row goes to the scalar twin.
+//! NEON kernels. The rest at the end of a row is computed by the scalar form.
 
 use std::arch::aarch64::*;
 

@@ -1,12 +1,13 @@
-//! How well a tag's corners can be known at all: the Cramér–Rao bound of the model that is fitted (the detector's page).
+//! The best possible accuracy of a tag's corners: the Cramér–Rao bound of the model that is fitted (the detector's
+//! page).
 
 use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector2, Vector3};
 use windhover_detect::TagPattern;
 
-/// A homography, a bow, a barrel and a twist of the lens, the blur's two sigmas and covariance, black's light and how far
-/// white is from it, either linear over the tag.
+/// A homography, a bow, a barrel and a twist of the lens, the blur's two sigmas and covariance, black's light and how
+/// far white is from it, both linear over the tag.
 const UNKNOWNS: usize = 22;
-/// What of it moves corners.
+/// Number of those that move corners.
 const GEOMETRY: usize = 13;
 type Matrix = SMatrix<f64, UNKNOWNS, UNKNOWNS>;
 type Row = SVector<f64, UNKNOWNS>;
@@ -24,7 +25,7 @@ pub struct Seen<'a> {
     pub noise: f64,
 }
 
-/// Least RMS distance of a corner from where it is, over all four, pixels.
+/// Least possible RMS error of a corner, over all four, pixels.
 pub fn corner_bound(seen: Seen<'_>) -> f64 {
     let h = seen.view / seen.view[(2, 2)];
     let back = h.try_inverse().expect("a view has an inverse");
@@ -51,7 +52,7 @@ pub fn corner_bound(seen: Seen<'_>) -> f64 {
         }
     }
     information.fill_upper_triangle_with_lower_triangle();
-    // What a lens bends is held near nought by what a wide one does.
+    // The lens's parameters have priors at zero, with the effect of a wide lens as sigma.
     let half = bent.half;
     let [bow, barrel, twist] = [0.75e-4 * half.powi(2), 3e-7 * half.powi(3), 2.5e-5 * half.powi(2)];
     for (k, sigma) in [bow, bow, barrel, twist, twist].into_iter().enumerate() {
@@ -66,7 +67,7 @@ pub fn corner_bound(seen: Seen<'_>) -> f64 {
     (traces.iter().sum::<f64>() / 4.0).sqrt()
 }
 
-/// A view, and what a lens may add to it (`refine.rs`).
+/// A view, and the distortion that a lens may add (`refine.rs`).
 struct Bent {
     h: Matrix3<f64>,
     middle: Vector2<f64>,
@@ -120,7 +121,7 @@ impl Bent {
     }
 }
 
-/// ∂(what a pixel shows)/∂unknowns; `None` where the ground shows in it.
+/// ∂(grey level of a pixel)/∂unknowns; `None` where the ground is visible in it.
 fn row(seen: &Seen<'_>, bent: &Bent, xi: f64, eta: f64) -> Option<Row> {
     let h = &bent.h;
     let p = h * Vector3::new(xi, eta, 1.0);
@@ -175,7 +176,8 @@ fn row(seen: &Seen<'_>, bent: &Bent, xi: f64, eta: f64) -> Option<Row> {
     Some(row)
 }
 
-/// Of seven cells about the one that `x` is in: the share under a Gaussian, and its slopes with `x` and with sigma.
+/// For seven cells around the one in which `x` lies: the share under a Gaussian, and its slopes with `x` and with
+/// sigma.
 fn shares(x: f64, sigma: f64) -> [(f64, f64, f64); 7] {
     let edge = |k: usize| match k {
         0 => (1.0, 0.0, 0.0),

@@ -1,4 +1,4 @@
-//! Corners at the limit of the light: their errors beside the least that there can be.
+//! Corners at the limit of the light: their errors compared with the least possible.
 
 use nalgebra::{Matrix3, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
@@ -83,7 +83,7 @@ fn smooth(image: &mut [f32], side: usize) {
     }
 }
 
-/// Of tags of a size: RMS error over the bound, RMS error, normalised error squared, share found.
+/// For tags of one size: RMS error over the bound, RMS error, normalised error squared, share found.
 fn measured(edge: f64, noise: f64, count: usize) -> (f64, f64, f64, f64) {
     let mut rng = ChaCha8Rng::seed_from_u64((edge * 10.0 + noise) as u64);
     let limits = Limits { min_px: 0.75 * edge.min(24.0), max_hamming: 2 };

@@ -1,4 +1,4 @@
-//! The detector on generated images: tags, discs, and what any image may hold.
+//! The detector on generated images: tags, discs, and arbitrary content.
 
 mod bound;
 mod common;

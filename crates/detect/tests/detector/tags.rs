@@ -1,4 +1,4 @@
-//! The tag detector on generated tags: honest covariance, one answer on every machine, nothing out of noise.
+//! The tag detector on generated tags: consistent covariance, the same result on every machine, no detection in noise.
 
 use nalgebra::{Matrix3, Vector2, Vector3};
 use proptest::prelude::*;
@@ -126,7 +126,7 @@ pub fn found_in(detector: &mut Detector, drawn: &Drawn) -> Option<TagDetection> 
     found.iter().find(|tag| (tag.family, tag.id) == (TagFamily::Tag36h11, drawn.id)).copied()
 }
 
-/// What corners of many tags come to.
+/// Results for the corners of many tags.
 #[derive(Default)]
 pub struct Score {
     nes: f64,

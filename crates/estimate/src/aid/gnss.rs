@@ -10,9 +10,9 @@ use super::gps_velocity::GpsVelocity;
 use crate::core::Core;
 use crate::models::Models;
 
-/// Farthest from the datum that a position can be meant, m: the tangent plane ends somewhere.
+/// Farthest position from the datum that is plausible, m: the tangent plane is an approximation.
 const FARTHEST_M: f64 = 2.0e5;
-/// Fastest a helicopter can be meant to fly, m/s.
+/// Fastest plausible flight of a helicopter, m/s.
 const FASTEST_MPS: f64 = 150.0;
 
 /// Position of an epoch; `None` where it has none, or of no fix.
@@ -37,14 +37,14 @@ pub(crate) fn velocity(epoch: &GnssEpoch) -> Option<GpsVelocity> {
 }
 
 impl GpsPosition {
-    /// Whether it can be meant.
+    /// Whether the value is plausible.
     pub(crate) fn is_credible(&self) -> bool {
         self.ned_m.norm() < FARTHEST_M
     }
 }
 
 impl GpsVelocity {
-    /// Whether it can be meant.
+    /// Whether the value is plausible.
     pub(crate) fn is_credible(&self) -> bool {
         self.ned_mps.norm() < FASTEST_MPS
     }

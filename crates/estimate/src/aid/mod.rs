@@ -1,5 +1,5 @@
-//! Measurement models: each a file that predicts one measurement `z = h(x) + noise`, with the blocks of its Jacobian,
-//! its noise, what it teaches of that noise, and what a run of refusals means.
+//! Measurement models: each file predicts one measurement `z = h(x) + noise`, with the blocks of its Jacobian, its
+//! noise, how that noise is learnt, and what a series of refusals means.
 //!
 //! A new sensor is a file here that implements [`Aid`], a variant of [`FusionSource`], and an arm in `sources.rs`.
 //! `jacobians.rs` holds every Jacobian against finite differences.
@@ -50,7 +50,7 @@ impl Core {
         }
     }
 
-    /// Writes what a measurement says into `self.z`; reports it where it cannot be predicted.
+    /// Writes a measurement into `self.z`; reports it if it cannot be predicted.
     pub(crate) fn expect_aid<A: Aid>(&mut self, aid: &A) -> bool {
         let expected = self.linearise(aid);
         if let Err(why) = expected {
@@ -59,10 +59,10 @@ impl Core {
         expected.is_ok()
     }
 
-    /// Writes what a measurement says into `self.z`.
+    /// Writes a measurement into `self.z`.
     ///
     /// # Errors
-    /// Says why it cannot be predicted.
+    /// The reason why it cannot be predicted.
     pub(crate) fn linearise<A: Aid>(&mut self, aid: &A) -> Result<(), Disposition> {
         aid.linearise(&self.state, &self.models, &mut self.z)
     }

@@ -1,7 +1,8 @@
-//! Tilt of the compass, or of the second source of attitude: `z = k (−w₁, w₂) + b + e` with a constant bias b and a slow error e. What w is depends on what the
-//! sensor feels (`kind.rs`): down in the body frame `d = Rᵀ e_D` where it tells attitude, or a share k of it; against the
-//! specific force, `u = −Rᵀ f/|f|`, where it feels that. In steady flight the two are the same; only acceleration parts
-//! them. A sensor of unknown kind is taken as one that tells attitude, with an error e that covers the others.
+//! Tilt of the compass, or of the second source of attitude: `z = k (−w₁, w₂) + b + e` with a constant bias b and a
+//! slow error e. What w is depends on what the sensor measures (`kind.rs`): down in the body frame `d = Rᵀ e_D` where
+//! it measures attitude, or a share k of it; against the specific force, `u = −Rᵀ f/|f|`, where it measures that. In
+//! steady flight the two are the same; only acceleration parts them. A sensor of unknown kind is taken as one that
+//! tells attitude, with an error e that covers the others.
 
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, SMatrix, Vector2, Vector3};
 

@@ -6,12 +6,12 @@ use std::collections::VecDeque;
 use windhover_base::msg::Disposition;
 use windhover_base::time::{MonoTime, Span};
 
-/// When a measurement was true and heard, and its place in the stream.
+/// When a measurement was valid and when it was received, and its place in the stream.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct Stamp {
     /// When it was true.
     pub t_valid: MonoTime,
-    /// When it was heard.
+    /// When it was received.
     pub t_recv: MonoTime,
     /// Position in the stream of events; orders measurements of one instant.
     pub seq: u64,
@@ -28,8 +28,8 @@ pub struct Entry<M, S> {
     pub after: S,
 }
 
-/// The history. It follows `t_recv`: one wild stamp cannot drag it into the future, since a
-/// measurement true later than it was heard is refused.
+/// The history. It follows `t_recv`: one wrong stamp cannot move it into the future, because a measurement valid later
+/// than it was received is refused.
 #[derive(Clone, Debug)]
 pub struct History<M, S> {
     entries: VecDeque<Entry<M, S>>,
@@ -43,15 +43,15 @@ pub struct History<M, S> {
     newest_recv: Option<MonoTime>,
 }
 
-/// How much later than heard a stamp may lie: the fits behind stamps are that good, ms.
+/// How much later than its reception a stamp may lie, ms: the accuracy of the fits behind stamps.
 const FUTURE_TOLERANCE_MS: f64 = 20.0;
 
 /// Entries made at once when none is to spare: the number in use then settles early.
 const BATCH: usize = 8;
 
 impl<M: Default, S: Default + Clone> History<M, S> {
-    /// An empty history that starts from `base`, true at `t_base`. It reaches `span` back from the
-    /// newest `t_recv` and holds at most `capacity` measurements.
+    /// An empty history that starts from `base`, valid at `t_base`. It reaches `span` back from the newest `t_recv` and
+    /// holds at most `capacity` measurements.
     pub fn new(span: Span, capacity: usize, base: S, t_base: MonoTime) -> Self {
         Self {
             entries: VecDeque::with_capacity(capacity + 1),

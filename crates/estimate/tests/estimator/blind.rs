@@ -1,5 +1,5 @@
-//! Own motion where no marker is in view: whether the scale of tilt holds, whether what is told covers the error, and
-//! whether a wrong word on the tilt sensor is found out.
+//! Own motion where no marker is in view: whether the scale of tilt is right, whether the stated variance covers the
+//! error, and whether a wrong configuration of the tilt sensor is detected.
 
 use nalgebra::Vector3;
 use windhover_base::geo::euler_321;
@@ -24,7 +24,7 @@ fn circling(seed: u64, kind: TiltKind, share: f64) -> Flight {
     })
 }
 
-/// What the filter says without anything in its frames.
+/// Estimates of the filter without sightings in its frames.
 fn blind(flight: &Flight) -> Vec<EstimatorOutput> {
     let (mut filter, mut out) = (flight.filter(), Vec::new());
     for heard in &flight.heard {
@@ -41,7 +41,8 @@ fn without_sight(heard: &Heard) -> Heard {
     heard
 }
 
-/// Slope of estimated tilt over the true one, and mean square of tilt error over what is told, an axis, from a time on.
+/// Slope of estimated tilt over the true one, and mean square of tilt error over the stated variance, for each axis,
+/// from a time on.
 fn tilt_of(flight: &Flight, out: &[EstimatorOutput], from_s: f64) -> (f64, f64) {
     let (mut both, mut truth2, mut squares, mut n) = (0.0, 0.0, 0.0, 0.0);
     for own in ownships(out).filter(|own| flight.world.seconds(own.t_valid) > from_s) {
@@ -171,7 +172,7 @@ fn features_on_a_parked_vehicle_do_not_bend_own_motion() {
     );
 }
 
-/// Mean square of the heading's error over what is told, from a time on.
+/// Mean square of the heading's error over the stated variance, from a time on.
 fn heading_of(flight: &Flight, out: &[EstimatorOutput], from_s: f64) -> f64 {
     let late = ownships(out).filter(|own| flight.world.seconds(own.t_valid) > from_s);
     let squares: Vec<f64> = late

@@ -184,7 +184,7 @@ fn the_order_of_arrival_does_not_matter() {
             out.iter().rev().find_map(|o| if let EstimatorOutput::Ownship(s) = o { Some(*s) } else { None });
         told.expect("a frame tells the helicopter's state")
     };
-    // From the same start on: everything in order of validity, heard at once, against as it came.
+    // From the same start: everything in order of validity and received at once, compared with the order of arrival.
     let mut in_order = flight.heard.clone();
     in_order[60..].sort_by_key(Heard::t_valid);
     in_order[60..].iter_mut().for_each(|h| h.set_t_recv(h.t_valid() + Span::from_ms(350.0)));
@@ -382,7 +382,7 @@ fn a_lasting_jump_of_the_receiver_anchors_the_scene_anew() {
         let Some(off_m) = off(own.t_valid) else { continue };
         let (error, sigma) = (own.position_ned_m - truth.position_ned_m, own.position_sigma_m());
         assert!((error.x - off_m).abs() < 4.0 * sigma.x && error.y.abs() < 4.0 * sigma.y, "{own:?}");
-        // Tags show the height, whatever the receiver says of it.
+        // Tags show the height, whatever the receiver reports.
         assert!(error.z.abs() < 4.0 * sigma.z && error.z.abs() < 1.0, "{own:?}");
         assert!(sigma.x > 0.3 * prior_m && sigma.x < 1.2 * prior_m, "{sigma:?}");
     }
@@ -426,7 +426,7 @@ fn the_papers_estimator_is_exact_without_noise() {
         (compass.bias_sigma_deg, compass.heading_noise_deg, compass.tilt_noise_deg) = (0.0, 0.0, 0.0);
         (compass.latency_spread_ms, compass.jitter_ms, compass.rate_hz) = (0.0, 0.0, 200.0);
         (s.camera.marker_noise_px, s.camera.stamp_noise_ms) = (0.0, 0.0);
-        // Everything heard as soon as it is true, so that the latest reading is that of the frame.
+        // Everything is received as soon as it is valid, so that the latest reading is that of the frame.
         s.rig.compass.baud = 921_600;
         (s.rig.gps.latency_ms, s.rig.compass.latency_ms) = (0.0, 0.0);
     });

@@ -130,7 +130,7 @@ fn on_a_slope(name: &str, runs: u64) -> [[f64; 4]; 2] {
 fn terrain_keeps_a_vehicle_on_a_slope_accurate() {
     let [terrain, level] = on_a_slope("follow", 4);
     println!("terrain {terrain:?}, level {level:?}");
-    // Heading and its covariance do not tell the two apart: the slow errors of own motion take the slope up.
+    // Heading and its covariance do not distinguish the two: the slow errors of own motion absorb the slope.
     assert!(terrain[0] < level[0] && terrain[1] < 0.35, "{terrain:?} {level:?}");
     assert!(terrain[3] < 4.5, "the covariances stay honest: {terrain:?}");
 }
@@ -165,8 +165,8 @@ fn floor_m(sigma_m: f64, tau_s: f64, t_s: f64) -> f64 {
     sigma_m * (2.0 * tau_s / (2.0 * tau_s + t_s)).sqrt()
 }
 
-/// What a survey holds after some seconds, over several flights: sigma told, error (root mean square,
-/// per axis), and normalised error squared of both axes.
+/// Result of a survey after some seconds, over several flights: stated sigma, error (root mean square, per axis), and
+/// normalised error squared of both axes.
 fn survey(seconds: f64, at_s: &[f64], runs: u64) -> BTreeMap<u64, [f64; 3]> {
     let mut table: BTreeMap<u64, [f64; 3]> = BTreeMap::new();
     for seed in 1..=runs {

@@ -1,5 +1,5 @@
-//! Whether a vehicle's speed, yaw rate and position are off by as much as is told, whatever the pixels are worth;
-//! and whether a track outlives its vehicle's absence.
+//! Whether the errors of a vehicle's speed, yaw rate and position agree with their stated variances, whatever the
+//! quality of the pixels; and whether a track survives its vehicle's absence.
 
 use std::sync::Arc;
 
@@ -54,7 +54,7 @@ fn fly_with(
     (world, estimates)
 }
 
-/// Mean over frames and seeds of squared error over variance told, of speed and of yaw rate.
+/// Mean over frames and seeds of squared error over stated variance, of speed and of yaw rate.
 fn squared_over_told(name: &str, px: (f64, f64)) -> [f64; 2] {
     let (mut sums, mut n) = ([0.0; 2], 0.0);
     for seed in 1..4 {
@@ -99,7 +99,7 @@ fn a_tag_badly_seen_for_a_while_is_no_vehicle_that_jumps() {
         let sigmas = seen.map(|e| e.state.and_then(|s| s.covariance).expect("tracked")[(3, 3)].sqrt());
         sigmas.fold(0.0, f64::max)
     };
-    // Then speed is told a little less surely meanwhile and as surely afterwards.
+    // Then the stated sigma of speed is a little larger meanwhile, and the same afterwards.
     let (before, during, after) = (sigma(10.0, 12.0), sigma(12.0, 12.6), sigma(13.0, 15.0));
     assert!(during < 4.0 * before && after < 2.0 * before, "{before:.4} {during:.4} {after:.4} m/s");
 }
@@ -110,8 +110,8 @@ fn ground_features_tell_nothing_of_where_they_are() {
     let seconds = 180.0;
     let (world, estimates) = fly("follow", seconds, 1, (0.5, 0.5));
     let last = estimates.last().and_then(|e| e.state).and_then(|s| s.covariance).expect("tracked");
-    // Then position is known as well as a receiver with a Gauss-Markov bias of known sigma and correlation time tells
-    // it in that time to one who knows every movement, and no better: `2 σ² τ / (T + 2 τ)`.
+    // Then position is known as well as a receiver with a Gauss-Markov bias of known sigma and correlation time gives
+    // it in that time if every movement is known, and no better: `2 σ² τ / (T + 2 τ)`.
     let gps = &world.scenario().rig.gps;
     let least = 2.0 * gps.bias_sigma_m.powi(2) * gps.bias_tau_s / (seconds + 2.0 * gps.bias_tau_s);
     for axis in 0..2 {

@@ -1,4 +1,4 @@
-//! The helicopter's own state between frames: told at any instant, whatever the camera does.
+//! The helicopter's own state between frames: output at any instant, whatever the camera does.
 
 use windhover_base::msg::{FrameObservations, Ownship, Stamped};
 use windhover_base::time::{MonoTime, Span};
@@ -8,12 +8,12 @@ use super::filter::{Flight, Heard, fly};
 
 const TENTH: i64 = 100_000_000;
 
-/// What was heard without the camera.
+/// What was received, without the camera's frames.
 fn without_frames(flight: &Flight) -> Vec<Heard> {
     flight.heard.iter().filter(|heard| !matches!(heard, Heard::Frame(_))).cloned().collect()
 }
 
-/// What a filter says between frames at every tenth of a second, and what it says else.
+/// The filter's output at every tenth of a second between frames, and its other output.
 fn told(flight: &Flight, heard: &[Heard], silence: Span) -> (Vec<Ownship>, Vec<EstimatorOutput>) {
     let (mut filter, mut own, mut out) = (flight.filter(), Vec::new(), Vec::new());
     let mut next = heard[0].t_recv().ns() / TENTH + 1;
