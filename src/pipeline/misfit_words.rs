@@ -71,6 +71,38 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
              detector.ground_features = 0"
                 .into(),
         ),
+        MisfitCause::Wanders => of_source(
+            format!("{figure:.1} times"),
+            "the receiver's slow error wanders farther than configured, against what is seen of vehicles and ground".into(),
+            "raise gps.bias_sigma_m: positions are allowed to be as far off meanwhile".into(),
+        ),
+        MisfitCause::Lens => MisfitWords {
+            source: "camera".into(),
+            kind,
+            figure: format!("{figure:+.3}"),
+            cause: "the lens distorts otherwise than configured: by this much in k1".into(),
+            advice: "calibrate the camera (windhover calibrate), and check camera.intrinsics and the picture's size".into(),
+        },
+        MisfitCause::AntennaPlace => of_source(
+            format!("{figure:.2} m"),
+            "the receiver's antenna is not where gps.antenna_position_m has it, by how it swings in turns".into(),
+            "measure the antenna's place from the body frame's origin again".into(),
+        ),
+        MisfitCause::TargetSways { target } => MisfitWords {
+            source: target_name(rig, target),
+            kind,
+            figure: format!("{:.1} cm", 100.0 * figure),
+            cause: "its body rolls, pitches or heaves on its springs".into(),
+            advice: "nothing: the estimate allows for it, with a larger sigma of speed; markers mounted lower move less"
+                .into(),
+        },
+        MisfitCause::TargetSlides { target } => MisfitWords {
+            source: target_name(rig, target),
+            kind,
+            figure: format!("{figure:.0} times"),
+            cause: "it moves across its heading".into(),
+            advice: "nothing where it slides: the estimate allows for it; else check yaw_deg of its markers".into(),
+        },
         MisfitCause::TargetTurns { target } => MisfitWords {
             source: target_name(rig, target),
             kind,
@@ -94,6 +126,11 @@ const fn kind(cause: MisfitCause) -> &'static str {
         MisfitCause::Height => "height",
         MisfitCause::MovingGround => "moving_ground",
         MisfitCause::TargetTurns { .. } => "target_turns",
+        MisfitCause::TargetSways { .. } => "target_sways",
+        MisfitCause::AntennaPlace => "antenna_place",
+        MisfitCause::Lens => "lens",
+        MisfitCause::Wanders => "wanders",
+        MisfitCause::TargetSlides { .. } => "target_slides",
         MisfitCause::Late => "late",
     }
 }

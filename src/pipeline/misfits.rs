@@ -79,7 +79,9 @@ const fn place(cause: MisfitCause) -> (Option<usize>, Option<usize>) {
         MisfitCause::MarkerSize(MarkerPair { target, marker, .. })
         | MisfitCause::MarkerPlace(MarkerPair { target, marker, .. })
         | MisfitCause::MarkerTurn(MarkerPair { target, marker, .. }) => (Some(target), Some(marker)),
-        MisfitCause::TargetTurns { target } => (Some(target), None),
+        MisfitCause::TargetTurns { target }
+        | MisfitCause::TargetSways { target }
+        | MisfitCause::TargetSlides { target } => (Some(target), None),
         _ => (None, None),
     }
 }
@@ -90,7 +92,9 @@ const fn where_it_fits(cause: MisfitCause) -> f64 {
         MisfitCause::TiltKind(_)
         | MisfitCause::Noise
         | MisfitCause::MarkerSize(_)
-        | MisfitCause::TargetTurns { .. } => 1.0,
+        | MisfitCause::Wanders
+        | MisfitCause::TargetTurns { .. }
+        | MisfitCause::TargetSlides { .. } => 1.0,
         _ => 0.0,
     }
 }

@@ -59,6 +59,7 @@ impl Core {
     /// What the fixes that have just been explained said of the receiver counts no more.
     fn forget_misfit(&mut self) {
         self.state.rejections.gps_position = 0;
+        self.state.past_bias.in_use = false;
         self.state.fits[WATCHED_POSITION] = Fit::default();
     }
 

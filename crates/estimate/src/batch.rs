@@ -244,7 +244,7 @@ impl Predictor {
 
     /// Variances of the receiver's position bias, NED, m², at this kind of fix, and its correlation time, s.
     pub fn gps_bias(&mut self, fix: FixKind) -> ([f64; 3], f64) {
-        self.core.state.senses.of_fix(fix, None, &self.core.models);
+        self.core.state.senses.of_fix(fix, None, 1.0, &self.core.models);
         (self.core.state.senses.gps_bias_var, self.core.models.tau.gps_bias_s)
     }
 
@@ -286,7 +286,7 @@ impl Predictor {
     /// Position of an epoch; `None` where it has none that can be meant.
     pub fn gps_position(&mut self, epoch: &GnssEpoch) -> Option<Linear<'_>> {
         let position = gnss::position(epoch, &self.core.models).filter(|position| position.is_credible())?;
-        self.core.state.senses.of_fix(epoch.fix, epoch.position_sigma_m, &self.core.models);
+        self.core.state.senses.of_fix(epoch.fix, epoch.position_sigma_m, 1.0, &self.core.models);
         self.core.linearise(&position).ok()?;
         Some(Linear(&self.core.z))
     }

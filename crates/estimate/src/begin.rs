@@ -12,6 +12,7 @@ use super::models::{Marker, Models};
 use super::own::Own;
 use super::standstill::Standstill;
 use super::state::{GUESSED_VAR, State, Target};
+use super::sway::Sway;
 use super::track::{Certainty, Circumstances, Life, Sighting};
 
 impl Core {
@@ -46,6 +47,7 @@ impl Core {
             last_seen: t,
             tied_since: t,
             standstill: Standstill::MOVES,
+            sway: if moves { Sway::presumed() } else { Sway::default() },
             ..Target::default()
         };
         self.state.learnt.target_q[index] = self.learning.start.target_q[index];
@@ -53,6 +55,7 @@ impl Core {
         let [speed_var, rate_var] = if moves { START_MOTION_VAR } else { [0.0; 2] };
         let block = self.state.layout().target(index).all();
         self.state.renew(block, &[GUESSED_VAR, GUESSED_VAR, heading_var, speed_var, rate_var]);
+        self.state.renew_sway(index, &self.models);
         self.fuse_first(index, markers);
         self.state.settle(index);
     }
@@ -91,6 +94,7 @@ impl Core {
         };
         self.state.learnt.target_q[index] = self.learning.start.target_q[index];
         self.state.renew(block.all(), &[GUESSED_VAR, GUESSED_VAR, 1.0, motion[0], motion[1]]);
+        self.state.renew_sway(index, &self.models);
         self.fuse_first(index, markers);
         self.state.settle(index);
         true
@@ -154,7 +158,7 @@ pub(crate) fn ground_point(
     let ned_from_camera =
         own.ned_from_body * nalgebra::Rotation3::from_matrix_unchecked(models.camera_from_body.transpose());
     let camera = own.position + own.ned_from_body * models.camera_at;
-    locate(&models.camera, &camera, &ned_from_camera, px, &models.ground, above_m, FARTHEST_M)
+    locate(&models.lens(own), &camera, &ned_from_camera, px, &models.ground, above_m, FARTHEST_M)
         .ok()
         .map(|found| found.ned_m)
 }

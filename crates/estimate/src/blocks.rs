@@ -1,7 +1,7 @@
 //! Which part of the joint state lies in which columns of the error state.
 //!
 //! Order: the helicopter and its sensors' slow errors ([`own`], as many as there are sensors), each target
-//! ([`TargetBlock`]), each ground feature (two columns), each fitted tag ([`TagFitBlock`]). A new state of the helicopter is a
+//! ([`TargetBlock`]), each ground feature (two columns), each fitted tag ([`TagFitBlock`]), the sway of each target. A new state of the helicopter is a
 //! constant of [`own`].
 
 use std::ops::Range;
@@ -93,8 +93,14 @@ pub(crate) mod own {
     /// How much older the compass is than configured, against the camera, s.
     pub(crate) const COMPASS_DELAY: Block<1> = Block::after(DRAG);
 
+    /// By how much the antenna is elsewhere than configured, body axes forward and right, m.
+    pub(crate) const ARM: Block<2> = Block::after(COMPASS_DELAY);
+
+    /// Errors of the lens's distortion: k1, k2, p1, p2.
+    pub(crate) const LENS: Block<4> = Block::after(ARM);
+
     /// Constant error of the gyros, body axes, rad/s. From here on only where there is an IMU.
-    pub(crate) const RATE_BIAS: Block<3> = Block::after(COMPASS_DELAY);
+    pub(crate) const RATE_BIAS: Block<3> = Block::after(LENS);
     /// Constant error of the accelerometers, body axes, m/s².
     pub(crate) const FORCE_BIAS: Block<3> = Block::after(RATE_BIAS);
     /// Heading bias of the second source of attitude, rad. From here on only where there is one.
@@ -109,7 +115,7 @@ pub(crate) mod own {
     /// What has intensities that are fitted in flight: rate, gusts, thrust, error of the tilt reading.
     pub(crate) const MOTION: Block<{ TILT_ERROR.end() - ATTITUDE.end() }> = Block::from_start_of(RATE);
     /// Length of the helicopter's part with GPS and compass only, with an IMU, and with a second source of attitude.
-    pub(crate) const LEN: usize = COMPASS_DELAY.end();
+    pub(crate) const LEN: usize = LENS.end();
     pub(crate) const WITH_IMU: usize = FORCE_BIAS.end();
     pub(crate) const WITH_SECOND: usize = SECOND_TILT_ERROR.end();
     /// What moves by itself, forces and slow errors: the table of `own.rs`.
@@ -122,6 +128,9 @@ pub(crate) mod own {
 pub(crate) const TARGET: usize = 5;
 /// Length of a feature's part: north, east.
 pub(crate) const FEATURE: usize = 2;
+
+/// Length of a vehicle's sway: roll, pitch, heave of its body.
+pub(crate) const SWAY: usize = 3;
 
 /// Length of a tag's part: logarithm of its size, place forward and right, turn, each beside its configuration.
 pub(crate) const TAG_FIT: usize = 4;
@@ -197,7 +206,7 @@ pub(crate) struct Layout {
 impl Layout {
     /// Length of the error state.
     pub(crate) const fn len(self) -> usize {
-        self.tag(self.tags).0.0
+        self.sway(self.targets).0
     }
 
     /// The states of the helicopter's part that move by themselves.
@@ -218,6 +227,11 @@ impl Layout {
     /// The fit of tag `i`.
     pub(crate) const fn tag(self, i: usize) -> TagFitBlock {
         TagFitBlock(Block(self.feature(self.features).0 + TAG_FIT * i))
+    }
+
+    /// The sway of target `i`.
+    pub(crate) const fn sway(self, i: usize) -> Block<SWAY> {
+        Block(self.tag(self.tags).0.0 + SWAY * i)
     }
 
     /// Every pair of columns that is a place on the ground: of targets, then of features.
@@ -242,7 +256,8 @@ mod tests {
         assert_eq!(layout.target(1).all().column(0), layout.target(0).yaw_rate().end());
         assert_eq!(layout.feature(0).column(0), layout.target(1).all().end());
         assert_eq!(layout.feature(2).end(), layout.tag(0).all().column(0));
-        assert_eq!(layout.tag(1).all().end(), layout.len());
+        assert_eq!(layout.tag(1).all().end(), layout.sway(0).column(0));
+        assert_eq!(layout.sway(1).end(), layout.len());
         let places: Vec<_> = layout.places().map(Block::range).collect();
         assert_eq!(places.len(), 5);
         assert_eq!(places[4].end, layout.tag(0).all().column(0));

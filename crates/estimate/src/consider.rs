@@ -23,6 +23,7 @@ const ALWAYS: Held = Held::NONE.and(own::TILT_GAIN).and(own::SECOND_TILT_GAIN);
 const BLIND: Held = ALWAYS
     .and(own::GPS_DELAY)
     .and(own::COMPASS_DELAY)
+    .and(own::ARM)
     .and(own::DRAG)
     .and(own::TRIM)
     .and(own::TILT_BIAS)

@@ -13,6 +13,7 @@ use super::kind::TiltWatch;
 use super::measurement::Measurement;
 use super::models::Models;
 use super::own::Senses;
+use super::receiver_error::Wandering;
 use super::state::State;
 use super::update::{Outcome, Workspace};
 
@@ -55,7 +56,7 @@ impl Core {
         let tilt = [rig.compass.tilt, second.tilt].map(TiltWatch::new);
         let mut senses = Senses::default();
         senses.of_tilt(&tilt);
-        senses.of_fix(FixKind::ThreeD, None, &models);
+        senses.of_fix(FixKind::ThreeD, None, 1.0, &models);
         senses.hold_bias(MonoTime::default());
         let tilt_error_var = senses.tilt_error_var;
         let start = Learnt {
@@ -70,6 +71,7 @@ impl Core {
             marker_factor: vec![1.0; rig.target.len()],
             feature_factor: 1.0,
             gps_factor: 1.0,
+            receiver: Wandering::default(),
             gps_velocity_factor: 1.0,
             force_factor: 1.0,
             blind: true,

@@ -76,7 +76,7 @@ impl DelayedCopy {
 impl State {
     /// The copies that are kept up.
     pub(crate) fn copies_in_use(&mut self) -> impl Iterator<Item = &mut DelayedCopy> {
-        in_use(&mut self.copies, &mut self.past_motion)
+        in_use(&mut self.copies, [&mut self.past_motion, &mut self.past_bias])
     }
 
     /// Starts a copy of the targets at the present instant, in the oldest place.
@@ -107,12 +107,20 @@ impl State {
         (copy.in_use, copy.t) = (true, self.t);
         copy.take(&self.cov, own::MOTION);
     }
+
+    /// Starts a copy of the receiver's horizontal error at the present instant.
+    pub(crate) fn copy_bias(&mut self) {
+        let (now, copy) = (self.own.gps_bias.xy(), &mut self.past_bias);
+        copy.mean.copy_from_slice(now.as_slice());
+        (copy.in_use, copy.t) = (true, self.t);
+        copy.take(&self.cov, own::GPS_BIAS);
+    }
 }
 
 /// Those of a state's copies that are kept up, for where the rest of the state is borrowed too.
 pub(crate) fn in_use<'a>(
     copies: &'a mut [DelayedCopy],
-    past_motion: &'a mut DelayedCopy,
+    past: [&'a mut DelayedCopy; 2],
 ) -> impl Iterator<Item = &'a mut DelayedCopy> {
-    copies.iter_mut().chain([past_motion]).filter(|copy| copy.in_use)
+    copies.iter_mut().chain(past).filter(|copy| copy.in_use)
 }

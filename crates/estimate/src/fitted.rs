@@ -4,6 +4,8 @@
 
 use windhover_base::time::{MonoTime, Span};
 
+use super::receiver_error::Wandering;
+
 /// What is fitted.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Learnt {
@@ -28,6 +30,8 @@ pub(crate) struct Learnt {
     pub(crate) feature_factor: f64,
     /// Factors on the variance of the receiver's position and velocity noise.
     pub(crate) gps_factor: f64,
+    /// How far the receiver's slow error wanders.
+    pub(crate) receiver: Wandering,
     pub(crate) gps_velocity_factor: f64,
     /// Factor on the variance of the accelerometers' noise.
     pub(crate) force_factor: f64,
@@ -80,6 +84,7 @@ impl Learnt {
             heading_var: other.heading_var,
             feature_factor: other.feature_factor,
             gps_factor: other.gps_factor,
+            receiver: other.receiver,
             gps_velocity_factor: other.gps_velocity_factor,
             force_factor: other.force_factor,
             blind: other.blind,

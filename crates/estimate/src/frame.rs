@@ -25,6 +25,7 @@ impl Core {
         }
         self.state.learn_targets(&self.learning);
         self.judge_turns();
+        self.judge_lens();
         self.state.copy_targets(frame.frame, self.keep_copies);
         self.judge_camera_clock();
     }
@@ -51,8 +52,7 @@ impl Core {
 
     /// Fuses the markers of a target that is held.
     fn fuse_seen(&mut self, index: usize, markers: &[MarkerDetection]) {
-        let (before, since_s) =
-            (self.state.across(index), (self.state.t - self.state.targets[index].last_seen).s());
+        let before = self.before_fusion(index);
         let mut accepted = false;
         for detection in markers {
             if let Some((target, marker)) = self.models.find(detection.marker)
@@ -72,7 +72,7 @@ impl Core {
         if accepted {
             target.life = target.life.accepted();
             target.last_seen = t;
-            self.learn_slip(index, &before, since_s);
+            self.judge_vehicle(index, &before);
         } else {
             target.life = target.life.refused();
             match target.life.verdict(self.restart_after, self.models.targets[index].moves()) {

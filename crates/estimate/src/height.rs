@@ -94,7 +94,7 @@ impl Core {
             own.ned_from_body * Rotation3::from_matrix_unchecked(self.models.camera_from_body.transpose());
         let mut at_one_metre = [Vector2::zeros(); 4];
         for (at, px) in at_one_metre.iter_mut().zip(corners_px) {
-            let ray = to_ned * self.models.camera.normalised(*px)?.push(1.0);
+            let ray = to_ned * self.models.lens(&self.state.own).normalised(*px)?.push(1.0);
             if ray.z < FLATTEST * ray.norm() {
                 return None;
             }

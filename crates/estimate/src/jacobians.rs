@@ -359,6 +359,8 @@ fn rows_exposed_one_after_the_other() {
             [
                 left_out(own::POSITION.range(), 5.0),
                 left_out(own::ATTITUDE.range(), 60.0),
+                // Some percent of what they move a pixel by themselves.
+                left_out(own::LENS.range(), 60.0),
                 left_out(seen, 20.0),
                 left_out(layout.tag(0).all().column(0)..layout.len(), 5.0),
             ]
@@ -417,6 +419,8 @@ fn nothing_seen_shows_scale_or_how_tags_are_turned() {
     for seed in 0..STATES {
         let mut core = random_core(seed, Ground::Flat { down_m: 0.0 });
         core.state.tags.iter_mut().for_each(|tag| tag.mean = [0.0; 4]);
+        // A body that is rolled or pitched lies otherwise to the ground: by its angle the directions are then off.
+        core.state.targets.iter_mut().for_each(|target| target.sway.mean = [0.0; 3]);
         let mut along = vec![0.0; core.state.layout().len()];
         for target in 0..core.state.targets.len() {
             let seen = detection(&core, target, 0);

@@ -123,6 +123,6 @@ impl Core {
 }
 
 /// Variance of `x_now − decay · x_then`.
-fn increment(copy: &DelayedCopy, row: usize, var_now: f64, column: usize, decay: f64) -> f64 {
+pub(crate) fn increment(copy: &DelayedCopy, row: usize, var_now: f64, column: usize, decay: f64) -> f64 {
     var_now + decay * decay * copy.cov.at(row, row) - 2.0 * decay * copy.cross.at(row, column)
 }

@@ -45,6 +45,8 @@ pub(crate) struct TargetModels {
     pub(crate) markers: Vec<Marker>,
     /// Around the middle of its markers, what the vehicle may cover, m.
     pub(crate) radius_m: f64,
+    /// Mean height of its markers over the ground, m.
+    pub(crate) markers_height_m: f64,
 }
 
 impl TargetModels {
@@ -179,17 +181,22 @@ const RATE_TAU_S: f64 = 1.0;
 /// Correlation time of the thrust beyond the weight, s: a climb begins or ends within seconds.
 const THRUST_TAU_S: f64 = 2.0;
 
+/// Markers are taken to be no lower than this where their height divides, m.
+const LOWEST_M: f64 = 0.1;
+
 fn target_models(index: usize, config: &TargetConfig) -> TargetModels {
     let markers: Vec<Marker> =
         config.marker.iter().enumerate().map(|(m, marker)| marker_model(index, m, marker)).collect();
     let wheelbase = config.wheelbase_m.unwrap_or(0.0);
     let reach = markers.iter().map(|m| m.center.xy().norm() + m.size_m).fold(wheelbase, f64::max);
+    let height: f64 = markers.iter().map(|m| -m.center.z).sum();
     TargetModels {
         kind: config.model,
         motion: Motion::new(config),
         reference_m: config.reference_m,
-        markers,
         radius_m: reach + 0.5,
+        markers_height_m: (height / markers.len().max(1) as f64).max(LOWEST_M),
+        markers,
     }
 }
 

@@ -4,7 +4,7 @@
 //! wanders. Everything else (injection, prediction, start, warm start) goes by the table. The measurement models in
 //! `aid` that it explains take it from there; what the forces do is in `force.rs`.
 
-use nalgebra::{Matrix3, Rotation3, Vector2, Vector3};
+use nalgebra::{Matrix3, Rotation3, Vector2, Vector3, Vector4};
 
 use windhover_base::msg::FixKind;
 use windhover_base::time::MonoTime;
@@ -41,6 +41,10 @@ pub(crate) struct Own {
     pub(crate) gps_delay_s: f64,
     pub(crate) drag_per_s: f64,
     pub(crate) compass_delay_s: f64,
+    /// By how much the antenna is elsewhere than configured, forward and right, m.
+    pub(crate) arm: Vector2<f64>,
+    /// By how much the lens's distortion (k1, k2, p1, p2) is more than configured.
+    pub(crate) lens: Vector4<f64>,
     /// Of the gyros, rad/s, and of the accelerometers, m/s², body axes.
     pub(crate) rate_bias: Vector3<f64>,
     pub(crate) force_bias: Vector3<f64>,
@@ -111,6 +115,8 @@ impl Default for Own {
             gps_delay_s: 0.0,
             drag_per_s: 0.0,
             compass_delay_s: 0.0,
+            arm: Vector2::zeros(),
+            lens: Vector4::zeros(),
             rate_bias: Vector3::zeros(),
             force_bias: Vector3::zeros(),
             second: AttitudeErrors::default(),
@@ -153,7 +159,7 @@ pub(crate) struct Terms<'a> {
 }
 
 /// How a slow state moves.
-enum SmoothNoise {
+enum Drift {
     /// A random walk, units per √s.
     Walk(f64),
     /// Gauss–Markov about zero: correlation time, s. Its variance is that it starts with.
@@ -165,128 +171,153 @@ struct Slow {
     first: usize,
     mean: for<'a> fn(&'a mut Own) -> &'a mut [f64],
     start_var: fn(&Terms<'_>) -> [f64; 3],
-    wander: SmoothNoise,
+    wander: Drift,
 }
 
 /// The slow states in the order of their columns.
-const SLOW: [Slow; 18] = [
+const SLOW: [Slow; 21] = [
     Slow {
         first: place(own::GUST),
         mean: |own| own.gust.as_mut_slice(),
         start_var: |terms| [terms.learnt.gust_var; 3],
-        wander: SmoothNoise::Reverts(|terms| terms.models.tau.gust_s),
+        wander: Drift::Reverts(|terms| terms.models.tau.gust_s),
     },
     Slow {
         first: place(own::THRUST),
         mean: |own| std::slice::from_mut(&mut own.thrust),
         start_var: |terms| [terms.learnt.thrust_var; 3],
-        wander: SmoothNoise::Reverts(|terms| terms.models.tau.thrust_s),
+        wander: Drift::Reverts(|terms| terms.models.tau.thrust_s),
     },
     Slow {
         first: place(own::TILT_ERROR),
         mean: |own| own.tilt_error.as_mut_slice(),
         start_var: |terms| [terms.learnt.tilt_error_var; 3],
-        wander: SmoothNoise::Reverts(|terms| terms.senses.tilt_error_tau_s),
+        wander: Drift::Reverts(|terms| terms.senses.tilt_error_tau_s),
     },
     Slow {
         first: place(own::WIND),
         mean: |own| own.wind.as_mut_slice(),
         // 8 m/s of wind at a drag of 0.2 /s.
         start_var: |_| [1.5f64.powi(2); 3],
-        wander: SmoothNoise::Walk(0.1),
+        wander: Drift::Walk(0.1),
     },
     Slow {
         first: place(own::TRIM),
         mean: |own| own.trim.as_mut_slice(),
         // 3.5°: a tail rotor alone makes a helicopter hang by some degrees.
         start_var: |_| [0.06f64.powi(2); 3],
-        wander: SmoothNoise::Walk(1e-4),
+        wander: Drift::Walk(1e-4),
     },
     Slow {
         first: place(own::GPS_BIAS),
         mean: |own| own.gps_bias.as_mut_slice(),
         start_var: |terms| terms.senses.gps_bias_var,
-        wander: SmoothNoise::Reverts(|terms| terms.models.tau.gps_bias_s),
+        wander: Drift::Reverts(|terms| terms.models.tau.gps_bias_s),
     },
     Slow {
         first: place(own::HEADING_BIAS),
         mean: |own| std::slice::from_mut(&mut own.heading_bias),
         start_var: |terms| [terms.models.heading_bias_var[COMPASS]; 3],
         // A tenth of a degree over 100 s would be 2e-4.
-        wander: SmoothNoise::Walk(3e-4),
+        wander: Drift::Walk(3e-4),
     },
     Slow {
         first: place(own::TILT_GAIN),
         mean: |own| std::slice::from_mut(&mut own.tilt_gain),
         // It is one, or found out beside the filter (`kind.rs`).
         start_var: |_| [0.0; 3],
-        wander: SmoothNoise::Walk(0.0),
+        wander: Drift::Walk(0.0),
     },
     Slow {
         first: place(own::TILT_BIAS),
         mean: |own| own.tilt_bias.as_mut_slice(),
         // 0.4°: data sheets allow 0.2° to 0.5°.
         start_var: |_| [0.007f64.powi(2); 3],
-        wander: SmoothNoise::Walk(3e-4),
+        wander: Drift::Walk(3e-4),
     },
     Slow {
         first: place(own::GPS_DELAY),
         mean: |own| std::slice::from_mut(&mut own.gps_delay_s),
         start_var: |terms| [terms.models.gps_delay_var; 3],
-        wander: SmoothNoise::Walk(2e-4),
+        wander: Drift::Walk(2e-4),
     },
     Slow {
         first: place(own::DRAG),
         mean: |own| std::slice::from_mut(&mut own.drag_per_s),
         // About START_DRAG_PER_S.
         start_var: |_| [0.1f64.powi(2); 3],
-        wander: SmoothNoise::Walk(1e-4),
+        wander: Drift::Walk(1e-4),
     },
     Slow {
         first: place(own::COMPASS_DELAY),
         mean: |own| std::slice::from_mut(&mut own.compass_delay_s),
         // Filters of compasses and drivers of cameras have tens of milliseconds that no data sheet tells.
         start_var: |_| [0.03f64.powi(2); 3],
-        wander: SmoothNoise::Walk(1e-4),
+        wander: Drift::Walk(1e-4),
+    },
+    Slow {
+        first: place(own::ARM),
+        mean: |own| own.arm.as_mut_slice(),
+        start_var: |_| [ARM_SIGMA_M * ARM_SIGMA_M; 3],
+        wander: Drift::Walk(0.0),
+    },
+    Slow {
+        first: place(own::LENS),
+        mean: |own| &mut own.lens.as_mut_slice()[..2],
+        // The others are as configured, until k1 is not (`lens.rs`).
+        start_var: |_| [LENS_K1_SIGMA * LENS_K1_SIGMA, 0.0, 0.0],
+        wander: Drift::Walk(0.0),
+    },
+    Slow {
+        first: place(own::LENS.part::<2>(2)),
+        mean: |own| &mut own.lens.as_mut_slice()[2..],
+        start_var: |_| [0.0; 3],
+        wander: Drift::Walk(0.0),
     },
     Slow {
         first: place(own::RATE_BIAS),
         mean: |own| own.rate_bias.as_mut_slice(),
         start_var: |terms| [terms.models.rate_bias_var; 3],
-        wander: SmoothNoise::Walk(1e-4),
+        wander: Drift::Walk(1e-4),
     },
     Slow {
         first: place(own::FORCE_BIAS),
         mean: |own| own.force_bias.as_mut_slice(),
         start_var: |terms| [terms.models.force_bias_var; 3],
         // What vibration rectifies changes with the load.
-        wander: SmoothNoise::Walk(0.05),
+        wander: Drift::Walk(0.05),
     },
     Slow {
         first: place(own::SECOND_HEADING_BIAS),
         mean: |own| std::slice::from_mut(&mut own.second.heading_bias),
         start_var: |terms| [terms.models.heading_bias_var[SECOND]; 3],
-        wander: SmoothNoise::Walk(3e-4),
+        wander: Drift::Walk(3e-4),
     },
     Slow {
         first: place(own::SECOND_TILT_GAIN),
         mean: |own| std::slice::from_mut(&mut own.second.tilt_gain),
         start_var: |_| [0.0; 3],
-        wander: SmoothNoise::Walk(0.0),
+        wander: Drift::Walk(0.0),
     },
     Slow {
         first: place(own::SECOND_TILT_BIAS),
         mean: |own| own.second.tilt_bias.as_mut_slice(),
         start_var: |_| [0.007f64.powi(2); 3],
-        wander: SmoothNoise::Walk(3e-4),
+        wander: Drift::Walk(3e-4),
     },
     Slow {
         first: place(own::SECOND_TILT_ERROR),
         mean: |own| own.second.tilt_error.as_mut_slice(),
         start_var: |terms| [terms.senses.second_error_var; 3],
-        wander: SmoothNoise::Reverts(|terms| terms.senses.second_error_tau_s),
+        wander: Drift::Reverts(|terms| terms.senses.second_error_tau_s),
     },
 ];
+
+/// How well an antenna's place is measured, m.
+pub(crate) const ARM_SIGMA_M: f64 = 0.1;
+
+/// How well k1 of a calibrated lens is known.
+pub(crate) const LENS_K1_SIGMA: f64 = 0.02;
 
 /// Drag at the start, 1/s: of a small rotorcraft 0.1 to 0.3 is usual, and every one has some.
 pub(crate) const START_DRAG_PER_S: f64 = 0.2;
@@ -300,6 +331,11 @@ impl Own {
     /// `ned_from_body` as a matrix.
     pub(crate) fn rotation(&self) -> &Matrix3<f64> {
         self.ned_from_body.matrix()
+    }
+
+    /// Where the antenna is, body axes, by what is configured, m.
+    pub(crate) fn antenna(&self, configured: &Vector3<f64>) -> Vector3<f64> {
+        configured + Vector3::new(self.arm.x, self.arm.y, 0.0)
     }
 
     /// Velocity of a point at `lever_m` in the body frame: `v + R (ω × l)`.
@@ -369,8 +405,8 @@ impl Terms<'_> {
     /// Variances that the slow states gain over a time.
     pub(crate) fn growth(&self, dt_s: f64) -> [f64; SLOW_STATES] {
         by_row(|slow| match slow.wander {
-            SmoothNoise::Walk(walk) => [walk.powi(2) * dt_s; 3],
-            SmoothNoise::Reverts(_) => {
+            Drift::Walk(walk) => [walk.powi(2) * dt_s; 3],
+            Drift::Reverts(_) => {
                 let decay = slow.decay(self, dt_s);
                 (slow.start_var)(self).map(|var| var * (1.0 - decay * decay))
             }
@@ -381,8 +417,8 @@ impl Terms<'_> {
 impl Slow {
     fn decay(&self, terms: &Terms<'_>, dt_s: f64) -> f64 {
         match self.wander {
-            SmoothNoise::Reverts(tau_s) => (-dt_s / tau_s(terms)).exp(),
-            SmoothNoise::Walk(_) => 1.0,
+            Drift::Reverts(tau_s) => (-dt_s / tau_s(terms)).exp(),
+            Drift::Walk(_) => 1.0,
         }
     }
 }

@@ -34,7 +34,13 @@ impl Senses {
 
     /// Takes variances of bias and noise from the quality of a fix, and from the errors the receiver states, if any:
     /// `told_m`, one sigma. These replace what is configured, down to what a fix of its kind reaches.
-    pub(crate) fn of_fix(&mut self, fix: FixKind, told_m: Option<Vector3<f64>>, models: &Models) {
+    pub(crate) fn of_fix(
+        &mut self,
+        fix: FixKind,
+        told_m: Option<Vector3<f64>>,
+        fitted: f64,
+        models: &Models,
+    ) {
         let (bias_m, noise_m) = match fix {
             FixKind::RtkFixed => RTK_FIXED_M,
             FixKind::RtkFloat => RTK_FLOAT_M,
@@ -45,7 +51,7 @@ impl Senses {
         let reached = usual.map(|var| var.min(CODE_M.powi(2)));
         let bias = told_m.map_or(usual, |told| told.component_mul(&told).sup(&reached));
         self.fix = fix;
-        self.gps_bias_var = bias.into();
+        self.gps_bias_var = (bias * fitted).into();
         // What is noisier as a whole is noisier from fix to fix.
         self.gps_noise_var = models.gps_noise_var.min(noise_m.powi(2)) * (bias.x / usual.x).max(1.0);
     }
@@ -75,7 +81,7 @@ impl Core {
     pub(crate) fn sense_fix(&mut self, fix: FixKind, told_m: Option<Vector3<f64>>) {
         let (state, models) = (&mut self.state, &self.models);
         let (before, t) = (state.senses, state.t);
-        state.senses.of_fix(fix, told_m, models);
+        state.senses.of_fix(fix, told_m, state.learnt.receiver.factor(), models);
         let bias_var = state.senses.gps_bias_var;
         if is_rtk(fix) != is_rtk(before.fix) && bias_var != before.gps_bias_var {
             state.senses.hold_bias(t);

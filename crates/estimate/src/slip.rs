@@ -7,7 +7,6 @@
 use nalgebra::{Matrix2, Vector2};
 
 use super::blocks::own;
-use super::core::Core;
 use super::state::State;
 
 /// Time over which it is fitted, s.
@@ -18,6 +17,9 @@ const LEAST_RATIO: f64 = 3.0;
 const MOST: f64 = 50.0;
 /// Factor on its intensity for each frame outside the gate.
 const OPENED: f64 = 30.0;
+/// Time over which a slide is averaged that is reported, s, and how many times the walk configured it must be.
+const SHOWN_S: f64 = 3.0;
+const SHOWN: f64 = 1.5;
 /// Least share of the variance that a frame must have found out.
 const LEAST_TOLD: f64 = 0.3;
 
@@ -26,6 +28,8 @@ const LEAST_TOLD: f64 = 0.3;
 pub(crate) struct Slip {
     /// Logarithm of the walk's intensity over that configured.
     growth: f64,
+    /// Its mean over [`SHOWN_S`].
+    mean_growth: f64,
 }
 
 impl Slip {
@@ -40,12 +44,19 @@ impl Slip {
         self.growth = (self.growth + OPENED.ln()).min(2.0 * MOST.ln());
     }
 
+    /// The walk over that configured, its mean over some seconds; `None` where that is not beyond doubt.
+    pub(crate) fn shown(self) -> Option<f64> {
+        let times = (0.5 * self.mean_growth).exp();
+        (times > SHOWN).then_some(times)
+    }
+
     /// Takes a frame's d² over what was due.
     fn take(&mut self, ratio: f64, since_s: f64) {
         if ratio.is_finite() && ratio > 0.0 {
             // Never beyond what explains this one.
             let step = (since_s / OVER_S * (ratio - LEAST_RATIO)).min(ratio.ln().max(0.0));
             self.growth = (self.growth + step).clamp(0.0, 2.0 * MOST.ln());
+            self.mean_growth += (since_s / SHOWN_S).min(1.0) * (self.growth - self.mean_growth);
         }
     }
 }
@@ -58,6 +69,18 @@ pub(crate) struct Across {
     var: f64,
 }
 
+impl Across {
+    /// Its variance then, m².
+    pub(crate) fn var(&self) -> f64 {
+        self.var
+    }
+
+    /// How far the vehicle has moved across its heading of then, m.
+    pub(crate) fn moved(&self, now: &Self) -> f64 {
+        self.direction.dot(&(now.from_us - self.from_us))
+    }
+}
+
 impl State {
     /// Where target `i` is across its heading.
     pub(crate) fn across(&self, i: usize) -> Across {
@@ -66,6 +89,11 @@ impl State {
         let direction = Vector2::new(-sin, cos);
         let from_us = Vector2::new(north, east) - self.own.position.xy();
         Across { direction, from_us, var: self.var_from_us(i, &direction) }
+    }
+
+    /// The present variance of the place of target `i` across its heading as it was before.
+    pub(crate) fn across_var(&self, i: usize, before: &Across) -> f64 {
+        self.var_from_us(i, &before.direction)
     }
 
     /// Variance of target `i`'s place, as seen from the helicopter, in a direction.
@@ -78,19 +106,15 @@ impl State {
     }
 }
 
-impl Core {
+impl State {
     /// Fits target `i`'s slip by what a frame has made of where it was; `since_s` is the time since it was seen before.
     pub(crate) fn learn_slip(&mut self, i: usize, before: &Across, since_s: f64) {
-        if !self.learning.on || !self.models.targets[i].moves() {
-            return;
-        }
-        let found = before.var - self.state.var_from_us(i, &before.direction);
+        let found = before.var - self.across_var(i, before);
         if found < LEAST_TOLD * before.var {
             return;
         }
-        let now = self.state.across(i);
-        let moved = before.direction.dot(&(now.from_us - before.from_us));
-        self.state.targets[i].slip.take(moved * moved / found, since_s.clamp(0.0, 0.2));
+        let moved = before.moved(&self.across(i));
+        self.targets[i].slip.take(moved * moved / found, since_s);
     }
 }
 

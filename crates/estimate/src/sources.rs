@@ -65,6 +65,7 @@ impl Core {
             Kind::Frame => self.fuse_frame(&measurement.frame),
         }
         self.state.learn(&self.models, &self.learning);
+        self.learn_receiver_error();
     }
 
     fn fuse_inertial(&mut self, block: &InertialSample) {

@@ -51,7 +51,7 @@ pub(crate) fn start(
     state.rejections = Rejections::default();
     let level: Block<2> = own::ATTITUDE.part(0);
     state.sense();
-    state.senses.of_fix(epoch.fix, epoch.position_sigma_m, models);
+    state.senses.of_fix(epoch.fix, epoch.position_sigma_m, state.learnt.receiver.factor(), models);
     state.senses.hold_bias(t);
     let tilt_var = state.tilt[COMPASS].tilt_var();
     let slow_vars = Terms { models, learnt: &state.learnt, senses: &state.senses }.start_vars();

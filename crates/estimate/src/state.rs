@@ -17,6 +17,7 @@ use super::own::{Own, Senses};
 use super::slip::Slip;
 use super::spin::Spin;
 use super::standstill::{Standstill, Unrest};
+use super::sway::Sway;
 use super::tag_fit::{Scale, ScaleTest, TagFit};
 use super::track::Life;
 use super::twins::Twin;
@@ -48,6 +49,7 @@ pub(crate) struct Target {
     pub(crate) spin: Spin,
     pub(crate) turn_judged: MonoTime,
     pub(crate) slip: Slip,
+    pub(crate) sway: Sway,
     /// Whether it is about to move again, where it stands.
     pub(crate) unrest: Unrest,
 }
@@ -110,6 +112,8 @@ pub(crate) struct State {
     pub(crate) copies: Vec<DelayedCopy>,
     /// Rates and forces as they were a moment ago, to fit their intensity from.
     pub(crate) past_motion: DelayedCopy,
+    /// The receiver's horizontal error as it was some seconds ago, likewise.
+    pub(crate) past_bias: DelayedCopy,
     pub(crate) learnt: Learnt,
     /// What the sensors are taken to be.
     pub(crate) senses: Senses,
@@ -122,6 +126,10 @@ pub(crate) struct State {
     pub(crate) height: HeightCheck,
     /// By how much lower than configured the ground lies, m: the receiver's heights are over that.
     pub(crate) ground_lower_m: f64,
+    /// Whether the lens was found to be another one than configured.
+    pub(crate) lens_open: bool,
+    /// Whether the antenna's place was found to be measured wrongly.
+    pub(crate) antenna_anywhere: bool,
     /// By how much earlier than stamped frames are true, as was found out, s.
     pub(crate) camera_late_s: f64,
     /// When the scene was last anchored anew, and by how much it moved.
@@ -145,6 +153,7 @@ impl State {
             cov: Grid::zeros(n, n),
             copies: vec![DelayedCopy::of_targets(layout); copies],
             past_motion: DelayedCopy::of_states(own::MOTION.range().len(), n),
+            past_bias: DelayedCopy::of_states(2, n),
             learnt,
             senses,
             tilt,
@@ -160,6 +169,7 @@ impl State {
             mine.copy_from(theirs);
         }
         self.past_motion.copy_from(&other.past_motion);
+        self.past_bias.copy_from(&other.past_bias);
         self.rejections = other.rejections;
         self.anchored = other.anchored;
         self.height = other.height;
@@ -172,6 +182,7 @@ impl State {
         self.alive = other.alive;
         self.own = other.own;
         (self.ground_lower_m, self.camera_late_s) = (other.ground_lower_m, other.camera_late_s);
+        (self.antenna_anywhere, self.lens_open) = (other.antenna_anywhere, other.lens_open);
         self.own_columns = other.own_columns;
         self.senses = other.senses;
         self.fits = other.fits;
@@ -192,8 +203,9 @@ impl State {
         self.features.fill(Feature::default());
         self.tags.fill(TagFit::default());
         self.scale = None;
+        (self.antenna_anywhere, self.lens_open) = (false, false);
         self.cov.fill(0.0);
-        self.past_motion.in_use = false;
+        (self.past_motion.in_use, self.past_bias.in_use) = (false, false);
         self.copies.iter_mut().for_each(|copy| copy.in_use = false);
     }
 
@@ -221,6 +233,7 @@ impl State {
         let add = |mean: &mut [f64], step: &[f64]| mean.iter_mut().zip(step).for_each(|(x, d)| *x += d);
         for (i, target) in self.targets.iter_mut().enumerate() {
             add(&mut target.mean, &dx[layout.target(i).all().range()]);
+            add(&mut target.sway.mean, &dx[layout.sway(i).range()]);
         }
         for (i, feature) in self.features.iter_mut().enumerate() {
             add(&mut feature.mean, &dx[layout.feature(i).range()]);

@@ -254,7 +254,7 @@ impl Core {
 
 impl State {
     /// `P ← P + σ² u uᵀ`.
-    fn add_direction(&mut self, along: &[f64], sigma: f64) {
+    pub(crate) fn add_direction(&mut self, along: &[f64], sigma: f64) {
         for (i, a) in along.iter().enumerate().filter(|(_, a)| **a != 0.0) {
             for (j, b) in along.iter().enumerate().filter(|(_, b)| **b != 0.0) {
                 self.cov.add(i, j, sigma * sigma * a * b);

@@ -89,12 +89,13 @@ impl Touched {
     const NONE: Self =
         Self { column: [0; MAX_COLUMNS], by: [[0.0; MAX_MEASURED]; MAX_COLUMNS], len: 0, width: 0 };
 
-    /// Those of `z` before `width` that any of its components moves with.
-    fn find(&mut self, z: &Measurement, width: usize) {
+    /// Those of `z` that have a variance, and that any of its components moves with.
+    fn find(&mut self, z: &Measurement, cov: &Grid, width: usize) {
         (self.len, self.width) = (0, width);
         for (place, column) in z.columns().iter().enumerate() {
             let by = std::array::from_fn(|i| if i < z.m { z.row(i)[place] } else { 0.0 });
-            if *column < width && by.iter().any(|d| *d != 0.0) {
+            let uncertain = *column < width && cov.at(*column, *column) != 0.0;
+            if uncertain && by.iter().any(|d| *d != 0.0) {
                 (self.column[self.len], self.by[self.len]) = (*column, by);
                 self.len += 1;
             }
@@ -206,7 +207,7 @@ impl Workspace {
     /// `H P` into the workspace.
     fn project(&mut self, state: &State, z: &Measurement) {
         let width = state.width();
-        self.touched.find(z, width);
+        self.touched.find(z, &state.cov, width);
         for i in 0..z.m {
             let out = &mut self.whitened.row_mut(i)[..width];
             out.fill(0.0);
@@ -281,7 +282,11 @@ impl Workspace {
         }
         let whitened: [&[f64]; M] = std::array::from_fn(|i| &self.whitened.row(i)[..width]);
         for r in 0..width {
-            subtract_rows(&mut state.cov.row_mut(r)[..width], &whitened.map(|w| w[r]), &whitened);
+            let by = whitened.map(|w| w[r]);
+            // A state without variance is not moved.
+            if by.iter().any(|w| *w != 0.0) {
+                subtract_rows(&mut state.cov.row_mut(r)[..width], &by, &whitened);
+            }
         }
         for a in held.columns() {
             held.columns().for_each(|b| state.cov.set(a, b, self.kept.at(a, b)));

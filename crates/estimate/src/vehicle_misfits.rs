@@ -25,14 +25,28 @@ impl Core {
         let turns = turns.map(|(target, track)| {
             (FusionSource::Marker, MisfitCause::TargetTurns { target }, track.spin.over_the_bound())
         });
+        let targets = || state.targets.iter().enumerate();
+        let sways = targets().filter_map(|(target, track)| {
+            let sigma_m = track.sway.shown_m()?;
+            Some((FusionSource::Marker, MisfitCause::TargetSways { target }, sigma_m))
+        });
+        let slides = targets().filter_map(|(target, track)| {
+            let times = track.slip.shown().filter(|_| track.sway.shown_m().is_none())?;
+            Some((FusionSource::Marker, MisfitCause::TargetSlides { target }, times))
+        });
         let share = state.markers_outside;
         let outside = (share > OUTSIDE_SHARE).then_some((FusionSource::Marker, MisfitCause::Outside, share));
         height
             .into_iter()
             .chain(self.clock_misfit())
+            .chain(self.antenna_misfit())
+            .chain(self.lens_misfit())
+            .chain(self.receiver_misfit())
             .chain(outside)
             .chain(moving)
             .chain(turns)
+            .chain(sways)
+            .chain(slides)
             .chain(self.tag_misfits())
     }
 }

@@ -270,6 +270,22 @@ pub enum MisfitCause {
         /// Index of the target in the configuration.
         target: usize,
     },
+    /// The body of a vehicle sways on its springs. Figure: standard deviation of its markers' displacement, m.
+    TargetSways {
+        /// Index of the target in the configuration.
+        target: usize,
+    },
+    /// A vehicle slides across its heading. Figure: the walk of its side slip over `slip_mps`.
+    TargetSlides {
+        /// Index of the target in the configuration.
+        target: usize,
+    },
+    /// The receiver's slow error wanders farther than configured. Figure: how many times as far.
+    Wanders,
+    /// The lens distorts otherwise than configured. Figure: the error of its radial distortion k1.
+    Lens,
+    /// The receiver's antenna is elsewhere than configured. Figure: by how much, m.
+    AntennaPlace,
     /// The times of validity of its measurements are earlier than their stamps. Figure: by how much, s.
     Late,
 }

@@ -34,8 +34,9 @@ impl Aid for GpsPosition {
 
     fn linearise(&self, state: &State, models: &Models, z: &mut Measurement) -> Result<(), Disposition> {
         let own = &state.own;
-        let arm = own.ned_from_body * models.antenna_at;
-        let velocity = own.velocity_of(&models.antenna_at);
+        let antenna = own.antenna(&models.antenna_at);
+        let arm = own.ned_from_body * antenna;
+        let velocity = own.velocity_of(&antenna);
         let tau = own.gps_delay_s;
         let acceleration = Force::of(own).acceleration();
         let expected = own.position + arm + own.gps_bias - velocity * tau + acceleration * (0.5 * tau * tau);
@@ -44,6 +45,8 @@ impl Aid for GpsPosition {
         z.block(own::POSITION, &Matrix3::identity());
         z.block(own::VELOCITY, &Matrix3::from_diagonal_element(-tau));
         z.block(own::ATTITUDE, &-skew(&arm));
+        let d_arm = own.rotation() * (Matrix3::identity() - skew(&own.rate) * tau);
+        z.block(own::ARM, &d_arm.fixed_columns::<2>(0).into_owned());
         z.block(own::GPS_BIAS, &Matrix3::identity());
         z.block(own::GPS_DELAY, &(-velocity + acceleration * tau));
         for i in 0..z.m {

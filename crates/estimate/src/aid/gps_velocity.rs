@@ -37,12 +37,15 @@ impl Aid for GpsVelocity {
         let tau = own.gps_delay_s;
         let force = Force::of(own);
         let acceleration = force.acceleration();
-        let expected = own.velocity_of(&models.antenna_at) - acceleration * tau;
-        let swing = own.ned_from_body * own.rate.cross(&models.antenna_at);
+        let antenna = own.antenna(&models.antenna_at);
+        let expected = own.velocity_of(&antenna) - acceleration * tau;
+        let swing = own.ned_from_body * own.rate.cross(&antenna);
         z.begin(if self.has_down { 3 } else { 2 });
         z.block(own::VELOCITY, &Matrix3::from_diagonal_element(1.0 + own.drag_per_s * tau));
         z.block(own::ATTITUDE, &(-skew(&swing) - force.d_attitude * tau));
-        z.block(own::RATE, &(-own.rotation() * skew(&models.antenna_at)));
+        z.block(own::RATE, &(-own.rotation() * skew(&antenna)));
+        let d_arm = own.rotation() * skew(&own.rate);
+        z.block(own::ARM, &d_arm.fixed_columns::<2>(0).into_owned());
         z.block(own::GUST, &(D_WIND * -tau));
         z.block(own::THRUST, &(force.d_thrust * -tau));
         z.block(own::WIND, &(D_WIND * -tau));
@@ -63,6 +66,7 @@ impl GpsVelocity {
     pub(crate) fn fuse(&self, core: &mut Core) {
         let Some(outcome) = core.fuse_aid(self) else { return };
         core.judge_scale(&outcome);
+        core.judge_antenna();
         core.note_velocity_unrest(&outcome);
         if core.teaches(&outcome) {
             blend_factor(&mut core.state.learnt.gps_velocity_factor, outcome.misfit, SAMPLES, FACTORS);

@@ -1,10 +1,11 @@
 //! What markers and ground features have in common: a point of the world in the image, through lens, mount and pose.
 
-use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix2x3, Matrix2x4, Matrix3, Vector2, Vector3};
 
 use windhover_base::geo::skew;
 
 use crate::blocks::{TARGET, own};
+use crate::lens::d_lens;
 use crate::matrix::Grid;
 use crate::measurement::{Columns, Measurement};
 use crate::models::Models;
@@ -17,6 +18,8 @@ pub(crate) struct PointView {
     pub(crate) d_point: Matrix2x3<f64>,
     /// ∂px/∂(attitude error).
     pub(crate) d_attitude: Matrix2x3<f64>,
+    /// ∂px/∂(errors of the lens).
+    pub(crate) d_lens: Matrix2x4<f64>,
 }
 
 /// Projects a point given in NED.
@@ -24,9 +27,11 @@ pub(crate) fn view(own: &Own, models: &Models, point: &Vector3<f64>) -> Option<P
     let from_us = point - own.position;
     let camera_from_ned = models.camera_from_body * own.rotation().transpose();
     let in_camera = camera_from_ned * from_us - models.camera_from_body * models.camera_at;
-    let seen = models.camera.project(&in_camera)?;
+    let lens = models.lens(own);
+    let seen = lens.project(&in_camera)?;
+    let d_lens = d_lens(&lens, &(in_camera.xy() / in_camera.z));
     let d_point = seen.d_point * camera_from_ned;
-    Some(PointView { px: seen.px, d_point, d_attitude: d_point * skew(&from_us) })
+    Some(PointView { px: seen.px, d_point, d_attitude: d_point * skew(&from_us), d_lens })
 }
 
 /// A point of a target in NED, and ∂point/∂(north, east, heading).
@@ -83,6 +88,7 @@ pub(crate) struct CameraColumns {
     velocity: Columns<3>,
     attitude: Columns<3>,
     rate: Columns<3>,
+    lens: Columns<4>,
 }
 
 impl CameraColumns {
@@ -93,6 +99,7 @@ impl CameraColumns {
             velocity: z.touch(own::VELOCITY),
             attitude: z.touch(own::ATTITUDE),
             rate: z.touch(own::RATE),
+            lens: z.touch(own::LENS),
         }
     }
 
@@ -114,6 +121,7 @@ impl CameraColumns {
         z.set(2 * i, self.position, &-view.d_point);
         z.set(2 * i, self.velocity, &(view.d_point * -after_s));
         z.set(2 * i, self.attitude, &view.d_attitude);
+        z.set(2 * i, self.lens, &view.d_lens);
         z.set(2 * i, self.rate, &(view.d_attitude * own.rotation() * after_s));
         for r in 0..2 {
             z.residual[2 * i + r] = residual[r];

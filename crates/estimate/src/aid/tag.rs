@@ -14,6 +14,7 @@ use crate::measurement::Measurement;
 use crate::models::Models;
 use crate::shape;
 use crate::state::State;
+use crate::sway;
 use crate::tag_fit;
 use crate::update::REFUSE_RATIO;
 
@@ -72,11 +73,13 @@ pub(super) fn linearise_points<'a>(
     let camera = CameraColumns::touch(z);
     let vehicle = z.touch(state.layout().target(target).all());
     let fit = fit.map(|block| z.touch(block.all()));
+    let body = &state.targets[target].sway;
+    let swaying = body.is_open().then(|| z.touch(state.layout().sway(target)));
     let turned = rot_z(mean[2]);
     let [_, _, heading, speed, yaw_rate] = *mean;
     let (s, c) = heading.sin_cos();
     for (i, Sighting { point, d_fit, px, cov_px2 }) in seen.enumerate() {
-        let (world, derivatives) = pixel::target_point(mean, models, &point);
+        let (world, derivatives) = pixel::target_point(mean, models, &(point + body.displaced(&point)));
         let view = pixel::view(&state.own, models, &world).ok_or(Disposition::Invalid)?;
         let known = cov_px2 + Matrix2::identity() * models.marker_var_px2;
         let bent = curvature.noise_px2(&(world - state.own.position));
@@ -89,8 +92,11 @@ pub(super) fn linearise_points<'a>(
         let sideways = (east * c - north * s) * (speed * later);
         let by = [north, east, turn + sideways, ahead * later, turn * later];
         z.set(2 * i, vehicle, &Matrix2x5::from_columns(&by.map(|d| view.d_point * d)));
+        if let Some(columns) = swaying {
+            z.set(2 * i, columns, &(view.d_point * turned * sway::derivative(&point)));
+        }
         if let Some((columns, d_fit)) = fit.zip(d_fit) {
-            z.set(2 * i, columns, &(view.d_point * turned * d_fit));
+            z.set(2 * i, columns, &(view.d_point * turned * body.carried(&d_fit)));
         }
     }
     Ok(())

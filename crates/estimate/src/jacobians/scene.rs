@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use nalgebra::{Vector2, Vector3};
+use nalgebra::{Vector2, Vector3, Vector4};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -15,6 +15,7 @@ use crate::blocks::{Block, own};
 use crate::core::Core;
 use crate::own::GRAVITY;
 use crate::state::State;
+use crate::sway::Sway;
 use crate::track::{Evidence, Life};
 
 /// A car with a tag and a disc, a rover, a tag on the ground; lever arms, lens and mount as crooked as a real one's.
@@ -145,6 +146,8 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
     own.gps_delay_s = within(most::DELAY_S);
     own.drag_per_s = 0.2 + within(0.2);
     own.compass_delay_s = within(most::COMPASS_DELAY_S);
+    own.lens = Vector4::new(within(0.1), within(0.1), within(0.005), within(0.005));
+    own.arm = Vector2::new(within(0.3), within(0.3));
     own.ned_from_body = ned_from_body_321(within(3.1), within(0.2), within(0.2));
     own.position.z = core.models.ground.down_m(own.position.x, own.position.y) - 12.0 + within(4.0);
     let below = own.position;
@@ -159,6 +162,10 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
     }
     for tag in &mut state.tags {
         tag.mean = [within(0.05), within(0.05), within(0.05), within(0.1)];
+    }
+    for target in &mut state.targets {
+        target.sway = Sway::presumed();
+        target.sway.mean = [within(0.05), within(0.05), within(0.05)];
     }
     core
 }
@@ -210,6 +217,9 @@ pub(crate) fn difference(to: &State, from: &State) -> Vec<f64> {
     }
     for i in 0..layout.tags {
         put(layout.tag(i).all().range(), &less(&to.tags[i].mean, &from.tags[i].mean));
+    }
+    for i in 0..layout.targets {
+        put(layout.sway(i).range(), &less(&to.targets[i].sway.mean, &from.targets[i].sway.mean));
     }
     dx
 }

@@ -131,6 +131,7 @@ impl State {
                 models.targets[i].motion.model().add_noise(mean, dt, walks, at, &mut self.cov);
             }
         }
+        self.advance_sways(dt, models);
         step.advance(&mut self.own);
         for (target, model) in self.targets.iter_mut().zip(&models.targets) {
             if target.life.is_held() {
@@ -142,15 +143,16 @@ impl State {
     /// `row ← row Fᵀ` for the covariance and, if asked for, for that of delayed copies with the present state.
     fn carry(&mut self, step: &Step, models: &Models, with_copies: bool) {
         let layout = self.layout();
-        let Self { cov, copies, past_motion, targets, .. } = self;
+        let Self { cov, copies, past_motion, past_bias, targets, .. } = self;
         if with_copies {
-            delayed::in_use(copies, past_motion).for_each(|copy| step.carry(&mut copy.cross));
+            delayed::in_use(copies, [past_motion, past_bias]).for_each(|copy| step.carry(&mut copy.cross));
         }
         step.carry(cov);
         for (i, target) in targets.iter().enumerate().filter(|(_, target)| target.life.is_held()) {
-            let crosses = delayed::in_use(copies, past_motion).map(|copy| &mut copy.cross);
+            let crosses = delayed::in_use(copies, [past_motion, past_bias]).map(|copy| &mut copy.cross);
             let mut grids = std::iter::once(&mut *cov).chain(crosses.filter(|_| with_copies));
             models.targets[i].motion.model().carry(&target.mean, step.dt(), layout.target(i), &mut grids);
         }
+        self.carry_sways(step.dt(), with_copies);
     }
 }

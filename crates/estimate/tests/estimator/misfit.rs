@@ -10,7 +10,7 @@ use windhover_simulate::{
 };
 
 use super::filter::{Flight, Heard, Score, estimates, fly, score};
-use super::time::errors;
+use super::time::{errors, flown};
 
 /// Pixels as sharp as rendered ones: what is wrong then shows most.
 fn sharp(scenario: &mut Scenario) {
@@ -311,6 +311,29 @@ fn a_vehicle_that_turns_on_the_spot_is_let_turn_whatever_its_model() {
 }
 
 #[test]
+fn a_receiver_that_wanders_farther_than_configured_is_found_out() {
+    let of_flight = |seed: u64| {
+        let (world, out) = flown("follow+gps-wander=3", 40.0, seed);
+        let late = out.iter().filter_map(|output| match output {
+            EstimatorOutput::Estimate(e) if world.seconds(e.t_valid) > 6.0 => Some(e),
+            _ => None,
+        });
+        let squares: Vec<f64> = late
+            .map(|e| {
+                let (state, truth) = (e.state.expect("tracked"), world.vehicle(0, e.t_valid));
+                let covariance = state.covariance.expect("told").fixed_view::<2, 2>(0, 0).into_owned();
+                let error = Vector2::new(state.north_m - truth.north_m, state.east_m - truth.east_m);
+                error.dot(&(covariance.try_inverse().expect("positive definite") * error))
+            })
+            .collect();
+        squares.iter().sum::<f64>() / squares.len() as f64
+    };
+    // Nine times the variance configured: not fitted the mean is 12.
+    let mean = (1..7).map(of_flight).sum::<f64>() / 6.0;
+    assert!(mean < 5.0, "{mean}");
+}
+
+#[test]
 fn a_vehicle_that_slides_is_no_tag_that_is_turned() {
     let rolls = errors("follow");
     for slip_deg in [5, 10] {
@@ -318,6 +341,61 @@ fn a_vehicle_that_slides_is_no_tag_that_is_turned() {
         for (k, what) in ["heading", "speed"].into_iter().enumerate() {
             assert!(slides[k] < 1.3 * rolls[k], "{slip_deg}°: {what} {} for {}", slides[k], rolls[k]);
         }
+    }
+}
+
+#[test]
+fn a_vehicle_that_sways_on_its_springs_is_no_worse_than_its_sway() {
+    let (world, out) = flown("follow", 25.0, 3);
+    let still = score(&estimates(&out), &world, 6.0);
+    for deviation in ["sway=3+bounce=5", "sway=3", "bounce=5"] {
+        let (world, out) = flown(&format!("follow+{deviation}"), 25.0, 3);
+        let score = score(&estimates(&out), &world, 6.0);
+        println!("{deviation}: {score:?}");
+        assert!(score.coverage >= 0.99 && score.nees <= 4.2, "{deviation}: {score:?}");
+        assert!(
+            score.heading < 1.6 * still.heading && score.speed < 6.0 * still.speed,
+            "{deviation}: {score:?}"
+        );
+        let sways = |(cause, _): &(MisfitCause, f64)| matches!(cause, MisfitCause::TargetSways { target: 0 });
+        assert!(told(&out).iter().any(sways), "{deviation}");
+    }
+}
+
+#[test]
+fn a_lens_whose_distortion_is_left_out_is_found_out() {
+    let lens = |out: &[EstimatorOutput]| {
+        told(out).into_iter().filter(|(cause, _)| *cause == MisfitCause::Lens).last()
+    };
+    for scenario in ["follow", "circle20"] {
+        let (world, out) = flown(scenario, 25.0, 3);
+        let twin = score(&estimates(&out), &world, 6.0);
+        assert_eq!(lens(&out), None, "{scenario}");
+        let (world, out) = flown(&format!("{scenario}+no-distortion"), 25.0, 3);
+        let score = score(&estimates(&out), &world, 6.0);
+        println!("{scenario}: {score:?}, twin {twin:?}, found {:?}", lens(&out));
+        // Not found out, the NEES is 20 to 150, and heading is off by some degrees.
+        assert!(score.nees <= (1.3 * twin.nees).max(4.2) && score.speed < 1.5 * twin.speed, "{score:?}");
+        let k1 = lens(&out).expect("it is reported").1;
+        assert!((-0.3..-0.05).contains(&k1), "{k1}");
+    }
+}
+
+#[test]
+fn an_antenna_that_is_elsewhere_is_found_out() {
+    let antenna = |out: &[EstimatorOutput]| {
+        told(out).into_iter().filter(|(cause, _)| *cause == MisfitCause::AntennaPlace).last()
+    };
+    let (world, out) = flown("follow", 40.0, 3);
+    let twin = score(&estimates(&out), &world, 6.0);
+    assert_eq!(antenna(&out), None);
+    for off_cm in [30, 100] {
+        let (world, out) = flown(&format!("follow+antenna={off_cm}"), 40.0, 3);
+        let score = score(&estimates(&out), &world, 6.0);
+        println!("{off_cm} cm: {score:?}, twin {twin:?}, found {:?}", antenna(&out));
+        assert!(score.nees <= (1.3 * twin.nees).max(4.2) && score.heading < 1.5 * twin.heading, "{score:?}");
+        let found_m = antenna(&out).expect("it is reported").1;
+        assert!((found_m - f64::from(off_cm) / 100.0).abs() < 0.15, "{found_m} m for {off_cm} cm");
     }
 }
 

@@ -10,7 +10,7 @@ use windhover_estimate::{Estimator, EstimatorOutput, Site};
 use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 
 /// Everything the filter says of a flight, with pixels as sharp as rendered ones.
-fn flown(described: &str, seconds: f64, seed: u64) -> (Arc<World>, Vec<EstimatorOutput>) {
+pub(super) fn flown(described: &str, seconds: f64, seed: u64) -> (Arc<World>, Vec<EstimatorOutput>) {
     let mut scenario = Scenario::described(described).expect("known names, figures within limits");
     scenario.duration_s = seconds;
     (scenario.camera.marker_noise_px, scenario.camera.feature_noise_px) = (0.03, 0.1);

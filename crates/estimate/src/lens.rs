@@ -1,0 +1,106 @@
+//! A lens that is not as configured.
+//!
+//! The errors of its distortion are states ([`own::LENS`]). That of k1 is open from the start, by as much as a calibration
+//! may be off; pixels that move through the picture show it within seconds. One that comes out beyond that is of another
+//! lens, or of none that was calibrated: then all four are open.
+
+use nalgebra::{Matrix2, Matrix2x4, Vector2};
+
+use windhover_base::geo::CameraModel;
+use windhover_base::msg::{FusionSource, MisfitCause};
+
+use super::blocks::{Block, own};
+use super::core::Core;
+use super::models::Models;
+use super::own::{LENS_K1_SIGMA, Own};
+use super::state::{State, Target};
+
+/// Sigmas of a calibration beyond which it is of another lens; while it is not known whether vehicles sway.
+const BEYOND: f64 = 2.5;
+const FAR_BEYOND: f64 = 4.0;
+/// Errors of k1, k2, p1, p2 then, one sigma: those of most lenses whose distortion is left out.
+const OTHERWISE: [f64; 4] = [0.15, 0.15, 0.003, 0.003];
+/// What heading may be off by where the lens was another one, rad.
+const HEADING_SIGMA: f64 = 0.035;
+/// It is reported from this many of its sigmas on, and from this error of k1 on.
+const REPORTED_SIGMAS: f64 = 5.0;
+const REPORTED: f64 = 0.02;
+
+impl Models {
+    /// The camera with its lens as it is found to be.
+    pub(crate) fn lens(&self, own: &Own) -> CameraModel {
+        let mut lens = self.camera;
+        lens.distortion.iter_mut().zip(own.lens.iter()).for_each(|(configured, error)| *configured += error);
+        lens
+    }
+}
+
+/// ∂px/∂(k1, k2, p1, p2) at normalised undistorted coordinates.
+pub(crate) fn d_lens(lens: &CameraModel, ray: &Vector2<f64>) -> Matrix2x4<f64> {
+    let (x, y, r2) = (ray.x, ray.y, ray.norm_squared());
+    let both = 2.0 * x * y;
+    Matrix2::new(lens.fx, lens.fx * lens.skew, 0.0, lens.fy)
+        * Matrix2x4::new(
+            x * r2,
+            x * r2 * r2,
+            both,
+            r2 + 2.0 * x * x,
+            y * r2,
+            y * r2 * r2,
+            r2 + 2.0 * y * y,
+            both,
+        )
+}
+
+impl State {
+    /// The direction in which the helicopter and all that is seen are turned about it, and the compass errs by as much: no
+    /// pixel and no reading of the compass changes along it.
+    fn heading_direction(&self, along: &mut [f64]) {
+        along.fill(0.0);
+        let (layout, us) = (self.layout(), self.own.position.xy());
+        along[own::TURN.column(0)] = 1.0;
+        along[own::HEADING_BIAS.column(0)] = -1.0;
+        let mut turn = |block: Block<2>, [north, east]: [f64; 2]| {
+            along[block.range()].copy_from_slice(&[-east, north]);
+        };
+        turn(own::VELOCITY.part(0), self.own.velocity.xy().into());
+        turn(own::WIND, self.own.wind.into());
+        turn(own::GUST, self.own.gust.into());
+        for (i, target) in self.targets.iter().enumerate().filter(|(_, target)| target.life.is_held()) {
+            turn(layout.target(i).place(), [target.mean[0] - us.x, target.mean[1] - us.y]);
+        }
+        for (i, feature) in self.features.iter().enumerate().filter(|(_, feature)| feature.id.is_some()) {
+            turn(layout.feature(i), [feature.mean[0] - us.x, feature.mean[1] - us.y]);
+        }
+        for (i, _) in self.targets.iter().enumerate().filter(|(_, target)| target.life.is_held()) {
+            along[layout.target(i).heading().column(0)] = 1.0;
+        }
+    }
+}
+
+impl Core {
+    /// After a frame: whether the lens is another one.
+    pub(crate) fn judge_lens(&mut self) {
+        let state = &mut self.state;
+        // A vehicle that sways bends what is seen of the lens, until it is known to.
+        let judged = |target: &Target| !target.life.is_held() || target.sway.is_judged();
+        let limit = if state.targets.iter().all(judged) { BEYOND } else { FAR_BEYOND };
+        if self.at_truth || state.lens_open || state.own.lens[0].abs() < limit * LENS_K1_SIGMA {
+            return;
+        }
+        state.lens_open = true;
+        state.cov.add_diagonal(own::LENS, &OTHERWISE.map(|sigma| sigma * sigma));
+        // Heading was found by the wrong lens, and the compass was judged by it.
+        let mut along = std::mem::take(&mut self.along);
+        self.state.heading_direction(&mut along);
+        self.state.add_direction(&along, HEADING_SIGMA);
+        self.along = along;
+    }
+
+    /// The lens, where it is not as configured beyond doubt: the error of its k1.
+    pub(crate) fn lens_misfit(&self) -> Option<(FusionSource, MisfitCause, f64)> {
+        let (off, sigma) = (self.state.own.lens[0], self.state.cov.sigma(own::LENS, 0));
+        let beyond = off.abs() > REPORTED.max(REPORTED_SIGMAS * sigma);
+        beyond.then_some((FusionSource::Marker, MisfitCause::Lens, off))
+    }
+}
