@@ -137,6 +137,7 @@ impl Config {
         self.store.check()?;
         self.link.check()?;
         self.mavlink.check()?;
+        self.video.check()?;
         self.check_montecarlo()
     }
 
