@@ -6,7 +6,7 @@ VENV  ?= target/venv
 DEMO  ?= demo
 
 .PHONY: help setup setup-python build debug demo test test-python test-web test-real test-zenoh test-clients fuzz soak proofs check lint docs configs \
-        licences oldest aarch64 bench bench-compare load misfit-table book pictures release mutants semver coverage clean deb sbom hil hil-long hil-short hil-tools
+        licences oldest aarch64 processors bench bench-compare load misfit-table book pictures release mutants semver coverage clean deb cargo-deb dist reproducible sbom hil hil-long hil-short hil-tools
 
 help:
 	@echo "make demo     build, simulate a flight, replay it, compare with the truth, open a report page"
@@ -31,6 +31,9 @@ help:
 	@echo "make semver   changes of the crates' public items against the last tag"
 	@echo "make coverage lines that the tests of the crates reach"
 	@echo "make deb      a Debian package in target/debian"
+	@echo "make dist     packages and archives for amd64, arm64, armhf with bills of materials, in target/dist"
+	@echo "make processors  detector and estimator for arm64 and armhf under QEMU, compared with this processor"
+	@echo "make reproducible  two builds of the last commit, byte for byte equal"
 	@echo "make sbom     what is built in, as CycloneDX, in target/windhover.cdx.json"
 	@echo "make hil      the virtual payload computer: install, boot, fly, compare (as root)"
 	@echo "make hil-long the same with every scenario"
@@ -75,11 +78,15 @@ test-web: setup-python debug
 	@sh tests/setup/packages.sh chromium
 	$(VENV)/bin/python -m unittest discover -s tests/web -p 'test_*.py' -v
 
-# Independent programs against a flying payload and its station.
+# Other people's programs against a flying payload, its station and its flights. Installs what they need; what cannot be had is
+# said, and its tests are left out. CLIENTS="test_video test_reports" for some of them.
+CLIENTS ?=
 test-clients: setup debug
-	@sh tests/setup/packages.sh python3 python3-venv gpsd gpsd-clients gdal-bin ffmpeg prometheus
-	@sh tests/setup/venv.sh $(VENV)-clients tests/clients/requirements.txt
-	$(VENV)-clients/bin/python -m unittest discover -s tests/clients -p 'test_*.py' -v
+	@sh tests/setup/packages.sh python3 python3-venv
+	@for package in gpsd gpsd-clients gdal-bin ffmpeg prometheus; do \
+	    sh tests/setup/packages.sh $$package || sh .ci/skip $$package "it cannot be installed here"; done
+	@sh tests/setup/venv.sh $(VENV)-clients tests/clients/requirements.txt each
+	$(VENV)-clients/bin/python tests/clients/run.py $(CLIENTS)
 
 # An hour of many faults at once; SOAK_S=120 for two minutes.
 SOAK_S ?= 3600
@@ -90,6 +97,7 @@ soak: setup-python debug
 FUZZ_S ?= 60
 fuzz: setup
 	test -x target/tools/bin/cargo-fuzz || $(CARGO) install cargo-fuzz --locked --root target/tools
+	python3 fuzz/seeds.py fuzz/corpus
 	for target in $$(sed -n 's/^name = "\(.*\)"/\1/p' fuzz/Cargo.toml | tail -n +2); do \
 	    PATH="$$PWD/target/tools/bin:$$PATH" RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run -s none $$target -- \
 	        -max_total_time=$(FUZZ_S) -rss_limit_mb=3000 || exit 1; done
@@ -134,7 +142,12 @@ oldest: setup
 
 # The part of the program that has code for another processor.
 aarch64: setup
-	sh .ci/aarch64 target/tools/aarch64
+	sh .ci/aarch64 target/tools/cross
+
+# Detector and estimator on other processors, compared with this one to the last bit.
+PROCESSORS ?= arm64 armhf
+processors: setup
+	sh .ci/processors $(PROCESSORS)
 
 bench: setup
 	$(CARGO) bench --locked
@@ -158,11 +171,26 @@ misfit-table: build
 	python3 benches/misfit.py target/release/windhover --seeds $(SEEDS) $(if $(ROWS),"$(ROWS)")
 
 # The package: binary, unit, configuration, rules, manual and completions out of the command line.
-deb: build
+deb: build cargo-deb
 	target/release/windhover generate man target/generated/man
 	target/release/windhover generate completions target/generated/completions
-	test -x target/tools/bin/cargo-deb || $(CARGO) install cargo-deb --version 3.8.0 --locked --root target/tools
 	target/tools/bin/cargo-deb --no-build --locked --strip
+
+# Everything that is given to others, in target/dist: for each of ARCHES a Debian package, an archive and the bill of
+# materials; checksums. Built for arm64 and armhf by Debian's cross compilers; what cannot be had is said.
+ARCHES ?= amd64 arm64 armhf
+dist: setup cargo-deb
+	sh .ci/dist $(ARCHES)
+
+# Two builds of the last commit in different folders, equal byte for byte. An hour on two cores; OPTIONS="--config
+# profile.release.opt-level=0" for a quarter of it.
+ARCH    ?= amd64
+OPTIONS ?=
+reproducible: setup cargo-deb
+	sh .ci/reproducible $(ARCH) $(OPTIONS)
+
+cargo-deb:
+	test -x target/tools/bin/cargo-deb || $(CARGO) install cargo-deb --version 3.8.0 --locked --root target/tools
 
 # The pages of docs as a book. mdBook is built once, into target/tools.
 MDBOOK = target/tools/bin/mdbook

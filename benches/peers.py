@@ -1,7 +1,9 @@
 """The detector and its peers from PyPI on one folder of frames, in one run; prints a Markdown table.
 
-usage: peers.py BIN FOLDER        FOLDER holds frame_*.png and truth.json (corners of every tag, pixel
-                                  centres at integers, 36h11)
+usage: peers.py BIN FOLDER        FOLDER holds pictures (PNG, JPEG) and truth.json (a list `frames` in order of the
+                                  pictures' names, with the corners of every tag of 36h11, pixel centres at integers).
+                                  Without truth.json only times and numbers of tags are given, and how many
+                                  of them the project finds too
 
 Needs numpy and opencv-python-headless; times pyapriltags and napa-vision where they are installed, and says
 so where they are not. It installs nothing. The project is timed by its own `ms` (detection alone, image in
@@ -100,9 +102,14 @@ def main():
     if len(sys.argv) != 3:
         sys.exit(__doc__)
     binary, folder = sys.argv[1], pathlib.Path(sys.argv[2])
-    paths = sorted(folder.glob("*.png"))
-    truth = json.loads((folder / "truth.json").read_text())["frames"]
+    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in (".png", ".jpg", ".jpeg"))
+    if not paths:
+        sys.exit(f"{folder}: no pictures")
     frames = [np.ascontiguousarray(cv2.imread(str(p), cv2.IMREAD_GRAYSCALE)) for p in paths]
+    listed = folder / "truth.json"
+    if not listed.exists():
+        return without_truth(binary, paths, frames)
+    truth = json.loads(listed.read_text())["frames"]
     total = sum(t["side"] >= LEAST_PX for f in truth for t in f["tags"])
     print("| detector | median ms | p95 ms | found | false | RMS ≥60 px | RMS 36–60 px |")
     print("|---|---|---|---|---|---|---|")
@@ -116,6 +123,27 @@ def main():
         )
 
     for least in (24, 16):
+        row(f"windhover, min {least} px", *of_project(binary, paths, least))
+    for name, detect in peers():
+        row(name, *of_peer(detect, frames))
+
+
+def without_truth(binary, paths, frames):
+    """Times of pictures of which nobody listed the tags, and what they have in common with the project's."""
+    print("| detector | median ms | p95 ms | tags | of them found at min 12 px |")
+    print("|---|---|---|---|---|")
+    most, _ = of_project(binary, paths, 12)
+
+    def row(name, found, ms):
+        tags = sum(len(tags) for tags in found)
+        both = sum(
+            any(n == number and np.linalg.norm(seen.mean(0) - c.mean(0)) < 0.3 * np.linalg.norm(c[0] - c[1]) for n, c in ours)
+            for tags, ours in zip(found, most)
+            for number, seen in tags
+        )
+        print(f"| {name} | {np.median(ms):.2f} | {np.percentile(ms, 95):.2f} | {tags} | {both} |", flush=True)
+
+    for least in (24, 16, 12):
         row(f"windhover, min {least} px", *of_project(binary, paths, least))
     for name, detect in peers():
         row(name, *of_peer(detect, frames))

@@ -6,6 +6,7 @@ use std::path::Path;
 use prost::Message;
 use prost_types::Timestamp;
 
+use super::refine::RefinedBeside;
 use crate::config::Config;
 use crate::io::capture::{CaptureReader, attached_config};
 use crate::io::mcap_read::{RawMessage, ReadError};
@@ -114,6 +115,9 @@ impl Flight {
             }
         }
         flight.warnings.extend(reader.take_warnings());
+        let mut beside = RefinedBeside::of(path);
+        flight.warnings.extend(beside.warning.take());
+        beside.for_each(|raw| flight.take(&raw));
         flight.ownship.sort_by_key(|own| host_time(own.timestamp.as_ref()));
         flight.utc = flight.epochs.iter().find_map(|e| e.utc_ns).map(UtcTime::from_unix_ns);
         Ok(flight)

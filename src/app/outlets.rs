@@ -6,7 +6,7 @@ use crate::io::records::OutputEncoder;
 use super::downlink::Downlink;
 use super::flight_store::FlightStore;
 use super::sink::{Outlets, Sink};
-use super::sinks::{CardSink, LatestHealth, LinkSink, MavlinkSink, MetricsSink};
+use super::sinks::{CardSink, LatestHealth, LinkSink, MavlinkSink, MetricsSink, VideoQueue, VideoSink};
 
 /// The daemon's sinks, one for each row. The link comes before the card: the ground gets a record before the card does,
 /// and the card keeps it under the number that the link assigned.
@@ -15,6 +15,7 @@ pub fn of_daemon(
     flight_store: &FlightStore,
     downlink: &Downlink,
     metrics: &LatestHealth,
+    video: &VideoQueue,
 ) -> Outlets<Box<dyn Sink>> {
     let mut sinks: Vec<Box<dyn Sink>> = vec![
         Box::new(LinkSink::new(downlink.clone())),
@@ -23,6 +24,9 @@ pub fn of_daemon(
     ];
     if config.daemon.metrics.is_some() {
         sinks.push(Box::new(MetricsSink::new(metrics.clone())));
+    }
+    if config.video.is_on() {
+        sinks.push(Box::new(VideoSink::new(video.clone(), config.video.rate_hz)));
     }
     Outlets::new(OutputEncoder::new(&config.target), sinks)
 }

@@ -31,6 +31,7 @@
 //! | pipeline | computes for milliseconds in each frame. A failure ends the process: a filter in an unknown state is
 //! not repaired |
 //! | store-encode | computes JPEG |
+//! | video, where it is configured | computes H.264; of lower priority than all others |
 //! | store-write, store-keep, index | `fdatasync` and directory calls block as long as the card does |
 //! | log, one for each sink | a terminal, a pipe, a journal or a disk can stall |
 //! | recording | reads image files where the camera is a recording; it replaces the driver |
@@ -49,6 +50,7 @@
 //! | store | see `io::store` | the excess is dropped and counted; the pipeline never waits |
 //! | link | see `io::link` | the oldest estimate is dropped first; missed records are sent later |
 //! | MAVLink to autopilot | 64 frames | the oldest is dropped |
+//! | video | one frame, 2048 records | a newer frame replaces it; the oldest record is dropped |
 //! | power to health, power to store, store to link | the newest value | a newer value replaces it |
 //! | log, each sink | 512 lines | the line is dropped and counted |
 //!
@@ -76,9 +78,10 @@ use super::outlets;
 use super::pipeline_task::{self, Parts};
 use super::power_task::{self, PowerView};
 use super::presence::Presence;
-use super::sinks::LatestHealth;
+use super::sinks::{LatestHealth, VideoQueue};
 use super::status::SharedStatus;
 use super::supervise::{Restart, Supervisor, TaskRule};
+use super::video_task::{self, VideoTask};
 
 /// The GPS line.
 pub const GPS: TaskRule = TaskRule { name: "gps", restart: Restart::Retries };
@@ -101,6 +104,9 @@ pub const LINK: TaskRule = TaskRule { name: "link", restart: Restart::Retries };
 
 /// Metrics on loopback, where configured.
 pub const METRICS: TaskRule = TaskRule { name: "metrics", restart: Restart::Retries };
+
+/// The camera's picture with its metadata, where it is configured.
+pub const VIDEO: TaskRule = TaskRule { name: "video", restart: Restart::Retries };
 
 /// The running graph, for its health task.
 pub struct Graph {
@@ -131,7 +137,7 @@ pub fn start(loaded: Loaded, clock: HostClock) -> std::io::Result<Graph> {
     let (flight_store, orders) = (FlightStore::default(), StoreOrders::default());
     let to_autopilot = ToAutopilot::default();
     let downlink = Downlink::new(&config, &to_autopilot);
-    let metrics = LatestHealth::default();
+    let (metrics, video) = (LatestHealth::default(), VideoQueue::default());
     let mut tasks = Supervisor::new(clock);
 
     tasks.spawn(LINK, |heartbeat| {
@@ -145,9 +151,17 @@ pub fn start(loaded: Loaded, clock: HostClock) -> std::io::Result<Graph> {
         let (flight_store, orders) = (flight_store.clone(), orders.clone());
         card::run(StoreTask { config, context, status, flight_store, orders, heartbeat }, opened)
     });
+    if config.video.is_on() {
+        let (config, context) = (Arc::clone(&config), context.clone());
+        let (queue, flight_store) = (video.clone(), flight_store.clone());
+        let run = |heartbeat| {
+            video_task::run(VideoTask { config, context, queue, flight_store, heartbeat });
+        };
+        tasks.spawn_thread(VIDEO, run)?;
+    }
     tasks.spawn_thread(PIPELINE, {
         let (config, context, status) = (Arc::clone(&config), context.clone(), status.clone());
-        let outlets = outlets::of_daemon(&config, &flight_store, &downlink, &metrics);
+        let outlets = outlets::of_daemon(&config, &flight_store, &downlink, &metrics, &video);
         let orders = orders.clone();
         move |heartbeat| {
             let parts = Parts { config, terrain, context, status, flight_store, outlets, orders, heartbeat };

@@ -22,13 +22,19 @@ pub(super) struct Args {
     /// Images: PNG, JPEG, BMP, PNM or TIFF
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
-    /// Family of the tags
-    #[arg(long, default_value = "36h11", value_parser = family)]
-    family: TagFamily,
-    /// Width of the border, cells: 1 as for AprilTags, 2 as printed by Kalibr
+    /// Families of the tags, separated by commas
+    #[arg(long, default_value = "36h11", value_delimiter = ',')]
+    family: Vec<TagFamily>,
+    /// Width of the border, cells: 1 as AprilTags are printed, 2 as Kalibr prints them
     #[arg(long, value_name = "CELLS", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=2))]
     border: u8,
-    /// Smallest edge of a tag's black square that is detected, pixels
+    /// Tags whose left and right are exchanged: photographs of a mirror, or through the sheet's back
+    #[arg(long)]
+    mirrored: bool,
+    /// Tags whose black and white are exchanged
+    #[arg(long)]
+    inverted: bool,
+    /// Smallest edge of a tag's black square that is looked for, pixels
     #[arg(long, value_name = "N", default_value_t = 16.0, value_parser = min_px)]
     min_px: f64,
     /// Most wrong bits that are corrected; families with few bits correct fewer
@@ -39,14 +45,6 @@ pub(super) struct Args {
     json: bool,
 }
 
-fn family(name: &str) -> Result<TagFamily, String> {
-    let known = || TagFamily::ALL.map(TagFamily::name).join(", ");
-    TagFamily::ALL
-        .into_iter()
-        .find(|f| f.name() == name)
-        .ok_or_else(|| format!("unknown family; the families are {}", known()))
-}
-
 fn min_px(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
     (8.0..=10_000.0).contains(&value).then_some(value).ok_or_else(|| "not between 8 and 10000".to_owned())
@@ -54,8 +52,9 @@ fn min_px(text: &str) -> Result<f64, String> {
 
 pub(super) fn run(args: &Args) -> CliResult {
     let limits = Limits { min_px: args.min_px, max_hamming: args.max_hamming };
-    let layout = TagLayout { family: args.family, border: args.border };
-    let mut detector = Detector::new(&[layout], limits);
+    let layouts: Vec<TagLayout> = layouts(args, (args.mirrored, args.inverted)).collect();
+    let mut detector = Detector::new(&layouts, limits);
+    let mut hints = Hints::new(args, limits);
     let mut failed = 0;
     for path in &args.images {
         let image = match read(path) {
@@ -74,12 +73,54 @@ pub(super) fn run(args: &Args) -> CliResult {
         } else {
             print_lines(path, ms, found)?;
         }
+        if found.is_empty() {
+            hints.look(path, &image);
+        }
     }
     match failed {
         0 => Ok(()),
         n => {
             let all = counted(args.images.len(), "image");
             Err(CliError::failed(format!("{n} of {all} could not be read")))
+        }
+    }
+}
+
+/// The tags asked for, printed this way.
+fn layouts(args: &Args, (mirrored, inverted): (bool, bool)) -> impl Iterator<Item = TagLayout> {
+    let border = args.border;
+    args.family.iter().map(move |&family| TagLayout { family, border, mirrored, inverted })
+}
+
+/// Where an image has no tag of those asked for, whether it has one that is mirrored or inverted.
+struct Hints {
+    /// The options that would read a tag, and a detector of such.
+    ways: Vec<(&'static str, Detector)>,
+}
+
+impl Hints {
+    fn new(args: &Args, limits: Limits) -> Self {
+        let ways = [
+            ("without --mirrored and --inverted", (false, false)),
+            ("with --mirrored", (true, false)),
+            ("with --inverted", (false, true)),
+            ("with --mirrored --inverted", (true, true)),
+        ];
+        let others = ways.into_iter().filter(|(_, way)| *way != (args.mirrored, args.inverted));
+        let ways = others.map(|(words, way)| {
+            let layouts: Vec<TagLayout> = layouts(args, way).collect();
+            (words, Detector::new(&layouts, limits))
+        });
+        Self { ways: ways.collect() }
+    }
+
+    fn look(&mut self, path: &Path, image: &GrayImage) {
+        for (words, detector) in &mut self.ways {
+            if let Some(tag) = detector.detect(image.view()).first() {
+                let (path, family, id) = (path.display(), tag.family.name(), tag.id);
+                note!("windhover: {path}: tag {id} of {family} would be found {words}");
+                return;
+            }
         }
     }
 }

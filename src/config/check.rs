@@ -1,5 +1,6 @@
 //! Checks of a configuration beyond its syntax.
 
+use windhover_base::geo::LensModel;
 use windhover_base::settings::{
     AttitudeConfig, AutopilotUse, GpsFormat, GroundConfig, ImuConfig, MarkerConfig, MarkerKind, TargetConfig,
     TargetModel, shares_line,
@@ -136,6 +137,7 @@ impl Config {
         self.store.check()?;
         self.link.check()?;
         self.mavlink.check()?;
+        self.video.check()?;
         self.check_montecarlo()
     }
 
@@ -330,7 +332,14 @@ impl Config {
         within("camera.intrinsics.cx", camera.intrinsics.cx, -1e5, 1e5)?;
         within("camera.intrinsics.cy", camera.intrinsics.cy, -1e5, 1e5)?;
         within("camera.intrinsics.skew", camera.intrinsics.skew, -1.0, 1.0)?;
-        for (term, value) in ["k1", "k2", "p1", "p2", "k3"].iter().zip(camera.intrinsics.distortion) {
+        let terms = match camera.intrinsics.model {
+            LensModel::Brown => ["k1", "k2", "p1", "p2", "k3"],
+            LensModel::Fisheye => ["k1", "k2", "k3", "k4", "the fifth"],
+        };
+        if camera.intrinsics.model == LensModel::Fisheye && camera.intrinsics.distortion[4] != 0.0 {
+            refuse("camera.intrinsics.distortion", "a fisheye has four terms: k1, k2, k3, k4".to_owned())?;
+        }
+        for (term, value) in terms.iter().zip(camera.intrinsics.distortion) {
             within(format!("camera.intrinsics.distortion ({term})"), value, -100.0, 100.0)?;
         }
         for (axis, value) in camera.mount.position_m.iter().enumerate() {

@@ -8,12 +8,14 @@ mod daemon;
 mod link;
 mod log;
 mod store;
+mod video;
 
 pub use check::ConfigError;
 pub use daemon::{DaemonConfig, GoingLine, Part, PowerConfig};
 pub use link::{AUTOPILOT, LandingFrame, LinkConfig, MavlinkConfig, MavlinkMessage};
 pub use log::{LogConfig, LogFormat, LogLevel};
 pub use store::{FramePolicy, StoreConfig};
+pub use video::VideoConfig;
 
 use serde::{Deserialize, Serialize};
 use windhover_base::settings::{
@@ -64,6 +66,9 @@ pub struct Config {
     /// MAVLink for other ground stations and autopilots.
     #[serde(default)]
     pub mavlink: MavlinkConfig,
+    /// The camera's picture, live.
+    #[serde(default)]
+    pub video: VideoConfig,
     /// The operator's log.
     #[serde(default)]
     pub log: LogConfig,
@@ -97,6 +102,7 @@ impl Config {
             store: StoreConfig::default(),
             link: LinkConfig::default(),
             mavlink: MavlinkConfig::default(),
+            video: VideoConfig::default(),
             log: LogConfig::default(),
             daemon: DaemonConfig::default(),
             power: PowerConfig::default(),

@@ -8,6 +8,13 @@ pub fn resident_mb() -> Option<f64> {
     Some(kb * 1024.0 / 1e6)
 }
 
+/// Lowers the priority of the calling thread by this number of steps (19 at most). Without effect where the system does
+/// not allow it.
+pub fn be_nice(steps: i32) {
+    // On Linux it is the thread's own.
+    let _ = rustix::process::nice(steps);
+}
+
 /// The kernel's identity of this boot; `None` where /proc does not provide it.
 pub fn boot_id() -> Option<String> {
     let id = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok()?;

@@ -1,9 +1,9 @@
-//! A misfit in the operator's words: which source, by how much, the likely cause, what to do.
+//! A misfit as text for the operator: which source, by how much, the likely cause, what to do.
 
 use windhover_base::msg::{FeltTilt, FusionSource, MarkerPair, Misfit, MisfitCause, MisfitWords};
 use windhover_base::settings::{MarkerConfig, MarkerKind, Rig};
 
-/// The words for a misfit of this rig.
+/// The texts for a misfit of this rig.
 pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
     let (kind, figure) = (kind(misfit.cause), misfit.figure);
     let of_source = |figure: String, cause: String, advice: String| MisfitWords {
@@ -23,7 +23,7 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
         ),
         MisfitCause::Bias => of_source(
             format!("{figure:.1} sigma"),
-            format!("{it} errs to one side"),
+            format!("{it} has a constant error"),
             format!("check {}", bias_keys(misfit.source)),
         ),
         MisfitCause::Outside => of_source(
@@ -54,7 +54,7 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
             kind,
             figure: format!("{figure:.1} m"),
             cause: format!(
-                "the helicopter is {:.1} m {} over the ground than receiver and [ground] tell, measured by the \
+                "the helicopter is {:.1} m {} over the ground than receiver and [ground] give, measured by the \
                  markers' size",
                 figure.abs(),
                 if figure < 0.0 { "lower" } else { "higher" }
@@ -65,22 +65,22 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
         },
         MisfitCause::MovingGround => of_source(
             format!("{:.0} %", 100.0 * figure),
-            "what is taken for ground moves: people, other vehicles, shadows, or a lens that is not as configured"
+            "features treated as ground move: people, other vehicles, shadows, or a lens that is not as configured"
                 .into(),
-            "nothing, where it passes; else check camera.intrinsics and camera.readout_ms, or set \
+            "nothing, if it is temporary; else check camera.intrinsics and camera.readout_ms, or set \
              detector.ground_features = 0"
                 .into(),
         ),
         MisfitCause::Wanders => of_source(
             format!("{figure:.1} times"),
-            "the receiver's slow error wanders farther than configured, against what is seen of vehicles and ground".into(),
-            "raise gps.bias_sigma_m: positions are allowed to be as far off meanwhile".into(),
+            "the receiver's slow error varies more than configured, compared with vehicles and ground in the pictures".into(),
+            "raise gps.bias_sigma_m; until then the filter assumes the larger error".into(),
         ),
         MisfitCause::Lens => MisfitWords {
             source: "camera".into(),
             kind,
             figure: format!("{figure:+.3}"),
-            cause: "the lens distorts otherwise than configured: by this much in k1".into(),
+            cause: "the lens's distortion differs from the configured one by this value of k1".into(),
             advice: "calibrate the camera (windhover calibrate), and check camera.intrinsics and the picture's size".into(),
         },
         MisfitCause::Readout => MisfitWords {
@@ -92,7 +92,7 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
         },
         MisfitCause::AntennaPlace => of_source(
             format!("{figure:.2} m"),
-            "the receiver's antenna is not where gps.antenna_position_m has it, by how it swings in turns".into(),
+            "the receiver's antenna is not at gps.antenna_position_m, as its motion in turns shows".into(),
             "measure the antenna's place from the body frame's origin again".into(),
         ),
         MisfitCause::TargetSways { target } => MisfitWords {
@@ -108,7 +108,7 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
             kind,
             figure: format!("{figure:.0} times"),
             cause: "it moves across its heading".into(),
-            advice: "nothing where it slides: the estimate allows for it; else check yaw_deg of its markers".into(),
+            advice: "nothing if it slides: the estimate allows for it; else check yaw_deg of its markers".into(),
         },
         MisfitCause::TargetTurns { target } => MisfitWords {
             source: target_name(rig, target),
@@ -120,7 +120,7 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
     }
 }
 
-/// A fixed name for what does not fit.
+/// A fixed name for each kind of misfit.
 const fn kind(cause: MisfitCause) -> &'static str {
     match cause {
         MisfitCause::TiltKind(_) => "tilt_kind",
@@ -143,11 +143,11 @@ const fn kind(cause: MisfitCause) -> &'static str {
     }
 }
 
-/// What a tilt sensor feels, as a sentence goes on.
+/// What a tilt sensor measures, as part of a sentence.
 pub(super) fn felt_words(felt: FeltTilt) -> String {
     match felt {
-        FeltTilt::Attitude => "tells attitude, as an AHRS does".into(),
-        FeltTilt::Force => "feels specific force, as an accelerometer does".into(),
+        FeltTilt::Attitude => "measures attitude, as an AHRS does".into(),
+        FeltTilt::Force => "measures specific force, as an accelerometer does".into(),
         FeltTilt::Share(k) => format!("reads {:.0} % of the tilt", 100.0 * k),
     }
 }
@@ -183,7 +183,7 @@ fn late(misfit: &Misfit) -> MisfitWords {
         kind: kind(misfit.cause),
         figure: format!("{by_ms:.0} ms"),
         cause: format!(
-            "{} is true {:.0} ms {} than its stamps say",
+            "{} was measured {:.0} ms {} than its time stamps",
             spoken(misfit.source),
             by_ms.abs(),
             if by_ms < 0.0 { "later" } else { "earlier" }
@@ -196,7 +196,7 @@ fn marker_size(ratio: f64, pair: MarkerPair, rig: &Rig) -> MisfitWords {
     let percent = 100.0 * (ratio - 1.0);
     let configured = marker(rig, pair.target, pair.marker).and_then(|m| m.size_m.or(m.diameter_m));
     let measured =
-        configured.map_or(String::new(), |m| format!(", about {:.3} m by what is seen", m * ratio));
+        configured.map_or(String::new(), |m| format!(", about {:.3} m by the pictures", m * ratio));
     of_marker(
         pair,
         rig,
@@ -245,7 +245,7 @@ pub(super) fn marker_name(rig: &Rig, target: usize, index: usize) -> String {
     }
 }
 
-/// A source as a sentence begins with it.
+/// Name of a source at the beginning of a sentence.
 const fn spoken(source: FusionSource) -> &'static str {
     match source {
         FusionSource::GpsPosition => "the receiver's position",
@@ -254,14 +254,14 @@ const fn spoken(source: FusionSource) -> &'static str {
         FusionSource::CompassTilt => "the compass's tilt",
         FusionSource::AttitudeHeading => "the second attitude's heading",
         FusionSource::AttitudeTilt => "the second attitude's tilt",
-        FusionSource::ImuRate => "the gyros' rate of turn",
+        FusionSource::ImuRate => "the gyros' rate",
         FusionSource::ImuForce => "the accelerometers' force",
-        FusionSource::Marker => "what is seen of markers",
-        FusionSource::Feature => "what is seen of the ground",
+        FusionSource::Marker => "the markers' place in the pictures",
+        FusionSource::Feature => "the ground's motion in the pictures",
     }
 }
 
-/// The keys that say how much a source scatters.
+/// The keys that configure the scatter of a source.
 const fn noise_keys(source: FusionSource) -> &'static str {
     match source {
         FusionSource::GpsPosition => "gps.bias_sigma_m and gps.noise_m",

@@ -1,5 +1,5 @@
-//! What does not fit, as the operator hears of it: once, again where it has changed, and over when it is not found
-//! any more.
+//! Misfits as they are reported to the operator: once, again when the figure has changed, and ended when they are not
+//! found any more.
 
 use std::mem::discriminant;
 
@@ -8,14 +8,14 @@ use windhover_base::msg::{MarkerPair, Misfit, MisfitCause, MisfitWords};
 use windhover_base::settings::Rig;
 use windhover_base::time::{MonoTime, Span};
 
-/// What was not found for so long is over.
+/// A misfit that was not found for this long has ended.
 const OVER: Span = Span::from_ns(10_000_000_000);
-/// The operator hears of the same misfit again no sooner than after this.
+/// The same misfit is reported again no sooner than after this.
 const AGAIN: Span = Span::from_ns(10_000_000_000);
-/// … and where its figure has moved by this share of how far it was from one that fits.
+/// … and only if its figure has changed by this share of its distance from the figure of a perfect fit.
 const CHANGED: f64 = 0.25;
 
-/// Everything that does not fit now.
+/// All present misfits.
 pub(super) struct Misfits {
     rig: Rig,
     found: Vec<Found>,
@@ -29,12 +29,12 @@ struct Found {
 }
 
 impl Misfits {
-    /// Of this rig; everything fits.
+    /// For this rig, without misfits.
     pub(super) fn new(rig: &Rig) -> Self {
         Self { rig: rig.clone(), found: Vec::new() }
     }
 
-    /// Takes what the filter found; gives the words where the operator is to hear them.
+    /// Takes a misfit that the filter found; returns its texts if it is to be reported.
     pub(super) fn take(&mut self, misfit: &Misfit, now: MonoTime) -> Option<MisfitWords> {
         self.forget(now);
         match self.found.iter_mut().find(|found| same(&found.misfit, misfit)) {
@@ -55,7 +55,7 @@ impl Misfits {
         Some(words(misfit, &self.rig))
     }
 
-    /// What does not fit now, longest known first.
+    /// The present misfits, the longest known first.
     pub(super) fn now(&mut self, now: MonoTime) -> Vec<MisfitWords> {
         self.forget(now);
         self.found.iter().map(|found| words(&found.misfit, &self.rig)).collect()
@@ -66,14 +66,14 @@ impl Misfits {
     }
 }
 
-/// Whether two are the same thing that does not fit, whatever the figure.
+/// Whether two are the same misfit, whatever the figure.
 fn same(a: &Misfit, b: &Misfit) -> bool {
     a.source == b.source
         && discriminant(&a.cause) == discriminant(&b.cause)
         && place(a.cause) == place(b.cause)
 }
 
-/// The target, and its marker, that a cause is about.
+/// The target, and its marker, to which a cause belongs.
 const fn place(cause: MisfitCause) -> (Option<usize>, Option<usize>) {
     match cause {
         MisfitCause::MarkerSize(MarkerPair { target, marker, .. })
@@ -86,7 +86,7 @@ const fn place(cause: MisfitCause) -> (Option<usize>, Option<usize>) {
     }
 }
 
-/// The figure where everything fits: one of a ratio, zero of a difference.
+/// The figure of a perfect fit: one for a ratio, zero for a difference.
 const fn where_it_fits(cause: MisfitCause) -> f64 {
     match cause {
         MisfitCause::TiltKind(_)

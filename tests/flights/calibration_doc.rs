@@ -5,7 +5,7 @@ use std::process::Command;
 use std::sync::LazyLock;
 
 use nalgebra::{Rotation3, Vector2, Vector3};
-use windhover_base::geo::{CameraModel, ned_from_body_321};
+use windhover_base::geo::{CameraModel, LensModel, ned_from_body_321};
 use windhover_base::msg::TagFamily;
 use windhover_detect::{TagPattern, tag_pattern};
 
@@ -120,6 +120,7 @@ fn photographs(dir: &Path, sheet: Sheet) {
         fy: 618.0,
         cx: 322.0,
         cy: 241.0,
+        model: LensModel::Brown,
         distortion: [-0.15, 0.03, 0.0, 0.0, 0.0],
         skew: 0.0,
     };

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use windhover::app::flight::Flight;
+use windhover::io::mcap_read::McapReader;
 
 use crate::contract::{capture, said, scratch, windhover};
 
@@ -47,6 +48,23 @@ fn a_refined_flight_stands_beside_the_real_one() {
     };
     assert_eq!(head("refined.csv").0, head("estimates.csv").0);
     assert_eq!(head("refined.csv").1, track.refined.len() + 1);
+    // The flight itself is read, exported and put into a bag with the refinement beside it.
+    assert_eq!((&real_time.refined, flight.refined.as_ref()), (&track.refined, Some(said)));
+    run(&["export", "flight.mcap", "--format", "csv", "--out", "of-flight"], dir.path());
+    let table = |folder: &str| std::fs::read(dir.path().join(folder).join("refined.csv")).expect("exported");
+    assert_eq!(table("of-flight"), table("tables"));
+    run(&["export", "flight.mcap", "--format", "rosbag2", "--out", "bag"], dir.path());
+    let bag = McapReader::open(&dir.path().join("bag/flight_0.mcap")).expect("a bag");
+    let odometry = bag.filter(|message| message.channel.topic == "/ownship/odometry_refined").count();
+    assert_eq!(odometry, refined.ownship_refined.len());
+    // A refinement that is older than the flight is not used, and that is said.
+    let file =
+        std::fs::File::options().append(true).open(dir.path().join("flight.mcap")).expect("it is there");
+    file.set_modified(std::time::SystemTime::now() + std::time::Duration::from_secs(60)).expect("ours");
+    let changed = Flight::read(&dir.path().join("flight.mcap")).expect("a flight");
+    assert!(
+        changed.refined.is_none() && changed.warnings.iter().any(|w| w.contains("older than the flight"))
+    );
     // And refined once more, it is the same flight with one refinement.
     run(&["refine", "flight.refined.mcap", "--out", "again.mcap"], dir.path());
     let again = Flight::read(&dir.path().join("again.mcap")).expect("a refined flight");

@@ -58,11 +58,11 @@ def until(what, seconds, message):
 class Flight:
     """A simulated flight, taken apart into what devices deliver. Made once, flown often."""
 
-    def __init__(self, scenario="hover20", seconds=60):
+    def __init__(self, scenario="hover20", seconds=60, fps=10, scale=0.5):
         self.folder = tempfile.TemporaryDirectory()
         self.at = pathlib.Path(self.folder.name)
         capture = self.at / "capture.mcap"
-        windhover("simulate", capture, "--scenario", scenario, "--duration", seconds, "--scale", 0.5, "--fps", 10)
+        windhover("simulate", capture, "--scenario", scenario, "--duration", seconds, "--scale", scale, "--fps", fps)
         camera = self.at / "camera"
         camera.mkdir()
         self.serial, rows, start = [], ["time_s,file"], None
@@ -103,6 +103,7 @@ class Daemon:
         config = config.replace('"/var/lib/windhover"', f'"{self.at / "card"}"')
         for table in re.findall(r"^\[(\w+)\]", tables, re.M):
             config = re.sub(rf"^\[{table}\]\n(?:(?!\[).*\n?)*", "", config, flags=re.M)
+        tables = tables.replace('"/var/lib/windhover"', f'"{self.at / "card"}"')
         (self.at / "windhover.toml").write_text(config + "\n" + tables)
         self.log = self.at / "log"
         self.stopped = threading.Event()

@@ -14,6 +14,7 @@ import flights
 import frames
 import own_motion
 import photographs
+import pictures
 import serial_lines
 from program import Program
 
@@ -21,6 +22,7 @@ LEAVE_OUT = pathlib.Path(__file__).resolve().parents[2] / ".ci/skip"
 PARTS = {
     "serial": (serial_lines, "serial"),
     "photographs": (photographs, "images"),
+    "pictures": (pictures, "reports/images"),
     "frames": (frames, "detector"),
     "flights": (flights, "flights"),
     "own motion": (own_motion, "real"),

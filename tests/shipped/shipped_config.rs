@@ -1,6 +1,7 @@
 //! The shipped configuration explains every key and shows true defaults.
 
 use windhover::config::Config;
+use windhover_base::geo::LensModel;
 
 fn shipped() -> String {
     std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/config/windhover.toml")).unwrap()
@@ -31,6 +32,21 @@ fn every_key_is_there() {
         let mentioned =
             text.lines().any(|l| l.trim_start_matches(['#', ' ']).starts_with(&format!("{key} =")));
         assert!(mentioned, "{key} is not explained in config/windhover.toml");
+    }
+}
+
+#[test]
+fn a_fisheye_has_four_terms() {
+    let told = "distortion = [-0.17892, 0.13875, -0.00128, 0.0056, 0.0]";
+    let with = |terms: &str| {
+        let text = shipped().replace("#model = \"brown\"", "model = \"fisheye\"");
+        Config::parse(&text.replace(told, &format!("distortion = {terms}")))
+    };
+    let lens = with("[-0.01, 0.002, 0.0, 0.001]").unwrap().camera.intrinsics;
+    assert_eq!((lens.model, lens.distortion), (LensModel::Fisheye, [-0.01, 0.002, 0.0, 0.001, 0.0]));
+    for terms in ["[-0.01, 0.002, 0.0, 0.001, 0.1]", "[-0.01, 0.002]"] {
+        let error = with(terms).unwrap_err().to_string();
+        assert!(error.contains("line") && error.contains("distortion"), "{terms}: {error}");
     }
 }
 

@@ -214,29 +214,40 @@ fn place(full: &FloatImage, corners: Corners, columns: usize, window_px: f64) ->
     Ok(placed)
 }
 
-/// Removes inner corners that are not between their neighbours: the edge of a shadow or a glint displaced them. Corners
-/// along the border of the board have no neighbours for this check.
-fn without_strays(corners: Corners, columns: usize) -> Corners {
+/// Leaves out inner corners that do not lie between their neighbours: the edge of a shadow or a glint
+/// drew them aside. Corners along the border of the board have no neighbours to tell.
+pub(super) fn without_strays(corners: Corners, columns: usize) -> Corners {
     let rows = corners.len() / columns;
     let at = |c: i64, r: i64| {
         let inside = c >= 0 && r >= 0 && c < columns as i64 && r < rows as i64;
         inside.then(|| corners[r as usize * columns + c as usize]).flatten()
     };
+    // By the neighbours along a row or column: as the inner ones have it, and beside the board's edge as those on one side.
     let between = |c: i64, r: i64, step: (i64, i64)| {
         let neighbour = |k: i64| at(c + k * step.0, r + k * step.1);
         let (before, after) = (neighbour(-1)?, neighbour(1)?);
         // The cubic through four neighbours follows perspective and distortion better than the line through two.
+        let one_sided = |near: Vector2<f64>, next: Vector2<f64>, beyond: Vector2<f64>, far: Vector2<f64>| {
+            (near * 6.0 - next * 4.0 + beyond + far) / 4.0
+        };
+        let line = (before + after) / 2.0;
         Some(match (neighbour(-2), neighbour(2)) {
-            (Some(first), Some(last)) => ((before + after) * 4.0 - first - last) / 6.0,
-            _ => (before + after) / 2.0,
+            (Some(first), Some(last)) => [((before + after) * 4.0 - first - last) / 6.0; 2],
+            (None, Some(last)) => {
+                [line, neighbour(3).map_or(line, |third| one_sided(after, last, third, before))]
+            }
+            (Some(first), None) => {
+                [line, neighbour(-3).map_or(line, |third| one_sided(before, first, third, after))]
+            }
+            (None, None) => [line; 2],
         })
     };
     let stays = |k: usize, p: Vector2<f64>| {
         let (c, r) = ((k % columns) as i64, (k / columns) as i64);
-        let guesses = [between(c, r, (1, 0)), between(c, r, (0, 1))];
         let limit = (STRAY_SHARE * to_nearest(&corners, columns, k)).max(1.0);
-        match guesses {
-            [Some(a), Some(b)] => ((a + b) / 2.0 - p).norm() < limit,
+        match [between(c, r, (1, 0)), between(c, r, (0, 1))] {
+            // One neighbour may itself be displaced: either guess will do.
+            [Some(a), Some(b)] => (0..2).any(|way| ((a[way] + b[way]) / 2.0 - p).norm() < limit),
             _ => true,
         }
     };
@@ -271,7 +282,7 @@ fn to_nearest(corners: &Corners, columns: usize, k: usize) -> f64 {
 mod tests {
     use super::*;
     use crate::drawn_board::{DrawnBoard, Shadow};
-    use windhover_base::geo::{CameraModel, rot_z};
+    use windhover_base::geo::{CameraModel, LensModel, rot_z};
 
     fn camera() -> CameraModel {
         CameraModel {
@@ -279,6 +290,7 @@ mod tests {
             fy: 605.0,
             cx: 330.0,
             cy: 236.0,
+            model: LensModel::Brown,
             distortion: [-0.22, 0.06, 0.001, -0.0005, 0.0],
             skew: 0.0,
         }
@@ -318,6 +330,38 @@ mod tests {
         // Where the shadow's edge runs through a corner itself, it may be left out.
         assert!(found.iter().flatten().count() >= 50);
         assert!(worst(&found, &drawn.corners()) < 0.2, "{}", worst(&found, &drawn.corners()));
+    }
+
+    /// Boards that fill most of a lens of 130°, squares at the rim a third as wide as those in the middle.
+    #[test]
+    fn whole_boards_that_fill_a_wide_lens_are_found() {
+        let fisheye = CameraModel {
+            fx: 262.0,
+            fy: 262.0,
+            model: LensModel::Fisheye,
+            distortion: [-0.02, 0.004, 0.0, 0.0, 0.0],
+            ..camera()
+        };
+        let barrel =
+            CameraModel { fx: 330.0, fy: 330.0, distortion: [-0.26, 0.085, 0.0, 0.0, -0.012], ..camera() };
+        for (lens, distance) in [(fisheye, 0.075), (fisheye, 0.1), (barrel, 0.13), (barrel, 0.16)] {
+            for (turn, pitch, roll) in
+                [(0.0, 0.0, 0.0), (0.1, 0.2, -0.1), (-0.15, -0.15, 0.25), (3.1, 0.1, 0.2)]
+            {
+                let drawn =
+                    DrawnBoard::new(lens, (640, 480), (9, 6), 0.025).posed(turn, pitch, roll, distance);
+                let truth = drawn.corners();
+                let is_inside = |p: &&Vector2<f64>| p.x > 8.0 && p.y > 8.0 && p.x < 631.0 && p.y < 471.0;
+                if truth.iter().filter(is_inside).count() < 54 {
+                    continue;
+                }
+                let name = format!("{:?} at {distance} m, {turn} {pitch} {roll}", lens.model);
+                let found = find_corners(drawn.image(None).view(), 9, 6, WINDOW_PX);
+                let found = found.unwrap_or_else(|e| panic!("{name}: {e}"));
+                assert!(found.iter().flatten().count() >= 52, "{name}: {}", found.iter().flatten().count());
+                assert!(worst(&found, &truth) < 0.5, "{name}: {}", worst(&found, &truth));
+            }
+        }
     }
 
     #[test]

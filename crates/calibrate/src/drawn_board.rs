@@ -16,7 +16,7 @@ const BLUR_PX: f64 = 1.8;
 /// A chessboard in front of a camera.
 #[derive(Clone)]
 pub(crate) struct DrawnBoard {
-    camera: CameraModel,
+    pub(crate) camera: CameraModel,
     size: (usize, usize),
     inner: (usize, usize),
     square_m: f64,

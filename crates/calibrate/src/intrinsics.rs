@@ -3,12 +3,17 @@
 use nalgebra::Vector2;
 
 pub use super::least_squares::Wanted;
-use super::least_squares::{COUNT, K3, Problem, SKEW, scaled_cholesky};
-use super::zhang::{PlanePose, PlaneView, homography, pose_of, starts};
-use windhover_base::geo::CameraModel;
+use super::least_squares::{COUNT, Problem, scaled_cholesky};
+use super::zhang::{PlanePose, PlaneView, fisheye_starts, homography, pose_of, pose_through, starts};
+use windhover_base::geo::{CameraModel, LensModel};
 
-/// Parameters of the camera, in the order of [`Intrinsics::sigma`].
-pub const PARAMETERS: [&str; COUNT] = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "skew"];
+/// Parameters of the camera, in the order of [`Intrinsics::sigma`]. A fisheye has no fifth term.
+pub fn parameters(model: LensModel) -> [&'static str; COUNT] {
+    match model {
+        LensModel::Brown => ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "skew"],
+        LensModel::Fisheye => ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "", "skew"],
+    }
+}
 
 /// Why views gave no intrinsics.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, thiserror::Error)]
@@ -44,7 +49,7 @@ pub struct ViewFit {
 pub struct Intrinsics {
     /// Its parameters.
     pub camera: CameraModel,
-    /// One-sigma of each of [`PARAMETERS`], from the normal equations scaled by the residuals; 0 for
+    /// One-sigma of each of [`parameters`], from the normal equations scaled by the residuals; 0 for
     /// those not estimated.
     pub sigma: [f64; COUNT],
     /// Root of the mean squared length of all residuals, as OpenCV reports it.
@@ -77,9 +82,16 @@ pub fn calibrate(
     for (k, view) in views.iter().enumerate() {
         homographies.push(homography(view).ok_or(IntrinsicsError::BadView(k))?);
     }
+    let cameras = match wanted.model {
+        LensModel::Brown => starts(&homographies, width, height),
+        LensModel::Fisheye => fisheye_starts(width, height).to_vec(),
+    };
     let mut best: Option<Problem<'_>> = None;
-    for camera in starts(&homographies, width, height) {
-        let poses: Option<Vec<_>> = homographies.iter().map(|h| pose_of(h, &camera)).collect();
+    for camera in cameras {
+        let poses: Option<Vec<_>> = match wanted.model {
+            LensModel::Brown => homographies.iter().map(|h| pose_of(h, &camera)).collect(),
+            LensModel::Fisheye => views.iter().map(|view| pose_through(view, &camera)).collect(),
+        };
         let Some(poses) = poses else { continue };
         let mut problem = Problem { views, camera, poses, wanted };
         problem.solve();
@@ -97,18 +109,14 @@ fn result(problem: Problem<'_>) -> Result<Intrinsics, IntrinsicsError> {
     let (left, _) = problem.reduced(&normal, 0.0).ok_or(IntrinsicsError::Degenerate)?;
     let inverse = scaled_cholesky(&left).ok_or(IntrinsicsError::Degenerate)?.inverse();
     let points: usize = problem.views.iter().map(|v| v.px.len()).sum();
-    let estimated = COUNT - usize::from(!problem.wanted.k3) - usize::from(!problem.wanted.skew);
+    let estimated = (0..COUNT).filter(|&k| problem.wanted.estimates(k)).count();
     let freedom = 2 * points as i64 - (estimated + 6 * problem.views.len()) as i64;
     let cost = problem.cost();
     let variance = if freedom > 0 { cost / freedom as f64 } else { f64::INFINITY };
-    let mut sigma: [f64; COUNT] = std::array::from_fn(|k| (variance * inverse[(k, k)]).sqrt());
-    if !problem.wanted.k3 {
-        sigma[K3] = 0.0;
-    }
-    if !problem.wanted.skew {
-        sigma[SKEW] = 0.0;
-    }
-    // A focal length whose sigma is more than a fifth of it is not known.
+    let sigma: [f64; COUNT] = std::array::from_fn(|k| {
+        if problem.wanted.estimates(k) { (variance * inverse[(k, k)]).sqrt() } else { 0.0 }
+    });
+    // A focal length known to no better than a fifth of itself is not known.
     if !(sigma[0] < 0.2 * problem.camera.fx && sigma[1] < 0.2 * problem.camera.fy) {
         return Err(IntrinsicsError::Degenerate);
     }
@@ -149,6 +157,7 @@ mod tests {
             fy: 541.0,
             cx: 342.0,
             cy: 235.0,
+            model: LensModel::Brown,
             distortion: [-0.26, 0.09, 0.0015, -0.0006, 0.0],
             skew: 0.0,
         }
@@ -169,7 +178,7 @@ mod tests {
         boards.iter().map(|b| PlaneView { plane_m: b.plane_points(), px: b.corners() }).collect()
     }
 
-    fn parameters(c: &CameraModel) -> Vec<f64> {
+    fn figures(c: &CameraModel) -> Vec<f64> {
         [c.fx, c.fy, c.cx, c.cy].into_iter().chain(c.distortion).chain([c.skew]).collect()
     }
 
@@ -179,11 +188,57 @@ mod tests {
 
     #[test]
     fn exact_corners_give_the_exact_camera() {
-        let found = calibrated(&exact(&boards()), Wanted { k3: true, skew: true }).expect("tilted boards");
-        for (got, want) in parameters(&found.camera).iter().zip(parameters(&camera())) {
+        let found = calibrated(&exact(&boards()), Wanted { model: LensModel::Brown, k3: true, skew: true })
+            .expect("tilted boards");
+        for (got, want) in figures(&found.camera).iter().zip(figures(&camera())) {
             assert!((got - want).abs() < 1e-5 * want.abs().max(1.0), "{got} {want}");
         }
         assert!(found.rms_px < 1e-6);
+    }
+
+    /// A lens of 140° across the frame, and boards all over it.
+    fn fisheye_boards() -> Vec<DrawnBoard> {
+        let lens = CameraModel {
+            fx: 255.0,
+            fy: 257.0,
+            model: LensModel::Fisheye,
+            distortion: [-0.02, 0.006, -0.004, 0.0008, 0.0],
+            ..camera()
+        };
+        let tilts = [(0.5, 0.0), (-0.5, 0.1), (0.1, 0.5), (0.0, -0.5), (0.4, 0.4), (-0.4, -0.4), (0.3, -0.3)];
+        let board = |(k, (pitch, roll)): (usize, (f64, f64))| {
+            let mut b = DrawnBoard::new(lens, SIZE, (9, 6), 0.025).posed(0.5 * k as f64, pitch, roll, 0.12);
+            b.pose.translation += Vector3::new(0.08, 0.03, 0.0) * [1.0, -1.0, 0.0][k % 3];
+            b
+        };
+        tilts.into_iter().enumerate().map(board).collect()
+    }
+
+    #[test]
+    fn corners_in_a_fisheye_give_it_exactly_and_noisy_ones_within_their_sigmas() {
+        let boards = fisheye_boards();
+        let truth = figures(&boards[0].camera);
+        let mut views = exact(&boards);
+        let widest = views.iter().flat_map(|v| &v.px).map(|px| (px - Vector2::new(342.0, 235.0)).norm());
+        assert!(widest.fold(0.0, f64::max) > 260.0, "the boards reach far off the axis");
+        let wanted = Wanted { model: LensModel::Fisheye, k3: true, skew: false };
+        let found = calibrated(&views, wanted).expect("tilted boards");
+        for (got, want) in figures(&found.camera).iter().zip(&truth) {
+            assert!((got - want).abs() < 1e-5 * want.abs().max(1.0), "{got} {want}");
+        }
+        let mut rng = ChaCha8Rng::seed_from_u64(43);
+        for px in views.iter_mut().flat_map(|v| &mut v.px) {
+            *px += 0.2 * Vector2::new(rng.sample(StandardNormal), rng.sample::<f64, _>(StandardNormal));
+        }
+        let found = calibrated(&views, wanted).expect("tilted boards");
+        assert!((found.noise_px - 0.2).abs() < 0.02, "{}", found.noise_px);
+        for (k, (got, want)) in figures(&found.camera).iter().zip(&truth).enumerate().take(8) {
+            let name = parameters(LensModel::Fisheye)[k];
+            assert!((got - want).abs() < 4.0 * found.sigma[k], "{name}: {got} {want}");
+        }
+        // The other model does not fit it.
+        let brown = calibrated(&views, Wanted { model: LensModel::Brown, k3: true, skew: false });
+        assert!(brown.is_err() || brown.is_ok_and(|b| b.noise_px > 0.3), "a fisheye passed for Brown's");
     }
 
     #[test]
@@ -191,7 +246,7 @@ mod tests {
         // Normalised errors of all parameters over 30 noisy sets: mean square near one.
         let views = exact(&boards());
         let mut rng = ChaCha8Rng::seed_from_u64(42);
-        let wanted = Wanted { k3: false, skew: false };
+        let wanted = Wanted { model: LensModel::Brown, k3: false, skew: false };
         let mut squares = Vec::new();
         for _ in 0..30 {
             let mut noisy = views.clone();
@@ -200,7 +255,7 @@ mod tests {
             }
             let found = calibrated(&noisy, wanted).expect("tilted boards");
             assert!((found.noise_px - 0.2).abs() < 0.02, "{}", found.noise_px);
-            let errors = parameters(&found.camera).into_iter().zip(parameters(&camera()));
+            let errors = figures(&found.camera).into_iter().zip(figures(&camera()));
             squares.extend(errors.zip(found.sigma).take(8).map(|((g, w), s)| ((g - w) / s).powi(2)));
         }
         let mean = squares.iter().sum::<f64>() / squares.len() as f64;
@@ -216,15 +271,17 @@ mod tests {
             PlaneView { plane_m: b.plane_points(), px }
         };
         let views: Vec<_> = boards.iter().map(view).collect();
-        calibrated(&views, Wanted { k3: false, skew: false }).expect("tilted boards")
+        calibrated(&views, Wanted { model: LensModel::Brown, k3: false, skew: false }).expect("tilted boards")
     }
 
     fn is_the_camera(found: &Intrinsics) {
-        for (k, (got, want)) in
-            parameters(&found.camera).iter().zip(parameters(&camera())).enumerate().take(8)
-        {
+        for (k, (got, want)) in figures(&found.camera).iter().zip(figures(&camera())).enumerate().take(8) {
             let sigma = found.sigma[k];
-            assert!((got - want).abs() < 4.0 * sigma, "{}: {got} {want} {sigma}", PARAMETERS[k]);
+            assert!(
+                (got - want).abs() < 4.0 * sigma,
+                "{}: {got} {want} {sigma}",
+                parameters(LensModel::Brown)[k]
+            );
         }
     }
 
@@ -259,7 +316,7 @@ mod tests {
         for px in views.iter_mut().flat_map(|v| &mut v.px) {
             *px += 0.2 * Vector2::new(rng.sample(StandardNormal), rng.sample::<f64, _>(StandardNormal));
         }
-        let wanted = Wanted { k3: false, skew: false };
+        let wanted = Wanted { model: LensModel::Brown, k3: false, skew: false };
         assert_eq!(calibrated(&views, wanted).map(|_| ()), Err(IntrinsicsError::Degenerate));
         assert_eq!(calibrated(&views[..2], wanted).map(|_| ()), Err(IntrinsicsError::TooFewViews(2)));
     }

@@ -4,9 +4,9 @@
 use nalgebra::{Matrix6, Rotation3, SMatrix, SVector, Vector2, Vector3};
 
 use super::zhang::{PlanePose, PlaneView};
-use windhover_base::geo::{CameraModel, skew as cross_matrix};
+use windhover_base::geo::{CameraModel, LensModel, skew as cross_matrix};
 
-/// Parameters of the camera: fx, fy, cx, cy, k1, k2, p1, p2, k3, skew.
+/// Parameters of the camera: fx, fy, cx, cy, k1, k2, p1, p2, k3, skew; of a fisheye k1 to k4 and nothing in place of k3.
 pub(super) const COUNT: usize = 10;
 /// Where the third radial term stands among them.
 pub(super) const K3: usize = 8;
@@ -17,16 +17,30 @@ const MOST_STEPS: usize = 100;
 /// The search ends when the sum of squares decreases by less than this share of itself.
 const LEAST_GAIN: f64 = 1e-10;
 
-/// Which of the optional parameters are estimated; the others stay zero.
+/// Which lens, and which of its optional parameters are estimated; the others stay zero.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Wanted {
-    /// The third radial term.
+    /// How the lens departs from a pinhole.
+    pub model: LensModel,
+    /// The third radial term of Brown's model.
     pub k3: bool,
     /// Bouguet's α.
     pub skew: bool,
 }
 
-/// A least-squares problem at its present values.
+impl Wanted {
+    /// Optional parameters, and whether they are estimated.
+    fn optional(self) -> [(usize, bool); 2] {
+        [(K3, self.k3 && self.model == LensModel::Brown), (SKEW, self.skew)]
+    }
+
+    /// Whether a parameter is estimated.
+    pub(super) fn estimates(self, parameter: usize) -> bool {
+        self.optional().into_iter().all(|(k, estimated)| k != parameter || estimated)
+    }
+}
+
+/// A least-squares problem at its present guess.
 #[derive(Clone)]
 pub(super) struct Problem<'a> {
     pub(super) views: &'a [PlaneView],
@@ -130,25 +144,21 @@ impl Problem<'_> {
         of_pose.fixed_columns_mut::<3>(3).copy_from(&d_point);
 
         let d = c.distort(m).0;
-        let r2 = m.norm_squared();
-        let radial = |power: f64| Vector2::new(c.fx * (m.x + c.skew * m.y), c.fy * m.y) * power;
-        let tangent = |x: f64, y: f64| Vector2::new(c.fx * (x + c.skew * y), c.fy * y);
+        let of_terms = terms(c.model, m).map(|t| Vector2::new(c.fx * (t.x + c.skew * t.y), c.fy * t.y));
         let mut of_camera = SMatrix::<f64, 2, COUNT>::from_columns(&[
             Vector2::new(d.x + c.skew * d.y, 0.0),
             Vector2::new(0.0, d.y),
             Vector2::x(),
             Vector2::y(),
-            radial(r2),
-            radial(r2 * r2),
-            tangent(2.0 * m.x * m.y, r2 + 2.0 * m.y * m.y),
-            tangent(r2 + 2.0 * m.x * m.x, 2.0 * m.x * m.y),
-            radial(r2 * r2 * r2),
+            of_terms[0],
+            of_terms[1],
+            of_terms[2],
+            of_terms[3],
+            of_terms[4],
             Vector2::new(c.fx * d.y, 0.0),
         ]);
-        for (column, estimated) in [(K3, self.wanted.k3), (SKEW, self.wanted.skew)] {
-            if !estimated {
-                of_camera.column_mut(column).fill(0.0);
-            }
+        for (column, _) in self.wanted.optional().into_iter().filter(|(_, estimated)| !estimated) {
+            of_camera.column_mut(column).fill(0.0);
         }
         (px - projected, of_camera, of_pose)
     }
@@ -171,11 +181,9 @@ impl Problem<'_> {
             left -= mixed * chol.solve(&mixed.transpose());
             right -= mixed * chol.solve(own_right);
         }
-        for (k, estimated) in [(K3, self.wanted.k3), (SKEW, self.wanted.skew)] {
-            if !estimated {
-                left[(k, k)] = 1.0;
-                right[k] = 0.0;
-            }
+        for (k, _) in self.wanted.optional().into_iter().filter(|(_, estimated)| !estimated) {
+            left[(k, k)] = 1.0;
+            right[k] = 0.0;
         }
         Some((left, right))
     }
@@ -204,6 +212,28 @@ impl Problem<'_> {
         }
         (c_is_usable(&next.camera) && next.poses.iter().all(|p| p.translation.iter().all(|x| x.is_finite())))
             .then_some(next)
+    }
+}
+
+/// By how much each distortion term moves the distorted coordinates of `m`, in the order of
+/// [`CameraModel::distortion`].
+fn terms(model: LensModel, m: Vector2<f64>) -> [Vector2<f64>; 5] {
+    let r2 = m.norm_squared();
+    match model {
+        LensModel::Brown => [
+            m * r2,
+            m * r2 * r2,
+            Vector2::new(2.0 * m.x * m.y, r2 + 2.0 * m.y * m.y),
+            Vector2::new(r2 + 2.0 * m.x * m.x, 2.0 * m.x * m.y),
+            m * r2 * r2 * r2,
+        ],
+        LensModel::Fisheye => {
+            let r = r2.sqrt();
+            // θ³, θ⁵, θ⁷ and θ⁹ along m.
+            let (angle, unit) = (r.atan(), if r > 0.0 { m / r } else { Vector2::zeros() });
+            let term = |power: i32| unit * angle.powi(power);
+            [term(3), term(5), term(7), term(9), Vector2::zeros()]
+        }
     }
 }
 

@@ -4,6 +4,7 @@
 pub mod boresight;
 mod boresight_filter;
 mod boresight_state;
+mod charuco;
 mod chessboard;
 #[cfg(test)]
 mod drawn_board;
@@ -17,6 +18,7 @@ mod subpixel;
 mod tag_grid;
 mod zhang;
 
+pub use charuco::{CharucoBoard, CharucoError};
 pub use chessboard::{BoardError, Corners, WINDOW_PX, find_corners};
 pub use tag_grid::{TagGrid, TagGridError};
 pub use zhang::{PlanePose, PlaneView};

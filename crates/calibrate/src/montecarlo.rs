@@ -269,6 +269,7 @@ fn draw(distribution: Distribution, rng: &mut ChaCha8Rng) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use windhover_base::geo::LensModel;
     use windhover_base::settings::PixelFormat;
 
     use super::*;
@@ -281,6 +282,7 @@ mod tests {
             fy: 1022.1229,
             cx: 645.66333,
             cy: 527.72943,
+            model: LensModel::Brown,
             distortion: [-0.17892, 0.13875, -0.00128, 0.0056, 0.0],
             skew: 0.0,
         };

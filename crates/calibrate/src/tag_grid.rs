@@ -6,9 +6,9 @@ use super::zhang::{PlaneView, homography};
 use windhover_base::msg::{ImageView, TagFamily};
 use windhover_detect::{Detector, Limits, TagDetection, TagLayout};
 
-/// Smallest edge of a tag that is used, pixels: corners of smaller ones are too inaccurate.
-const LEAST_PX: f64 = 14.0;
-/// Fewest tags with which an image is used: fewer determine little of the lens.
+/// Smallest edge of a tag that is used, pixels: corners of smaller ones are too rough.
+pub(super) const LEAST_PX: f64 = 14.0;
+/// Fewest tags with which an image is used: fewer tell little of the lens.
 const FEWEST: usize = 3;
 
 /// Tags numbered row by row from 0, all upright, a gap between neighbours.
@@ -62,7 +62,7 @@ impl TagGrid {
     pub fn find(&self, image: ImageView<'_>) -> Result<PlaneView, TagGridError> {
         let limits = Limits { min_px: LEAST_PX, max_hamming: 1 };
         let [narrow, wide] = [1, 2].map(|border| {
-            let layout = TagLayout { family: self.family, border };
+            let layout = TagLayout { border, ..self.family.into() };
             Detector::new(&[layout], limits).detect(image).to_vec()
         });
         let seen = if wide.len() > narrow.len() { wide } else { narrow };
@@ -108,8 +108,8 @@ impl TagGrid {
     }
 }
 
-/// Root of the mean squared distance to the points' places by the best homography, pixels.
-fn misfit_px(view: &PlaneView) -> f64 {
+/// Root of the mean squared distance to where the best homography puts the points, pixels.
+pub(super) fn misfit_px(view: &PlaneView) -> f64 {
     let Some(h) = homography(view) else { return f64::INFINITY };
     let squared = view.plane_m.iter().zip(&view.px).map(|(p, px)| {
         let at = h * p.push(1.0);
@@ -126,7 +126,7 @@ mod tests {
 
     use super::*;
     use crate::intrinsics::{Wanted, calibrate};
-    use windhover_base::geo::{CameraModel, ned_from_body_321};
+    use windhover_base::geo::{CameraModel, LensModel, ned_from_body_321};
     use windhover_base::msg::GrayImage;
     use windhover_detect::{TagPattern, tag_pattern};
 
@@ -138,7 +138,15 @@ mod tests {
 
     fn camera() -> CameraModel {
         let distortion = [-0.2, 0.05, 0.0005, -0.0005, 0.0];
-        CameraModel { fx: 640.0, fy: 636.0, cx: 324.0, cy: 238.0, distortion, skew: 0.0 }
+        CameraModel {
+            fx: 640.0,
+            fy: 636.0,
+            cx: 324.0,
+            cy: 238.0,
+            model: LensModel::Brown,
+            distortion,
+            skew: 0.0,
+        }
     }
 
     /// Whether the sheet is dark at a point; with `from_below` numbers count from the bottom row up.
@@ -195,8 +203,9 @@ mod tests {
         // When the camera is calibrated with them.
         let views: Vec<PlaneView> = photos.iter().map(|p| GRID.find(p.view()).expect("tags")).collect();
         let found =
-            calibrate(&views, 640.0, 480.0, Wanted { k3: false, skew: false }).expect("tilted enough");
-        // Then the result is within its own sigmas.
+            calibrate(&views, 640.0, 480.0, Wanted { model: LensModel::Brown, k3: false, skew: false })
+                .expect("tilted enough");
+        // Then it is found within its own sigmas.
         assert!(views[4].px.len() < views[0].px.len(), "the last is partly outside");
         let truth = camera();
         let (c, s) = (&found.camera, &found.sigma);

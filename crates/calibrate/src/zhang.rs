@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
 
-use windhover_base::geo::CameraModel;
+use windhover_base::geo::{CameraModel, LensModel};
 
 /// Points of a plane (its own coordinates, metres) and their observations in an image (pixels).
 #[derive(Clone, PartialEq, Debug)]
@@ -58,8 +58,15 @@ fn normalised(points: &[Vector2<f64>]) -> Option<(Matrix3<f64>, Vec<Vector2<f64>
 pub fn starts(homographies: &[Matrix3<f64>], width: f64, height: f64) -> Vec<CameraModel> {
     let middle = Vector2::new((width - 1.0) / 2.0, (height - 1.0) / 2.0);
     let scale = width.max(height);
-    let guess =
-        CameraModel { fx: scale, fy: scale, cx: middle.x, cy: middle.y, distortion: [0.0; 5], skew: 0.0 };
+    let guess = CameraModel {
+        fx: scale,
+        fy: scale,
+        cx: middle.x,
+        cy: middle.y,
+        model: LensModel::Brown,
+        distortion: [0.0; 5],
+        skew: 0.0,
+    };
     let mut found: Vec<CameraModel> = [false, true]
         .into_iter()
         .filter_map(|held| closed_form(homographies, middle, scale, held))
@@ -73,6 +80,38 @@ pub fn starts(homographies: &[Matrix3<f64>], width: f64, height: f64) -> Vec<Cam
         .collect();
     found.push(guess);
     found
+}
+
+/// Fisheye cameras to start from: a circle of 100 to 220 degrees that fills the image's longer side, distortion zero.
+pub(super) fn fisheye_starts(width: f64, height: f64) -> [CameraModel; 4] {
+    [100.0f64, 130.0, 170.0, 220.0].map(|across_deg| {
+        let focal = width.max(height) / across_deg.to_radians();
+        let (cx, cy) = ((width - 1.0) / 2.0, (height - 1.0) / 2.0);
+        let model = LensModel::Fisheye;
+        CameraModel { fx: focal, fy: focal, cx, cy, model, distortion: [0.0; 5], skew: 0.0 }
+    })
+}
+
+/// Farthest off the axis that a point may be for a first pose, as a tangent: homographies weigh such by its square.
+const FARTHEST: f64 = 4.0;
+
+/// The plane's pose by the rays of the points seen.
+pub(super) fn pose_through(view: &PlaneView, camera: &CameraModel) -> Option<PlanePose> {
+    let rays = view.plane_m.iter().zip(&view.px).filter_map(|(p, px)| {
+        let ray = camera.normalised(*px).filter(|m| m.norm() < FARTHEST)?;
+        Some((*p, ray))
+    });
+    let (plane_m, px) = rays.unzip();
+    let unit = CameraModel {
+        fx: 1.0,
+        fy: 1.0,
+        cx: 0.0,
+        cy: 0.0,
+        model: LensModel::Brown,
+        distortion: [0.0; 5],
+        skew: 0.0,
+    };
+    pose_of(&homography(&PlaneView { plane_m, px })?, &unit)
 }
 
 /// Solves `h1ᵀ B h2 = 0` and `h1ᵀ B h1 = h2ᵀ B h2` for `B = K⁻ᵀ K⁻¹` in pixels centred on `middle` and
@@ -112,6 +151,7 @@ fn closed_form(
         fy: scale * fy2.sqrt(),
         cx: middle.x - scale * b13 / b11,
         cy: middle.y - scale * b23 / b22,
+        model: LensModel::Brown,
         distortion: [0.0; 5],
         skew: 0.0,
     })
@@ -152,8 +192,15 @@ mod tests {
 
     #[test]
     fn perfect_views_give_the_camera_back() {
-        let camera =
-            CameraModel { fx: 800.0, fy: 820.0, cx: 350.0, cy: 220.0, distortion: [0.0; 5], skew: 0.0 };
+        let camera = CameraModel {
+            fx: 800.0,
+            fy: 820.0,
+            cx: 350.0,
+            cy: 220.0,
+            model: LensModel::Brown,
+            distortion: [0.0; 5],
+            skew: 0.0,
+        };
         let poses = [(0.3, 0.2, 0.1), (-0.4, 0.5, 0.2), (0.1, -0.5, 0.4)].map(|(a, b, c)| PlanePose {
             rotation: ned_from_body_321(a, b, c),
             translation: Vector3::new(-0.1, -0.05, 0.5),

@@ -51,6 +51,12 @@ const CLEAR_RELATIVE: u8 = 70;
 const ENOUGH_RELATIVE: u8 = 160;
 const BUSY_SHARE: f32 = 0.3;
 
+/// Share of an image that is looked at more closely because nowhere else there is as much contrast.
+const STRONGEST_SHARE: f32 = 0.05;
+
+/// And no fewer tiles than a tag of some fifty pixels of its level has, however small the image is.
+const STRONGEST_TILES: u32 = 256;
+
 /// Share of an image with the contrast of print in clear air below which weak contrast is what there is.
 const HAZY_SHARE: f32 = 0.05;
 
@@ -76,6 +82,8 @@ pub(super) struct Binariser {
     relative: Vec<u8>,
     /// The least of these that counts in this image.
     least_relative: u8,
+    /// What the tiles of `STRONGEST_SHARE` have at least.
+    strongest: u8,
     /// Shares of the tiles that are above the gate and have less than that, that have the contrast of clear air, and that
     /// of sharp print.
     dim_share: f32,
@@ -93,6 +101,8 @@ pub(super) enum Where {
     Everywhere,
     /// Where light and shade are near each other.
     LightChanges,
+    /// In the part of the image that has most contrast.
+    Strongest,
     /// Where there is any contrast above the gate.
     AboveNoise,
     /// Where something is as light as a pixel can be: what is lit more than that spreads over what is beside it.
@@ -135,20 +145,26 @@ impl Binariser {
         }
         let mut tiles = [0u32; 256];
         self.relative.iter().for_each(|&r| tiles[usize::from(r)] += 1);
-        let budget = (BUSY_SHARE * self.wide_low.len() as f32) as u32;
         let from = |r: u8| tiles[usize::from(r)];
-        let (mut least, mut passed) = (ENOUGH_RELATIVE, (ENOUGH_RELATIVE..=u8::MAX).map(from).sum::<u32>());
-        while least > CLEAR_RELATIVE && passed + from(least - 1) <= budget {
-            least -= 1;
-            passed += from(least);
-        }
+        let share = |share: f32| (share * self.wide_low.len() as f32) as u32;
+        // The least contrast, `floor` or more, with which no more tiles than `budget` count; at most `least`.
+        let of_tiles = |budget: u32, mut least: u8, floor: u8| {
+            let mut passed = (least..=u8::MAX).map(from).sum::<u32>();
+            while least > floor && passed + from(least - 1) <= budget {
+                least -= 1;
+                passed += from(least);
+            }
+            least
+        };
+        let least = of_tiles(share(BUSY_SHARE), ENOUGH_RELATIVE, CLEAR_RELATIVE);
+        let strongest = of_tiles(share(STRONGEST_SHARE).max(STRONGEST_TILES), u8::MAX, least);
         let dim = tiles[1..usize::from(least)].iter().sum::<u32>();
         let clear = tiles[usize::from(CLEAR_RELATIVE)..].iter().sum::<u32>();
         [self.dim_share, self.clear_share] =
             [dim, clear].map(|count| count as f32 / self.wide_low.len() as f32);
         let printed = tiles[usize::from(PRINTED)..].iter().sum::<u32>();
         self.printed_share = printed as f32 / self.wide_low.len() as f32;
-        self.least_relative = least;
+        (self.least_relative, self.strongest) = (least, strongest);
     }
 
     /// Share of the image with contrast above the gate that is not looked at everywhere.
@@ -161,7 +177,8 @@ impl Binariser {
         self.clear_share < HAZY_SHARE
     }
 
-    /// Whether much of the image has the contrast of sharp print: sheets of tags, that touch each other's corners.
+    /// Whether much of the image has the contrast of sharp print: sheets of tags, that touch each other's corners, or
+    /// coarse gravel in the sun.
     pub fn is_print(&self) -> bool {
         self.printed_share > PRINTED_SHARE
     }
@@ -183,7 +200,11 @@ impl Binariser {
     pub fn mark(&mut self, image: ImageView<'_>, fraction: u16, at: Where, out: &mut Bitmap, simd: Simd) {
         let (across, down) = self.tiles;
         self.thresholds.resize(across * down, 0);
-        let least = if at == Where::AboveNoise { 1 } else { self.least_relative };
+        let least = match at {
+            Where::AboveNoise => 1,
+            Where::Strongest => self.strongest,
+            _ => self.least_relative,
+        };
         let lightest = if at == Where::Saturated { SATURATED } else { 0 };
         let Self { wide_low: low, wide_high: high, relative, thresholds: to, .. } = self;
         simd.run(Divide { low, high, relative, to, fraction, least, lightest });

@@ -139,7 +139,7 @@ pub(super) struct Labeller {
     labels: Vec<u32>,
     /// Where each row's runs start.
     rows: Vec<u32>,
-    /// Marks of every row, a row without runs before the first.
+    /// Marks of every row that has runs, a row without before the first.
     marks: Vec<Marks>,
     /// Label above each label; a root is its own.
     parents: Vec<u32>,
@@ -184,19 +184,19 @@ impl Labeller {
         let marks = bits.width.div_ceil(64) + 1;
         self.marks.resize((bits.height + 1) * marks, Marks::default());
         self.marks[..marks].fill(Marks::default());
-        let (mut above, mut first) = (0, 0);
+        // Where the marks of the row above are: of a row without runs those before the first.
+        let (mut above, mut first, mut above_marks) = (0, 0, 0);
         (self.count, self.joined) = (0, 0);
         for v in 0..bits.height {
             self.rows.push(first as u32);
             let words = bits.row(v);
             if words.iter().fold(0, |any, word| any | word) == 0 {
-                self.marks[(v + 1) * marks..(v + 2) * marks].fill(Marks::default());
-                above = first;
+                (above, above_marks) = (first, 0);
                 continue;
             }
             let after = first + self.split_row(words, first, (v + 1) * marks);
-            self.label_row::<BY_CORNERS>(above, first..after, v as u16, v * marks..(v + 1) * marks);
-            (above, first) = (first, after);
+            self.label_row::<BY_CORNERS>(above, first..after, v as u16, above_marks..above_marks + marks);
+            (above, first, above_marks) = (first, after, (v + 1) * marks);
         }
         for &(a, b) in &self.joins[..self.joined] {
             union(&mut self.parents, a, b);

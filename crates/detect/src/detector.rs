@@ -34,6 +34,9 @@ pub struct Detector {
     tried: Vec<(usize, Quad)>,
     detections: Vec<TagDetection>,
     negative: GrayImage,
+    /// Runs of dark pixels of the last division, and of a level at the highest one that is looked at everywhere.
+    runs: usize,
+    runs_of_level: usize,
     /// Of a frame pixel, grey levels.
     noise: f32,
 }
@@ -79,6 +82,21 @@ enum Look {
     BusyPrint,
 }
 
+impl Look {
+    fn is_print(self) -> bool {
+        matches!(self, Self::Print | Self::BusyPrint)
+    }
+
+    /// The same where what has the contrast of print is none.
+    fn of_ground(self) -> Self {
+        match self {
+            Self::BusyPrint => Self::Whole,
+            Self::Print => Self::Ground,
+            other => other,
+        }
+    }
+}
+
 /// Most levels of an image that are searched.
 const MOST_SEARCHED: usize = 3;
 
@@ -89,6 +107,10 @@ const MOST_SEARCHED: usize = 3;
 const FRACTIONS_ONCE: [u16; 1] = [85];
 const FRACTIONS_TWICE: [u16; 2] = [72, 116];
 const FRACTIONS_THRICE: [u16; 3] = [40, 72, 116];
+
+/// In the finest level, where these are not among them, the others only in parts: low where light changes, high where
+/// there is most contrast.
+const FRACTIONS_IN_PARTS: [(u16, Where); 2] = [(56, Where::LightChanges), (116, Where::Strongest)];
 
 /// And where white is over-exposed: it spreads into the border from both sides and leaves little of it dark.
 const FRACTION_SATURATED: u16 = 195;
@@ -103,6 +125,11 @@ const FRACTION_DIM: u16 = 100;
 /// print in clear air, where there is such too. In the finest level it is not: weak tags beside clear contrast are found
 /// from twice the least size on.
 const AREA_OF_RUN: usize = 20;
+
+/// Pixels of the finest level for each run of dark ones from which an image with the contrast of print is one: gravel has
+/// half as many. Where runs are as many, so many tags that were found show a sheet of small ones.
+const AREA_OF_PRINT: usize = 24;
+const TAGS_OF_PRINT: usize = 6;
 
 /// The same by the share of a level that has such contrast, which is known before pixels are marked.
 const MOST_DIM: f32 = 0.25;
@@ -138,6 +165,8 @@ impl Detector {
             tried: Vec::new(),
             detections: Vec::new(),
             negative: GrayImage::default(),
+            runs: 0,
+            runs_of_level: 0,
             noise: 0.0,
         }
     }
@@ -173,10 +202,10 @@ impl Detector {
         if sides.iter().any(|s| !(1..=LARGEST_IMAGE_PX).contains(s)) {
             return;
         }
-        if self.families.iter().any(|f| !f.inverted) {
+        if self.families.iter().any(|f| !f.in_negative) {
             self.search(image, rim, false);
         }
-        if self.families.iter().any(|f| f.inverted) {
+        if self.families.iter().any(|f| f.in_negative) {
             let mut negative = std::mem::take(&mut self.negative);
             negate(image, &mut negative);
             self.search(negative.view(), rim, true);
@@ -194,8 +223,17 @@ impl Detector {
         } else {
             Base::Full
         };
-        self.pyramid.build(image, base, rim, 16, self.simd);
         self.noise = noise_sigma(image);
+        let is_print = self.search_from(image, base, rim, inverted);
+        // Sheets hold tags seen so much aslant that only the frame itself shows their cells, however large they are.
+        if is_print && base != Base::Full && rim == Rim::Kept {
+            self.search_from(image, Base::Full, rim, inverted);
+        }
+    }
+
+    /// Searches an image's levels from a base on; whether it shows print.
+    fn search_from(&mut self, image: ImageView<'_>, base: Base, rim: Rim, inverted: bool) -> bool {
+        self.pyramid.build(image, base, rim, 16, self.simd);
         let first = usize::from(base != Base::Full).min(self.pyramid.len() - 1);
         let last = (first + MOST_SEARCHED - 1).min(self.pyramid.len() - 1);
         let fractions = |n: usize| -> &[u16] {
@@ -210,14 +248,17 @@ impl Detector {
         for n in (first..=last).rev() {
             looks[n - first] = self.search_level(image, n, fractions(n), n == first, inverted);
         }
+        let is_sparse = self.runs_of_level * AREA_OF_PRINT <= self.bits.width * self.bits.height;
+        let is_print = looks[0].is_print() && (is_sparse || self.found.len() >= TAGS_OF_PRINT);
         // What touches others by a corner comes last: what is found without needs no second look. While tracking a region
         // is foretold, and has to be searched fast.
-        if rim == Rim::LeftOut {
-            return;
+        if rim == Rim::Kept {
+            for n in (first..=last).rev() {
+                let look = if is_print { looks[n - first] } else { looks[n - first].of_ground() };
+                self.search_parts(image, n, fractions(n), look, inverted);
+            }
         }
-        for n in (first..=last).rev() {
-            self.search_parts(image, n, fractions(n), looks[n - first], inverted);
-        }
+        is_print
     }
 
     /// Appearance for tags in a level; how their parts are to be looked at afterwards.
@@ -236,6 +277,13 @@ impl Detector {
             let at = if is_lower { Where::LightChanges } else { Where::Everywhere };
             self.search_division(image, n, (fraction, at, Touch::Corners), inverted);
         }
+        let runs = self.runs;
+        if finest {
+            for (fraction, at) in FRACTIONS_IN_PARTS.into_iter().filter(|(f, _)| !fractions.contains(f)) {
+                self.search_division(image, n, (fraction, at, Touch::Corners), inverted);
+            }
+        }
+        self.runs_of_level = runs;
         if self.binariser.is_saturated() {
             let division = (FRACTION_SATURATED, Where::Saturated, Touch::Corners);
             self.search_division(image, n, division, inverted);
@@ -298,7 +346,9 @@ impl Detector {
         let level = self.pyramid.level(image, n).image;
         self.binariser.mark(level, fraction, at, &mut self.bits, self.simd);
         let is_dim = at == Where::AboveNoise && !self.binariser.is_hazy();
-        if is_dim && self.bits.runs() * AREA_OF_RUN > level.width * level.height {
+        let most = if is_dim { level.width * level.height / AREA_OF_RUN } else { usize::MAX };
+        self.runs = self.bits.runs();
+        if !(1..=most).contains(&self.runs) {
             return;
         }
         self.search_regions(image, n, at, touch, inverted);
@@ -329,7 +379,7 @@ impl Detector {
             tried.push((n, quad));
             // Of a small tag a side may be drawn to what is beside it: then as it was.
             let tag = [straight, in_frame].iter().find_map(|quad| {
-                let mut families = families.iter().filter(|f| f.inverted == inverted);
+                let mut families = families.iter().filter(|f| f.in_negative == inverted);
                 families.find_map(|f| decode(image, pyramid, quad, f, refiner))
             });
             found.extend(tag);
@@ -390,14 +440,16 @@ fn unrefined(corners: &Quad) -> Refined {
     Refined { corners, corner_cov: [cov; 4], center, center_cov: cov / 2.0 }
 }
 
-/// Smallest that one tag inside another may not be, over the outer one: 48h12 leaves two of its ten cells free.
+/// From where on, over the outer one, a tag is no other inside it: 48h12 leaves two of its ten cells free.
 const NESTED: f32 = 0.5;
 
-/// Whether two quadrilaterals are of one tag, the first of one that was found: not one inside it.
+/// Whether two quadrilaterals are of one tag, the first of one that was found: neither one inside it nor one around it.
 fn same_place(a: &Quad, b: &Quad) -> bool {
     let centre = |q: &Quad| [0, 1].map(|k| q.iter().map(|p| p[k]).sum::<f32>() / 4.0);
     let size = |q: &Quad| distance(q[0], q[2]) + distance(q[1], q[3]);
-    distance(centre(a), centre(b)) < 0.2 * distance(a[0], a[2]) && size(b) > NESTED * size(a)
+    distance(centre(a), centre(b)) < 0.2 * distance(a[0], a[2])
+        && size(b) > NESTED * size(a)
+        && size(a) > NESTED * size(b)
 }
 
 fn detection(found: &Found) -> TagDetection {

@@ -7,7 +7,7 @@
 
 use windhover_base::msg::{FamilySpec, Form, TagFamily};
 
-/// How a tag is printed: its family, and how many cells wide its border is.
+/// How a tag is printed: its family, how many cells wide its border is, and whether it was turned over or negated.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct TagLayout {
     /// Family of the code words.
@@ -15,11 +15,16 @@ pub struct TagLayout {
     /// Width of the border, cells: 1 as the families' authors print it, 2 as Kalibr does. The corners are those of the
     /// border's outer square in either case.
     pub border: u8,
+    /// Left and right are exchanged: seen in a mirror or through the sheet's back. The corners are those of what is
+    /// seen: its top-left, then clockwise.
+    pub mirrored: bool,
+    /// Black and white are exchanged: print on dark ground, or as near infrared shows some inks.
+    pub inverted: bool,
 }
 
 impl From<TagFamily> for TagLayout {
     fn from(family: TagFamily) -> Self {
-        Self { family, border: 1 }
+        Self { family, border: 1, mirrored: false, inverted: false }
     }
 }
 
@@ -56,8 +61,10 @@ pub(super) struct Family {
     pub border: usize,
     /// Cells sampled around the border: 1, or more where data lie outside.
     pub pad: usize,
-    /// Whether the border is light inside a dark ring.
-    pub inverted: bool,
+    /// Whether the border is light inside a dark ring, so that the tag is looked for in the negative.
+    pub in_negative: bool,
+    /// Whether a set bit is dark in the image that is looked at.
+    set_is_dark: bool,
     /// Data cells (x, y), first in the word's top bit.
     pub cells: Vec<(i32, i32)>,
     codes: &'static [u64],
@@ -69,18 +76,23 @@ pub(super) struct Family {
 impl Family {
     /// The tables of a family; `max_hamming` is cut to what the family allows.
     pub fn new(layout: TagLayout, max_hamming: u8) -> Self {
-        let TagLayout { family, border } = layout;
-        let &FamilySpec { border: square, pad, form, inverted, correctable: limit, codes, .. } =
-            family.spec();
+        let TagLayout { family, border, mirrored, inverted } = layout;
+        let &FamilySpec {
+            border: square, pad, form, inverted: set_is_dark, correctable: limit, codes, ..
+        } = family.spec();
         let border = usize::from(border.max(1));
         let width = square + 2 * (border - 1);
-        let cells = data_cells(width, pad, border as i32, form);
+        let mut cells = data_cells(width, pad, border as i32, form);
+        if mirrored {
+            cells.iter_mut().for_each(|(x, _)| *x = width as i32 - 1 - *x);
+        }
         let turned = std::array::from_fn(|turns| {
             cells.iter().map(|&cell| grid_index(turn(cell, width, turns), width, pad)).collect()
         });
         let max_hamming = max_hamming.min(limit);
         let index = ChunkIndex::new(codes, cells.len(), max_hamming);
-        Self { family, width, border, pad, inverted, cells, codes, turned, index }
+        let in_negative = set_is_dark != inverted;
+        Self { family, width, border, pad, in_negative, set_is_dark, cells, codes, turned, index }
     }
 
     /// Cells on a side of the sampled grid.
@@ -88,10 +100,10 @@ impl Family {
         self.width + 2 * self.pad
     }
 
-    /// The bit of data cell `cell` of tag `id`: true for white in the (possibly inverted) image.
+    /// The bit of data cell `cell` of tag `id`: true for white in the image that is looked at.
     pub fn bit(&self, id: u32, cell: usize) -> bool {
         let bit = self.codes[id as usize] >> (self.cells.len() - 1 - cell) & 1 == 1;
-        bit != self.inverted
+        bit != self.set_is_dark
     }
 
     /// Most wrong bits that are corrected.
@@ -99,7 +111,7 @@ impl Family {
         self.index.max_hamming
     }
 
-    /// What cell (x, y) of the sampled grid of tag `id` is in the (possibly inverted) image.
+    /// What cell (x, y) of the sampled grid of tag `id` is in the image that is looked at.
     pub fn cell(&self, id: u32, x: i32, y: i32) -> Cell {
         let w = self.width as i32;
         match self.cells.iter().position(|&c| c == (x, y)) {
@@ -110,7 +122,7 @@ impl Family {
         }
     }
 
-    /// Whether cell (x, y) of tag `id` is light in the (possibly inverted) image: data, border (dark) or the
+    /// Whether cell (x, y) of tag `id` is light in the image that is looked at: data, border (dark) or the
     /// ring around it (light). `None` beyond the ring and where it is not known.
     pub fn is_light(&self, id: u32, x: i32, y: i32) -> Option<bool> {
         match self.cell(id, x, y) {
@@ -124,8 +136,9 @@ impl Family {
     pub fn find(&self, grid: &[bool]) -> Option<Word> {
         let mut best: Option<Word> = None;
         for (turns, order) in self.turned.iter().enumerate() {
-            let word =
-                order.iter().fold(0, |word, &i| word << 1 | u64::from(grid[usize::from(i)] != self.inverted));
+            let word = order
+                .iter()
+                .fold(0, |word, &i| word << 1 | u64::from(grid[usize::from(i)] != self.set_is_dark));
             if let Some((id, hamming)) = self.index.nearest(word, self.codes)
                 && best.is_none_or(|b| hamming < b.hamming)
             {

@@ -38,5 +38,5 @@ pub use pattern::{TagPattern, tag_pattern};
 pub use pose::{TagPose, TagPoses, tag_poses};
 pub use roi::Roi;
 pub use simd::Simd;
-pub use windhover_base::geo::CameraModel;
+pub use windhover_base::geo::{CameraModel, LensModel};
 pub use windhover_base::msg::{GrayImage, ImageView, TagFamily};

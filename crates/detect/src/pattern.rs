@@ -28,7 +28,8 @@ impl TagPattern {
 /// # Panics
 /// Where the family has no tag of this number.
 pub fn tag_pattern(layout: impl Into<TagLayout>, id: u32) -> TagPattern {
-    let tables = Family::new(layout.into(), 0);
+    let layout = layout.into();
+    let tables = Family::new(layout, 0);
     let (side, pad) = (tables.grid_side(), tables.pad as i32);
     let last = tables.width as i32 - 1;
     let mut white: Vec<bool> = (0..side * side)
@@ -37,11 +38,11 @@ pub fn tag_pattern(layout: impl Into<TagLayout>, id: u32) -> TagPattern {
             // The border is black in a white ring, or white in a black one.
             let in_square = (0..=last).contains(&x) && (0..=last).contains(&y);
             let is_free = matches!(tables.cell(id, x, y), Cell::Other);
-            is_free || in_square == tables.inverted
+            if is_free { !layout.inverted } else { in_square == tables.in_negative }
         })
         .collect();
     for (cell, (x, y)) in tables.cells.iter().enumerate() {
-        white[(y + pad) as usize * side + (x + pad) as usize] = tables.bit(id, cell) != tables.inverted;
+        white[(y + pad) as usize * side + (x + pad) as usize] = tables.bit(id, cell) != tables.in_negative;
     }
     TagPattern { border: tables.width, side, white }
 }

@@ -171,6 +171,7 @@ fn apply(pose: &Isometry3<f64>, step: &Vector6<f64>) -> Isometry3<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use windhover_base::geo::LensModel;
 
     fn camera() -> CameraModel {
         CameraModel {
@@ -178,6 +179,7 @@ mod tests {
             fy: 1022.1,
             cx: 645.7,
             cy: 527.7,
+            model: LensModel::Brown,
             distortion: [-0.179, 0.139, -0.001, 0.006, 0.0],
             skew: 0.0,
         }

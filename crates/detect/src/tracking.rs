@@ -11,6 +11,7 @@ use super::roi::Roi;
 use windhover_base::geo::CameraModel;
 use windhover_base::msg::{
     FrameObservations, FramePrediction, ImageView, MarkerDetection, MarkerId, MarkerPrediction, RgbImage,
+    TagFamily,
 };
 use windhover_base::settings::{DetectorConfig, MarkerConfig, MarkerKind, TargetConfig};
 
@@ -48,7 +49,7 @@ impl FrameDetector {
             .iter()
             .flat_map(|t| &t.marker)
             .filter(|m| m.kind == MarkerKind::Apriltag)
-            .filter_map(|m| Some(TagLayout { family: m.family?, border: m.border }))
+            .filter_map(|m| Some(layout_of(m.family?, m)))
             .collect();
         layouts.sort_unstable();
         layouts.dedup();
@@ -136,6 +137,11 @@ impl FrameDetector {
             }
         }
     }
+}
+
+/// How a marker of a family is printed.
+fn layout_of(family: TagFamily, m: &MarkerConfig) -> TagLayout {
+    TagLayout { family, border: m.border, mirrored: m.mirrored, inverted: m.inverted }
 }
 
 /// How far a vehicle reaches about each of its markers, in sizes of that marker.

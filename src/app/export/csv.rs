@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use prost::Message;
 
 use super::{ExportError, Exported, write_error};
+use crate::app::refine::RefinedBeside;
 use crate::io::mcap_read::{McapReader, RawMessage};
 use crate::io::new_file::NewFile;
 use crate::io::proto::host_time;
@@ -65,7 +66,8 @@ impl CsvTable {
     }
 }
 
-pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, ExportError> {
+pub(super) fn export(flight: &Path, mut reader: McapReader, out: &Path) -> Result<Exported, ExportError> {
+    let mut beside = RefinedBeside::of(flight);
     let with_covariance = format!("{ESTIMATE_COLUMNS}{COVARIANCE_COLUMNS}");
     let mut estimates = CsvTable::create(out, "estimates.csv", &with_covariance)?;
     let mut smoothed = CsvTable::create(out, "smoothed.csv", &with_covariance)?;
@@ -76,7 +78,7 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
     let mut ownship_rows: Vec<(i64, String)> = Vec::new();
     let mut datum: Option<Datum> = None;
     let mut damaged = Vec::new();
-    for message in reader.by_ref() {
+    for message in reader.by_ref().chain(beside.by_ref()) {
         let name = message.channel.topic.as_str();
         if name == topic::CAMERA_DETECTIONS {
             if let Some(seen) = decoded::<Detections>(&message, &mut damaged) {
@@ -104,6 +106,7 @@ pub(super) fn export(mut reader: McapReader, out: &Path) -> Result<Exported, Exp
     ownship_rows.sort_by_key(|(time, _)| *time);
     ownship_rows.iter().try_for_each(|(_, row)| ownship.row(row))?;
     let mut warnings = reader.take_warnings();
+    warnings.extend(beside.warning.take());
     warnings.extend(damaged);
     let mut exported = Exported { files: Vec::new(), warnings };
     let mut tables = vec![estimates, smoothed, paper, detections, ownship];

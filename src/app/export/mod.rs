@@ -90,7 +90,7 @@ pub fn export(flight: &Path, format: Format, out: &Path) -> Result<Exported, Exp
     let is_new = !out.exists();
     std::fs::create_dir_all(out).map_err(|source| write_error(out, source))?;
     let exported = match format {
-        Format::Csv => csv::export(reader, out)?,
+        Format::Csv => csv::export(flight, reader, out)?,
         Format::Geojson => geojson::export(reader, out)?,
         Format::Kml => kml::export(reader, out)?,
         Format::Rosbag2 => rosbag2::export(flight, out)?,

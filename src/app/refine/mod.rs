@@ -1,11 +1,13 @@
 //! Refinement after the flight: a recorded flight is estimated as a whole, and the result is written beside it.
 
 mod adopt;
+mod beside;
 mod outside;
 mod words;
 mod write;
 
 pub use adopt::adopted;
+pub use beside::RefinedBeside;
 pub use words::{ConstantWords, constant_words, source_name};
 
 use std::path::{Path, PathBuf};

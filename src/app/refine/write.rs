@@ -25,7 +25,8 @@ pub(super) fn write(done: &RefinedFlight, from: &Path, to: &Path) -> Result<(), 
             file.write(&record)?;
         }
         let schema = raw.channel.schema.name.as_str();
-        let picture = matches!(schema, "foxglove.CompressedImage" | "foxglove.RawImage");
+        let picture =
+            matches!(schema, "foxglove.CompressedImage" | "foxglove.RawImage" | "foxglove.CompressedVideo");
         if !picture && !topic::is_refined(&raw.channel.topic) {
             file.copy(&raw)?;
         }

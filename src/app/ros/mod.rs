@@ -95,6 +95,7 @@ impl RosTranslator {
         match name {
             topic::DATUM => self.datum(&wh::Datum::decode(data)?, log, out),
             topic::OWNSHIP => self.ownship(&wh::Ownship::decode(data)?, log, out),
+            topic::OWNSHIP_REFINED => self.ownship_refined(&wh::Ownship::decode(data)?, log, out),
             topic::GPS_EPOCH => self.fix(&wh::GnssEpoch::decode(data)?, log, out),
             topic::CAMERA_CALIBRATION => {
                 self.lens = Some(camera::lens(fox::CameraCalibration::decode(data)?))

@@ -119,33 +119,35 @@ fn ownship_covariance(own: &Ownship) -> Option<SMatrix<f64, 9, 9>> {
     })
 }
 
+/// The helicopter's place and motion, and whether its covariance is known.
+fn ownship_odometry(own: &Ownship) -> Option<(Odometry, bool)> {
+    let ned_from_body = nalgebra::Quaternion::new(own.qw, own.qx, own.qy, own.qz);
+    let ned_from_body = UnitQuaternion::try_new(ned_from_body, 1e-6).filter(|_| own.is_sound())?;
+    let velocity = Vector3::new(own.vn_mps, own.ve_mps, own.vd_mps);
+    let flu_from_ned = flu_from_frd() * ned_from_body.inverse();
+    let p = ownship_covariance(own);
+    let pose = p.as_ref().map_or_else(nothing_known, ownship_pose);
+    let matrix = flu_from_ned.to_rotation_matrix();
+    let twist = p.as_ref().map_or_else(nothing_known, |p| ownship_twist(p, &velocity, matrix.matrix()));
+    let odometry = Odometry {
+        header: Header::new(host_time(own.timestamp.as_ref()), MAP),
+        child_frame_id: BASE_LINK.into(),
+        position: Vector3::new(own.east_m, own.north_m, -own.down_m),
+        orientation: enu_from_ned() * ned_from_body * flu_from_frd(),
+        pose_covariance: rows(&pose),
+        linear: flu_from_ned * velocity,
+        angular: Vector3::zeros(),
+        twist_covariance: rows(&twist),
+    };
+    Some((odometry, p.is_some()))
+}
+
 impl RosTranslator {
     /// `/ownship/odometry`, `/ownship/imu` (attitude alone), `/ownship/fix`, `/tf`.
     pub(super) fn ownship(&mut self, own: &Ownship, log: MonoTime, out: &mut Vec<RosRecord>) {
-        let ned_from_body = nalgebra::Quaternion::new(own.qw, own.qx, own.qy, own.qz);
-        let Some(ned_from_body) = UnitQuaternion::try_new(ned_from_body, 1e-6).filter(|_| own.is_sound())
-        else {
-            return;
-        };
-        let t = host_time(own.timestamp.as_ref());
-        let position = Vector3::new(own.east_m, own.north_m, -own.down_m);
-        let orientation = enu_from_ned() * ned_from_body * flu_from_frd();
-        let velocity = Vector3::new(own.vn_mps, own.ve_mps, own.vd_mps);
-        let flu_from_ned = flu_from_frd() * ned_from_body.inverse();
-        let p = ownship_covariance(own);
-        let pose = p.as_ref().map_or_else(nothing_known, ownship_pose);
-        let matrix = flu_from_ned.to_rotation_matrix();
-        let twist = p.as_ref().map_or_else(nothing_known, |p| ownship_twist(p, &velocity, matrix.matrix()));
-        let odometry = Odometry {
-            header: Header::new(t, MAP),
-            child_frame_id: BASE_LINK.into(),
-            position,
-            orientation,
-            pose_covariance: rows(&pose),
-            linear: flu_from_ned * velocity,
-            angular: Vector3::zeros(),
-            twist_covariance: rows(&twist),
-        };
+        let Some((odometry, is_known)) = ownship_odometry(own) else { return };
+        let (t, position, orientation) = (odometry.header.stamp, odometry.position, odometry.orientation);
+        let pose = Matrix6::from_row_slice(&odometry.pose_covariance);
         out.push(RosRecord::new("/ownship/odometry", log, t, &odometry));
         let mut absent = [0.0; 9];
         absent[0] = -1.0;
@@ -166,10 +168,17 @@ impl RosTranslator {
             longitude: own.lon_deg,
             altitude: own.height_m,
             position_covariance: rows(&pose.fixed_view::<3, 3>(0, 0).into_owned()),
-            position_covariance_type: if p.is_some() { 3 } else { 0 },
+            position_covariance_type: if is_known { 3 } else { 0 },
         };
         out.push(RosRecord::new("/ownship/fix", log, t, &fix));
         transform(t, log, BASE_LINK, position, orientation, out);
+    }
+
+    /// `/ownship/odometry_refined`: the refined estimate.
+    pub(super) fn ownship_refined(&self, own: &Ownship, log: MonoTime, out: &mut Vec<RosRecord>) {
+        if let Some((odometry, _)) = ownship_odometry(own) {
+            out.push(RosRecord::new("/ownship/odometry_refined", log, odometry.header.stamp, &odometry));
+        }
     }
 
     /// `/target/NAME/odometry`, `…/fix`, `/tf` of the real-time state; of later estimates the odometry alone, under its

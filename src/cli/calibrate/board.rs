@@ -8,16 +8,17 @@ use crate::cli::out::outln;
 use crate::cli::{CliError, CliResult, place};
 use crate::io::new_file::Inputs;
 use crate::plot::MADE_BY;
-use windhover_calibrate::TagGrid;
+use windhover_calibrate::{CharucoBoard, TagGrid};
 use windhover_detect::tag_pattern;
 
-/// Draw a calibration target for printing, as SVG in real size: a chessboard, or a grid of tags.
+/// Draw a calibration target to print, as SVG in real size: a chessboard, one with tags in its white squares, or a grid of tags.
 ///
 /// Print it at 100 %, measure it with a ruler, and glue the sheet to something flat and stiff.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:
   windhover calibrate board --board 9x6 --square-m 0.025
-  windhover calibrate board --board 6x4 --tag-m 0.035 --gap-m 0.01 --out tags.svg")]
+  windhover calibrate board --board 6x4 --tag-m 0.035 --gap-m 0.01 --out tags.svg
+  windhover calibrate board --board 9x6 --square-m 0.03 --tag-m 0.022 --family aruco_4x4_50 --out charuco.svg")]
 pub(super) struct Args {
     #[command(flatten)]
     target: TargetArgs,
@@ -30,6 +31,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     place::check(&args.out, &Inputs::default(), &place::DRAWING)?;
     let drawing = match args.target.target()? {
         Target::Chessboard { board, square_m } => chessboard(board, square_m),
+        Target::Charuco(board) => charuco(&board),
         Target::Tags(grid) => tags(&grid)?,
     };
     place::write(&args.out, &drawing)?;
@@ -49,6 +51,36 @@ fn chessboard(board: Board, square_m: f64) -> String {
     let words =
         format!("{}x{} inner corners, squares of {edge} mm: print at 100 %", board.columns, board.rows);
     sheet(((columns + 2) as f64 * edge, (rows + 2) as f64 * edge), edge, &squares, &words)
+}
+
+/// The chessboard with tags, its margin one square, in millimetres.
+fn charuco(board: &CharucoBoard) -> String {
+    let (edge, tag) = (board.square_m * 1e3, board.tag_m * 1e3);
+    let mut cells = String::new();
+    for (x, y) in board.squares(true) {
+        let _ = write!(cells, "M{} {}h{edge}v{edge}h-{edge}z", (x + 1) as f64 * edge, (y + 1) as f64 * edge);
+    }
+    for (number, (x, y)) in board.squares(false).enumerate() {
+        let pattern = tag_pattern(board.family, number as u32);
+        let cell = tag / pattern.border as f64;
+        let ring = (pattern.side() - pattern.border) / 2;
+        let corner = |n: usize| (n + 1) as f64 * edge + 0.5 * (edge - tag);
+        for k in 0..pattern.border * pattern.border {
+            let (column, row) = (k % pattern.border, k / pattern.border);
+            if !pattern.white(column + ring, row + ring) {
+                let (left, top) = (corner(x) + column as f64 * cell, corner(y) + row as f64 * cell);
+                let _ = write!(cells, "M{left:.4} {top:.4}h{cell:.4}v{cell:.4}h-{cell:.4}z");
+            }
+        }
+    }
+    let words = format!(
+        "{}x{} inner corners, squares of {edge} mm, tags of {}, {tag} mm: print at 100 %",
+        board.columns,
+        board.rows,
+        board.family.name()
+    );
+    let span = |corners: usize| (corners + 3) as f64 * edge;
+    sheet((span(board.columns), span(board.rows)), edge, &cells, &words)
 }
 
 /// The grid with a white margin of half a tag, in millimetres.

@@ -12,8 +12,9 @@ use crate::io::new_file::Inputs;
 use crate::pixels;
 use crate::plot;
 use crate::plot::intrinsics::{coverage_advice, coverage_svg, per_view_svg, residuals_svg};
+use windhover_base::geo::{CameraModel, LensModel};
 use windhover_base::msg::GrayImage;
-use windhover_calibrate::intrinsics::{Intrinsics, PARAMETERS, Wanted, calibrate};
+use windhover_calibrate::intrinsics::{Intrinsics, Wanted, calibrate, parameters};
 use windhover_calibrate::{PlaneView, WINDOW_PX, find_corners};
 
 /// Calibrate the lens from photographs of a printed chessboard or grid of tags.
@@ -26,6 +27,7 @@ use windhover_calibrate::{PlaneView, WINDOW_PX, find_corners};
 #[command(after_help = "Examples:
   windhover calibrate intrinsics photos/*.png --board 9x6 --square-m 0.025 --plots plots
   windhover calibrate intrinsics photos/*.png --board 6x4 --tag-m 0.035 --gap-m 0.01
+  windhover calibrate intrinsics photos/*.png --board 9x6 --square-m 0.03 --tag-m 0.022 --family aruco_4x4_50
   windhover calibrate intrinsics photos/*.png --board 9x6 --square-m 0.025 --json")]
 pub(super) struct Args {
     /// Photographs of the board, all of the same size, taken with the same focus
@@ -37,7 +39,11 @@ pub(super) struct Args {
     /// own edges than to the next ones is used. The default is that of OpenCV's calibration
     #[arg(long, value_name = "PX", value_parser = positive, default_value_t = WINDOW_PX)]
     window: f64,
-    /// Keep the third radial term at zero
+    /// How the lens departs from a pinhole: `brown`, or `fisheye` (Kannala and Brandt, as OpenCV's fisheye) for lenses
+    /// that bend straight lines much
+    #[arg(long, value_name = "MODEL", value_parser = lens_model, default_value = "brown")]
+    model: LensModel,
+    /// Keep the third radial term of brown at zero
     #[arg(long)]
     no_k3: bool,
     /// Also estimate the skew of the pixel axes
@@ -49,6 +55,14 @@ pub(super) struct Args {
     /// One JSON object on standard output
     #[arg(long)]
     json: bool,
+}
+
+fn lens_model(text: &str) -> Result<LensModel, String> {
+    match text {
+        "brown" => Ok(LensModel::Brown),
+        "fisheye" => Ok(LensModel::Fisheye),
+        _ => Err("brown or fisheye".to_owned()),
+    }
 }
 
 /// The drawings.
@@ -74,7 +88,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     let used: Vec<&Photo> = photos.iter().filter(|p| p.found.is_ok()).collect();
     let views: Vec<PlaneView> = photos.iter().filter_map(|p| p.found.clone().ok()).collect();
     let (width, height) = (size.0 as f64, size.1 as f64);
-    let wanted = Wanted { k3: !args.no_k3, skew: args.skew };
+    let wanted = Wanted { model: args.model, k3: !args.no_k3, skew: args.skew };
     let result = calibrate(&views, width, height, wanted).map_err(CliError::failed)?;
     let names: Vec<&str> = used.iter().map(|p| p.name.as_str()).collect();
     if let Some(dir) = &args.plots {
@@ -137,6 +151,7 @@ fn read(path: &Path) -> Result<GrayImage, String> {
 fn corners_of(image: &GrayImage, target: Target, window_px: f64) -> Result<PlaneView, String> {
     let (Board { columns, rows }, square_m) = match target {
         Target::Chessboard { board, square_m } => (board, square_m),
+        Target::Charuco(board) => return board.find(image.view(), window_px).map_err(|e| e.to_string()),
         Target::Tags(grid) => return grid.find(image.view()).map_err(|e| e.to_string()),
     };
     let corners = find_corners(image.view(), columns, rows, window_px).map_err(|e| e.to_string())?;
@@ -164,7 +179,7 @@ fn draw(
 fn as_json(result: &Intrinsics, photos: &[Photo]) -> serde_json::Value {
     let c = &result.camera;
     let sigma: serde_json::Map<String, serde_json::Value> =
-        PARAMETERS.iter().zip(result.sigma).map(|(name, s)| ((*name).to_owned(), json!(s))).collect();
+        fitted(result).map(|(name, _, sigma)| (name.to_owned(), json!(sigma))).collect();
     let used = photos.iter().filter(|p| p.found.is_ok()).zip(&result.views);
     let images: Vec<_> = used.map(|(p, fit)| json!({"image": p.name, "rms_px": fit.rms_px})).collect();
     let refused: Vec<_> = photos
@@ -173,7 +188,8 @@ fn as_json(result: &Intrinsics, photos: &[Photo]) -> serde_json::Value {
         .collect();
     json!({
         "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy,
-        "distortion": c.distortion,
+        "model": c.model,
+        "distortion": terms(c),
         "skew": c.skew,
         "sigma": sigma,
         "rms_px": result.rms_px,
@@ -182,6 +198,22 @@ fn as_json(result: &Intrinsics, photos: &[Photo]) -> serde_json::Value {
         "images": images,
         "refused": refused,
     })
+}
+
+/// Name, value and sigma of every parameter that the model has.
+fn fitted(result: &Intrinsics) -> impl Iterator<Item = (&'static str, f64, f64)> {
+    let c = result.camera;
+    let values = [c.fx, c.fy, c.cx, c.cy].into_iter().chain(c.distortion).chain([c.skew]);
+    let named = parameters(c.model).into_iter().zip(values.zip(result.sigma));
+    named.filter(|(name, _)| !name.is_empty()).map(|(name, (value, sigma))| (name, value, sigma))
+}
+
+/// The distortion's terms that the model has.
+fn terms(camera: &CameraModel) -> &[f64] {
+    match camera.model {
+        LensModel::Brown => &camera.distortion,
+        LensModel::Fisheye => &camera.distortion[..4],
+    }
 }
 
 fn print_text(result: &Intrinsics, names: &[&str], views: &[PlaneView], size: (usize, usize)) -> CliResult {
@@ -193,8 +225,7 @@ fn print_text(result: &Intrinsics, names: &[&str], views: &[PlaneView], size: (u
         result.rms_px
     )?;
     outln!("parameter        value   one sigma")?;
-    let values = [c.fx, c.fy, c.cx, c.cy].into_iter().chain(c.distortion).chain([c.skew]).zip(result.sigma);
-    for (name, (value, sigma)) in PARAMETERS.iter().zip(values) {
+    for (name, value, sigma) in fitted(result) {
         if sigma > 0.0 {
             outln!("{name:<10} {value:>12.5} {sigma:>11.5}")?;
         } else {
@@ -208,10 +239,13 @@ fn print_text(result: &Intrinsics, names: &[&str], views: &[PlaneView], size: (u
     for advice in coverage_advice(result, views, size) {
         outln!("\n{advice}")?;
     }
-    let [k1, k2, p1, p2, k3] = c.distortion;
     outln!("\n[camera.intrinsics]")?;
+    if c.model == LensModel::Fisheye {
+        outln!("model = \"fisheye\"")?;
+    }
     outln!("fx = {:.5}\nfy = {:.5}\ncx = {:.5}\ncy = {:.5}", c.fx, c.fy, c.cx, c.cy)?;
-    outln!("distortion = [{k1:.6}, {k2:.6}, {p1:.6}, {p2:.6}, {k3:.6}]")?;
+    let terms: Vec<String> = terms(c).iter().map(|k| format!("{k:.6}")).collect();
+    outln!("distortion = [{}]", terms.join(", "))?;
     if c.skew != 0.0 {
         outln!("skew = {:.7}", c.skew)?;
     }

@@ -1,28 +1,29 @@
-//! The photographed target as arguments: a chessboard or a grid of tags.
+//! What was photographed: a chessboard, one with tags in its squares, or a grid of tags, as arguments.
 
 use std::str::FromStr;
 
 use crate::cli::CliError;
 use windhover_base::msg::TagFamily;
-use windhover_calibrate::TagGrid;
+use windhover_calibrate::{CharucoBoard, TagGrid};
 
 /// The calibration target.
 #[derive(clap::Args, Clone, Copy, Debug)]
 pub(super) struct TargetArgs {
-    /// Inner corners of a chessboard, columns x rows (10x7 squares have 9x6); with --tag-m, tags
+    /// Inner corners of a chessboard, columns x rows (10x7 squares have 9x6); with --gap-m, tags
     #[arg(long, value_name = "CxR")]
     board: Board,
     /// A chessboard: edge of one square, metres
     #[arg(long, value_name = "METRES", value_parser = positive, required_unless_present = "tag_m")]
     square_m: Option<f64>,
-    /// A grid of tags numbered from 0 row by row: edge of a tag's black square, metres
-    #[arg(long, value_name = "METRES", value_parser = positive, conflicts_with = "square_m", requires = "gap_m")]
+    /// Edge of a tag's black square, metres: with --gap-m of a grid of tags numbered from 0 row by row, with --square-m of
+    /// the tags in a chessboard's white squares (ChArUco, as OpenCV draws it)
+    #[arg(long, value_name = "METRES", value_parser = positive)]
     tag_m: Option<f64>,
-    /// Gap between one tag's black square and the next one's, metres
-    #[arg(long, value_name = "METRES", value_parser = positive, requires = "tag_m")]
+    /// White between one tag's black square and the next one's, metres
+    #[arg(long, value_name = "METRES", value_parser = positive, requires = "tag_m", conflicts_with = "square_m")]
     gap_m: Option<f64>,
     /// Family of the tags
-    #[arg(long, value_name = "FAMILY", default_value = "36h11", value_parser = family, requires = "tag_m")]
+    #[arg(long, value_name = "FAMILY", default_value = "36h11", requires = "tag_m")]
     family: TagFamily,
 }
 
@@ -36,6 +37,8 @@ pub(super) enum Target {
         /// Edge of a square, metres.
         square_m: f64,
     },
+    /// A chessboard with tags in its white squares.
+    Charuco(CharucoBoard),
     /// A grid of tags.
     Tags(TagGrid),
 }
@@ -46,13 +49,30 @@ impl TargetArgs {
         match (self.square_m, self.tag_m, self.gap_m) {
             (Some(square_m), None, _) => Ok(Target::Chessboard { board: self.board, square_m }),
             (None, Some(tag_m), Some(gap_m)) => {
-                if columns * rows > self.family.codes() {
-                    let (name, most) = (self.family.name(), self.family.codes());
-                    return Err(CliError::usage(format!("{columns}x{rows} tags: {name} has {most} only")));
-                }
+                self.check_tags(columns * rows)?;
                 Ok(Target::Tags(TagGrid { family: self.family, columns, rows, tag_m, gap_m }))
             }
-            _ => Err(CliError::usage("give --square-m for a chessboard, or --tag-m and --gap-m for tags")),
+            (Some(square_m), Some(tag_m), None) => {
+                if tag_m >= square_m {
+                    return Err(CliError::usage(
+                        "--tag-m must be less than --square-m: tags lie inside squares",
+                    ));
+                }
+                let board = CharucoBoard { family: self.family, columns, rows, square_m, tag_m };
+                self.check_tags(board.tags())?;
+                Ok(Target::Charuco(board))
+            }
+            _ => Err(CliError::usage(
+                "give --square-m for a chessboard, with --tag-m for one with tags, or --tag-m and --gap-m for tags",
+            )),
+        }
+    }
+
+    fn check_tags(&self, wanted: usize) -> Result<(), CliError> {
+        let (name, most) = (self.family.name(), self.family.codes());
+        match wanted <= most {
+            true => Ok(()),
+            false => Err(CliError::usage(format!("the board has {wanted} tags, {name} has {most} only"))),
         }
     }
 }
@@ -82,10 +102,4 @@ impl FromStr for Board {
 pub(super) fn positive(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|_| format!("{text:?} is not a number"))?;
     if value > 0.0 && value.is_finite() { Ok(value) } else { Err("must be above zero".into()) }
-}
-
-fn family(name: &str) -> Result<TagFamily, String> {
-    let known = || TagFamily::ALL.map(TagFamily::name).join(", ");
-    let found = TagFamily::ALL.into_iter().find(|f| f.name() == name);
-    found.ok_or_else(|| format!("unknown family; the families are {}", known()))
 }

@@ -5,12 +5,13 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 
 /// Sources of all types in the configuration.
-const SOURCES: [&str; 15] = [
+const SOURCES: [&str; 16] = [
     include_str!("../../config/mod.rs"),
     include_str!("../../config/daemon.rs"),
     include_str!("../../config/link.rs"),
     include_str!("../../config/log.rs"),
     include_str!("../../config/store.rs"),
+    include_str!("../../config/video.rs"),
     include_str!("../../../crates/base/src/settings/autopilot.rs"),
     include_str!("../../../crates/base/src/settings/estimator.rs"),
     include_str!("../../../crates/base/src/settings/framing.rs"),
@@ -27,7 +28,7 @@ const SOURCES: [&str; 15] = [
 const SHIPPED: &str = include_str!("../../../config/windhover.toml");
 
 /// Table and type of each section, in the order of the shipped configuration.
-const SECTIONS: [(&str, &str); 20] = [
+const SECTIONS: [(&str, &str); 21] = [
     ("gps", "GpsConfig"),
     ("compass", "CompassConfig"),
     ("autopilot", "AutopilotConfig"),
@@ -45,6 +46,7 @@ const SECTIONS: [(&str, &str); 20] = [
     ("store", "StoreConfig"),
     ("link", "LinkConfig"),
     ("mavlink", "MavlinkConfig"),
+    ("video", "VideoConfig"),
     ("log", "LogConfig"),
     ("daemon", "DaemonConfig"),
     ("power", "PowerConfig"),

@@ -11,7 +11,7 @@ use super::output_messages::{
 };
 use super::{Record, Schema, topic};
 use crate::io::proto::{foxglove as fox, timestamp, windhover as wh};
-use windhover_base::geo::rot_z;
+use windhover_base::geo::{LensModel, rot_z};
 use windhover_base::msg::{
     AttitudeSample, EstimatorOutput, FusionResult, GnssEpoch, Output, SensorReading, Stamped, TargetEstimate,
 };
@@ -30,13 +30,18 @@ pub struct DaemonFigures {
 /// Records at the start of every file: intrinsics and the camera's mount.
 pub fn opening(camera: &CameraConfig, t: MonoTime) -> Vec<Record> {
     let k = &camera.intrinsics;
+    // Foxglove's names, which ROS's readers know too.
+    let (distortion_model, terms) = match k.model {
+        LensModel::Brown => ("plumb_bob", &k.distortion[..]),
+        LensModel::Fisheye => ("kannala_brandt", &k.distortion[..4]),
+    };
     let calibration = fox::CameraCalibration {
         timestamp: Some(timestamp(t)),
         frame_id: "camera".into(),
         width: camera.width,
         height: camera.height,
-        distortion_model: "plumb_bob".into(),
-        d: k.distortion.to_vec(),
+        distortion_model: distortion_model.into(),
+        d: terms.to_vec(),
         k: vec![k.fx, k.fx * k.skew, k.cx, 0.0, k.fy, k.cy, 0.0, 0.0, 1.0],
         r: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         p: vec![k.fx, 0.0, k.cx, 0.0, 0.0, k.fy, k.cy, 0.0, 0.0, 0.0, 1.0, 0.0],

@@ -11,6 +11,8 @@ pub enum Schema {
     SourceEvent,
     /// `foxglove.CompressedImage`
     CompressedImage,
+    /// `foxglove.CompressedVideo`
+    CompressedVideo,
     /// `foxglove.RawImage`
     RawImage,
     /// `foxglove.LocationFix`
@@ -54,6 +56,7 @@ impl Schema {
             Self::SerialBytes => "windhover.SerialBytes",
             Self::SourceEvent => "windhover.SourceEvent",
             Self::CompressedImage => "foxglove.CompressedImage",
+            Self::CompressedVideo => "foxglove.CompressedVideo",
             Self::RawImage => "foxglove.RawImage",
             Self::LocationFix => "foxglove.LocationFix",
             Self::FrameTransform => "foxglove.FrameTransform",
@@ -76,10 +79,11 @@ impl Schema {
 
     /// The schema of that full name.
     pub fn named(name: &str) -> Option<Self> {
-        const ALL: [Schema; 20] = [
+        const ALL: [Schema; 21] = [
             Schema::SerialBytes,
             Schema::SourceEvent,
             Schema::CompressedImage,
+            Schema::CompressedVideo,
             Schema::RawImage,
             Schema::LocationFix,
             Schema::FrameTransform,

@@ -14,6 +14,8 @@ pub const COMPASS_ATTITUDE: &str = "/compass/attitude";
 pub const TF: &str = "/tf";
 /// Intrinsics.
 pub const CAMERA_CALIBRATION: &str = "/camera/calibration";
+/// The camera's picture as a film, where it is recorded.
+pub const CAMERA_VIDEO: &str = "/camera/video";
 /// Overlays for viewers.
 pub const CAMERA_ANNOTATIONS: &str = "/camera/annotations";
 /// Markers and features with all fields.

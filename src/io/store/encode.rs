@@ -85,7 +85,7 @@ pub(super) fn run(
         };
         let raw = match entry.value {
             Work::Event(event) => encode_event(&event, frames, shared, &mut channels),
-            Work::Record(record, number) => Some(channels.raw(&record, number, Weight::Small)),
+            Work::Record(record, number) => Some(channels.raw(&record, number, Weight::of(record.schema))),
             Work::State(name, blob) => {
                 let at = heard_ns.unwrap_or_else(|| unsigned(now()));
                 let data = state_message(&name, &blob).into();

@@ -139,8 +139,9 @@ impl StoreHandle {
     pub fn record(&self, record: Arc<Record>, number: Option<u32>) {
         let bytes = record.data.len() + 128;
         let (topic, log_ns) = (record.topic.clone(), encode::unsigned(record.log_time));
+        let weight = Weight::of(record.schema);
         let value = Work::Record(record, number);
-        self.intake.push(Entry { value, bytes, weight: Weight::Small, topic, log_ns });
+        self.intake.push(Entry { value, bytes, weight, topic, log_ns });
     }
 
     /// Stores a last known state under a name, for the next start: an opaque blob that should begin with a version. At

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use mcap::records::Channel;
 
 use super::format;
-use crate::io::records::{FRAME_NUMBER_KEY, IN_SEQUENCE};
+use crate::io::records::{FRAME_NUMBER_KEY, IN_SEQUENCE, Schema};
 
 /// Channel metadata key of records that are also queued for the ground station.
 pub const BACKFILL_KEY: &str = "windhover.backfill";
@@ -58,6 +58,13 @@ pub enum Weight {
     Frame,
     /// Anything else.
     Small,
+}
+
+impl Weight {
+    /// Of a record of that schema.
+    pub fn of(schema: Schema) -> Self {
+        if schema == Schema::CompressedVideo { Self::Frame } else { Self::Small }
+    }
 }
 
 /// One encoded message.

@@ -102,12 +102,33 @@ fn planes(gray: &GrayImage, rgb: Option<&RgbImage>, width: usize, height: usize)
     planes
 }
 
-/// The unit with its time as supplemental information (MISB ST 0604, "MISPmicrosectime") before its first slice;
-/// `is_utc` tells whether the time is locked to UTC.
-pub fn with_time(unit: &[u8], unix_us: u64, is_utc: bool) -> Vec<u8> {
+/// What ST 0603's status tells of a time.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub struct TimeStatus {
+    /// It is locked to UTC.
+    pub is_utc: bool,
+    /// It does not continue the one before: by so many microseconds, 0 where it does.
+    pub step_us: i64,
+}
+
+impl TimeStatus {
+    /// Bits 7 not locked, 6 discontinuity, 5 backward, the others one.
+    fn byte(self) -> u8 {
+        let locked = if self.is_utc { 0x1f } else { 0x9f };
+        let step = match self.step_us {
+            0 => 0,
+            1.. => 0x40,
+            _ => 0x60,
+        };
+        locked | step
+    }
+}
+
+/// The unit with its time as supplemental information (MISB ST 0604, "MISPmicrosectime") before its first slice.
+pub fn with_time(unit: &[u8], unix_us: u64, status: TimeStatus) -> Vec<u8> {
     let mut sei = vec![0, 0, 0, 1, 6, 5, 28];
     sei.extend_from_slice(b"MISPmicrosectime");
-    sei.push(if is_utc { 0x1f } else { 0x9f });
+    sei.push(status.byte());
     for (k, pair) in unix_us.to_be_bytes().chunks(2).enumerate() {
         if k > 0 {
             sei.push(0xff);
@@ -123,4 +144,19 @@ pub fn with_time(unit: &[u8], unix_us: u64, is_utc: bool) -> Vec<u8> {
 fn first_slice(unit: &[u8]) -> Option<usize> {
     let at = unit.windows(4).position(|w| w[..3] == [0, 0, 1] && matches!(w[3] & 0x1f, 1 | 5))?;
     Some(if at > 0 && unit[at - 1] == 0 { at - 1 } else { at })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_time_that_steps_says_so() {
+        let byte = |is_utc, step_us| TimeStatus { is_utc, step_us }.byte();
+        assert_eq!([byte(true, 0), byte(false, 0), byte(true, 7), byte(true, -7)], [0x1f, 0x9f, 0x5f, 0x7f]);
+        let picture = [0, 0, 0, 1, 9, 0xf0, 0, 0, 0, 1, 0x65, 1];
+        let unit = with_time(&picture, 0x0102_0304_0506_0708, TimeStatus::default());
+        assert_eq!((&unit[..6], &unit[unit.len() - 6..]), (&picture[..6], &picture[6..]));
+        assert_eq!(unit[29..41], [0x9f, 1, 2, 0xff, 3, 4, 0xff, 5, 6, 0xff, 7, 8]);
+    }
 }

@@ -2,7 +2,7 @@
 
 use crc::{CRC_32_MPEG_2, Crc};
 
-const PACKET: usize = 188;
+pub(super) const PACKET: usize = 188;
 const SYNC: u8 = 0x47;
 const PAT_PID: u16 = 0;
 const PMT_PID: u16 = 0x1000;

@@ -114,7 +114,7 @@ pub fn locate_with_covariance(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geo::{ImageTop, body_from_camera, ned_from_body_312, ned_from_body_321};
+    use crate::geo::{ImageTop, LensModel, body_from_camera, ned_from_body_312, ned_from_body_321};
 
     fn camera() -> CameraModel {
         CameraModel {
@@ -122,6 +122,7 @@ mod tests {
             fy: 1022.1,
             cx: 645.7,
             cy: 527.7,
+            model: LensModel::Brown,
             distortion: [-0.17892, 0.13875, -0.00128, 0.0056, 0.0],
             skew: 0.0,
         }
@@ -130,7 +131,15 @@ mod tests {
     #[test]
     fn errata_example_of_equation_12() {
         // P = (3, 4, −10), u = 0.2, level, camera axes along the body: X_G is 5.00.
-        let pinhole = CameraModel { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, distortion: [0.0; 5], skew: 0.0 };
+        let pinhole = CameraModel {
+            fx: 1.0,
+            fy: 1.0,
+            cx: 0.0,
+            cy: 0.0,
+            model: LensModel::Brown,
+            distortion: [0.0; 5],
+            skew: 0.0,
+        };
         let at = locate(
             &pinhole,
             &Vector3::new(3.0, 4.0, -10.0),

@@ -13,7 +13,7 @@ mod rotations;
 mod terrain;
 mod wgs84;
 
-pub use camera::{CameraModel, Projection};
+pub use camera::{CameraModel, LensModel, Projection};
 pub use declination::{DeclinationError, declination};
 pub use ground::Ground;
 pub use locate::{GroundPoint, LocateError, PoseSigmas, locate, locate_with_covariance};

@@ -49,6 +49,12 @@ pub struct MarkerConfig {
     /// Width of a tag's border, cells: 1 as printed by the authors of the families, 2 as by Kalibr.
     #[serde(default = "one_cell", skip_serializing_if = "is_one_cell")]
     pub border: u8,
+    /// Whether left and right of a tag are exchanged: seen in a mirror or through the sheet's back.
+    #[serde(default, skip_serializing_if = "is_not")]
+    pub mirrored: bool,
+    /// Whether black and white of a tag are exchanged.
+    #[serde(default, skip_serializing_if = "is_not")]
+    pub inverted: bool,
     /// Edge of a tag's black square, its whole border included, metres.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub size_m: Option<f64>,
@@ -70,6 +76,11 @@ pub struct MarkerConfig {
 
 fn one_cell() -> u8 {
     1
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes references")]
+fn is_not(flag: &bool) -> bool {
+    !flag
 }
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes references")]

@@ -2,7 +2,7 @@
 
 use windhover_base::msg::TagFamily;
 use windhover_base::settings::{Brightness, MarkerConfig, MarkerKind, TargetConfig, TargetModel};
-use windhover_detect::CameraModel;
+use windhover_detect::{CameraModel, LensModel};
 
 /// A disc half a metre above the ground and `ahead_m` before the rear axle: light, dark, or where neither is said,
 /// red.
@@ -12,6 +12,8 @@ pub fn disc(diameter_m: f64, brightness: Option<Brightness>, ahead_m: f64) -> Ma
         family: None,
         id: None,
         border: 1,
+        mirrored: false,
+        inverted: false,
         size_m: None,
         diameter_m: Some(diameter_m),
         brightness,
@@ -28,6 +30,8 @@ pub fn tag(id: u32) -> MarkerConfig {
         family: Some(TagFamily::Tag36h11),
         id: Some(id),
         border: 1,
+        mirrored: false,
+        inverted: false,
         size_m: Some(0.48),
         diameter_m: None,
         brightness: None,
@@ -45,5 +49,5 @@ pub fn target(marker: Vec<MarkerConfig>) -> TargetConfig {
 
 /// A lens without distortion.
 pub fn lens(focal: f64, (cx, cy): (f64, f64)) -> CameraModel {
-    CameraModel { fx: focal, fy: focal, cx, cy, distortion: [0.0; 5], skew: 0.0 }
+    CameraModel { fx: focal, fy: focal, cx, cy, model: LensModel::Brown, distortion: [0.0; 5], skew: 0.0 }
 }

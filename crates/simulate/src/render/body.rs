@@ -222,9 +222,15 @@ impl Plate {
         let (s, c) = (marker.yaw_deg.to_radians() as f32).sin_cos();
         let half = 0.5 * marker.size_m.or(marker.diameter_m).unwrap_or(0.0) as f32;
         let face = match (marker.kind, marker.family, marker.id) {
-            (MarkerKind::Apriltag, Some(family), Some(id)) => {
-                Face::Tag(tag_pattern(TagLayout { family, border: marker.border }, id))
-            }
+            (MarkerKind::Apriltag, Some(family), Some(id)) => Face::Tag(tag_pattern(
+                TagLayout {
+                    family,
+                    border: marker.border,
+                    mirrored: marker.mirrored,
+                    inverted: marker.inverted,
+                },
+                id,
+            )),
             _ => Face::Disc(disc_level(marker)),
         };
         Self { centre, top: (c, s), half, face }

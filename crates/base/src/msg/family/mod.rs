@@ -116,31 +116,31 @@ families! {
     /// 49 bits, 12 apart, round: 65 535 tags.
     Circle49h12, "circle49h12", &circle49h12::CODES, Round border 5 pad 3 inverted true correctable 3;
     /// ArUco, 36 bits, 12 apart: 250 tags.
-    Mip36h12, "mip_36h12", &mip36h12::CODES, Square border 8 pad 1 inverted false correctable 3;
+    Mip36h12, "aruco_mip_36h12", &mip36h12::CODES, Square border 8 pad 1 inverted false correctable 3;
     /// ArUco of OpenCV, 16 bits: the first 50 tags.
-    Aruco4x4N50, "4x4_50", aruco::CODES_4X4.split_at(50).0, Square border 6 pad 1 inverted false correctable 0;
+    Aruco4x4N50, "aruco_4x4_50", aruco::CODES_4X4.split_at(50).0, Square border 6 pad 1 inverted false correctable 0;
     /// ArUco of OpenCV, 16 bits: the first 100 tags.
-    Aruco4x4N100, "4x4_100", aruco::CODES_4X4.split_at(100).0, Square border 6 pad 1 inverted false correctable 0;
+    Aruco4x4N100, "aruco_4x4_100", aruco::CODES_4X4.split_at(100).0, Square border 6 pad 1 inverted false correctable 0;
     /// ArUco of OpenCV, 16 bits: the first 250 tags.
-    Aruco4x4N250, "4x4_250", aruco::CODES_4X4.split_at(250).0, Square border 6 pad 1 inverted false correctable 0;
+    Aruco4x4N250, "aruco_4x4_250", aruco::CODES_4X4.split_at(250).0, Square border 6 pad 1 inverted false correctable 0;
     /// ArUco of OpenCV, 16 bits: 1000 tags.
-    Aruco4x4N1000, "4x4_1000", aruco::CODES_4X4.split_at(1000).0, Square border 6 pad 1 inverted false correctable 0;
+    Aruco4x4N1000, "aruco_4x4_1000", aruco::CODES_4X4.split_at(1000).0, Square border 6 pad 1 inverted false correctable 0;
     /// ArUco of OpenCV, 25 bits: the first 50 tags.
-    Aruco5x5N50, "5x5_50", aruco::CODES_5X5.split_at(50).0, Square border 7 pad 1 inverted false correctable 1;
+    Aruco5x5N50, "aruco_5x5_50", aruco::CODES_5X5.split_at(50).0, Square border 7 pad 1 inverted false correctable 1;
     /// ArUco of OpenCV, 25 bits: the first 100 tags.
-    Aruco5x5N100, "5x5_100", aruco::CODES_5X5.split_at(100).0, Square border 7 pad 1 inverted false correctable 0;
+    Aruco5x5N100, "aruco_5x5_100", aruco::CODES_5X5.split_at(100).0, Square border 7 pad 1 inverted false correctable 0;
     /// ArUco of OpenCV, 25 bits: the first 250 tags.
-    Aruco5x5N250, "5x5_250", aruco::CODES_5X5.split_at(250).0, Square border 7 pad 1 inverted false correctable 0;
+    Aruco5x5N250, "aruco_5x5_250", aruco::CODES_5X5.split_at(250).0, Square border 7 pad 1 inverted false correctable 0;
     /// ArUco of OpenCV, 25 bits: 1000 tags.
-    Aruco5x5N1000, "5x5_1000", aruco::CODES_5X5.split_at(1000).0, Square border 7 pad 1 inverted false correctable 0;
+    Aruco5x5N1000, "aruco_5x5_1000", aruco::CODES_5X5.split_at(1000).0, Square border 7 pad 1 inverted false correctable 0;
     /// ArUco of OpenCV, 36 bits: the first 50 tags.
-    Aruco6x6N50, "6x6_50", aruco::CODES_6X6.split_at(50).0, Square border 8 pad 1 inverted false correctable 3;
+    Aruco6x6N50, "aruco_6x6_50", aruco::CODES_6X6.split_at(50).0, Square border 8 pad 1 inverted false correctable 3;
     /// ArUco of OpenCV, 36 bits: the first 100 tags.
-    Aruco6x6N100, "6x6_100", aruco::CODES_6X6.split_at(100).0, Square border 8 pad 1 inverted false correctable 3;
+    Aruco6x6N100, "aruco_6x6_100", aruco::CODES_6X6.split_at(100).0, Square border 8 pad 1 inverted false correctable 3;
     /// ArUco of OpenCV, 36 bits: the first 250 tags.
-    Aruco6x6N250, "6x6_250", aruco::CODES_6X6.split_at(250).0, Square border 8 pad 1 inverted false correctable 3;
+    Aruco6x6N250, "aruco_6x6_250", aruco::CODES_6X6.split_at(250).0, Square border 8 pad 1 inverted false correctable 3;
     /// ArUco of OpenCV, 36 bits: 1000 tags.
-    Aruco6x6N1000, "6x6_1000", aruco::CODES_6X6.split_at(1000).0, Square border 8 pad 1 inverted false correctable 2;
+    Aruco6x6N1000, "aruco_6x6_1000", aruco::CODES_6X6.split_at(1000).0, Square border 8 pad 1 inverted false correctable 2;
 }
 
 impl TagFamily {
@@ -204,6 +204,9 @@ mod tests {
             ("tagCustom48h12", TagFamily::Tag48h12),
             ("tagCircle21h7", TagFamily::Circle21h7),
             ("DICT_4X4_100", TagFamily::Aruco4x4N100),
+            ("4x4_50", TagFamily::Aruco4x4N50),
+            ("aruco_6x6_250", TagFamily::Aruco6x6N250),
+            ("aruco_mip_36h12", TagFamily::Mip36h12),
             ("5x5", TagFamily::Aruco5x5N1000),
             ("DICT_ARUCO_MIP_36h12", TagFamily::Mip36h12),
             ("DICT_APRILTAG_36h11", TagFamily::Tag36h11),
