@@ -1,12 +1,12 @@
 //! A lens that is not as configured.
 //!
-//! The errors of its distortion are states ([`own::LENS`]). That of k1 is open from the start, by as much as a calibration
+//! The errors of its first four distortion terms are states ([`own::LENS`]). That of k1 is open from the start, by as much as a calibration
 //! may be off; pixels that move through the picture show it within seconds. One that comes out beyond that is of another
 //! lens, or of none that was calibrated: then all four are open.
 
 use nalgebra::{Matrix2, Matrix2x4, Vector2};
 
-use windhover_base::geo::CameraModel;
+use windhover_base::geo::{CameraModel, LensModel};
 use windhover_base::msg::{FusionSource, MisfitCause};
 
 use super::blocks::{Block, own};
@@ -35,21 +35,28 @@ impl Models {
     }
 }
 
-/// ∂px/∂(k1, k2, p1, p2) at normalised undistorted coordinates.
+/// ∂px/∂(k1, k2, p1, p2), of a fisheye ∂px/∂(k1, k2, k3, k4), at normalised undistorted coordinates.
 pub(crate) fn d_lens(lens: &CameraModel, ray: &Vector2<f64>) -> Matrix2x4<f64> {
     let (x, y, r2) = (ray.x, ray.y, ray.norm_squared());
-    let both = 2.0 * x * y;
-    Matrix2::new(lens.fx, lens.fx * lens.skew, 0.0, lens.fy)
-        * Matrix2x4::new(
-            x * r2,
-            x * r2 * r2,
-            both,
-            r2 + 2.0 * x * x,
-            y * r2,
-            y * r2 * r2,
-            r2 + 2.0 * y * y,
-            both,
-        )
+    let by = match lens.model {
+        LensModel::Brown => {
+            let both = 2.0 * x * y;
+            Matrix2x4::from_columns(&[
+                ray * r2,
+                ray * (r2 * r2),
+                Vector2::new(both, r2 + 2.0 * y * y),
+                Vector2::new(r2 + 2.0 * x * x, both),
+            ])
+        }
+        LensModel::Fisheye => {
+            let r = r2.sqrt();
+            // Towards the axis all of them vanish.
+            let outwards = ray / r.max(f64::MIN_POSITIVE.sqrt());
+            let angle = r.atan();
+            Matrix2x4::from_columns(&[3, 5, 7, 9].map(|power| outwards * angle.powi(power)))
+        }
+    };
+    Matrix2::new(lens.fx, lens.fx * lens.skew, 0.0, lens.fy) * by
 }
 
 impl State {
@@ -102,5 +109,38 @@ impl Core {
         let (off, sigma) = (self.state.own.lens[0], self.state.cov.sigma(own::LENS, 0));
         let beyond = off.abs() > REPORTED.max(REPORTED_SIGMAS * sigma);
         beyond.then_some((FusionSource::Marker, MisfitCause::Lens, off))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_move_by_their_derivatives_with_either_lens() {
+        let brown = CameraModel {
+            fx: 900.0,
+            fy: 910.0,
+            cx: 640.0,
+            cy: 512.0,
+            distortion: [-0.18, 0.1, 0.001, -0.002, 0.0],
+            skew: 0.001,
+            model: LensModel::Brown,
+        };
+        let fisheye = CameraModel { model: LensModel::Fisheye, ..brown };
+        for lens in [brown, fisheye] {
+            for ray in [Vector2::new(0.4, -0.3), Vector2::new(-0.05, 0.2), Vector2::zeros()] {
+                for k in 0..4 {
+                    let by = |step: f64| {
+                        let mut moved = lens;
+                        moved.distortion[k] += step;
+                        moved.pixel_of(ray).0
+                    };
+                    let found = (by(1e-5) - by(-1e-5)) / 2e-5;
+                    let error = (found - d_lens(&lens, &ray).column(k)).norm();
+                    assert!(error < 1e-4 * (1.0 + found.norm()), "{ray}, term {k}: {error}");
+                }
+            }
+        }
     }
 }

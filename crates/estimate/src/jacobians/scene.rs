@@ -146,7 +146,6 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
     own.gps_delay_s = within(most::DELAY_S);
     own.drag_per_s = 0.2 + within(0.2);
     own.compass_delay_s = within(most::COMPASS_DELAY_S);
-    own.readout_s = within(0.002);
     own.lens = Vector4::new(within(0.1), within(0.1), within(0.005), within(0.005));
     own.arm = Vector2::new(within(0.3), within(0.3));
     own.ned_from_body = ned_from_body_321(within(3.1), within(0.2), within(0.2));

@@ -100,18 +100,35 @@ fn another_clock_that_is_late_is_not_taken_for_the_cameras() {
 }
 
 #[test]
-fn a_rolling_shutter_that_is_told_costs_little() {
-    let (whole, told, untold) =
-        (errors("follow"), errors("follow+told-readout=25"), errors("follow+readout=25"));
-    for (k, what) in ["heading", "speed"].into_iter().enumerate() {
-        assert!(
-            told[k] < 1.3 * whole[k],
-            "{what}: {} told, {} where all rows are exposed together",
-            told[k],
-            whole[k]
-        );
+fn a_rolling_shutter_costs_little_configured_or_not() {
+    let whole = errors("follow");
+    for described in ["follow+told-readout=25", "follow+readout=25"] {
+        let rolling = errors(described);
+        for (k, what) in ["heading", "speed"].into_iter().enumerate() {
+            assert!(
+                rolling[k] < 1.3 * whole[k],
+                "{described}: {what} {} for {} where all rows are exposed together",
+                rolling[k],
+                whole[k]
+            );
+        }
     }
-    assert!(untold[1] > 1.5 * told[1], "speed: {} untold, {} told", untold[1], told[1]);
+}
+
+#[test]
+fn the_time_from_first_row_to_last_is_found_out_where_it_is_not_as_configured() {
+    let found = |described: &str| {
+        let (_, out) = flown(described, 12.0, 3);
+        out.iter().rev().find_map(|output| match output {
+            EstimatorOutput::Misfit(misfit) if misfit.cause == MisfitCause::Readout => Some(misfit.figure),
+            _ => None,
+        })
+    };
+    let readout_s = found("follow+readout=25").expect("it is reported");
+    assert!((readout_s - 0.025).abs() < 0.002, "{readout_s}");
+    for fits in ["follow", "follow+told-readout=25", "hover20", "follow+camera-late=20"] {
+        assert_eq!(found(fits), None, "{fits}");
+    }
 }
 
 #[test]
