@@ -53,7 +53,7 @@ fn a_port_that_another_program_holds_is_taken_when_it_is_free() {
     let held = serialport::TTYPort::open(&serialport::new(path, 38_400)).expect("opened");
     let daemon = bench.start();
     let (line, _) = daemon.wait(&["event=device_down", "about=gps", "fault=busy"]);
-    assert!(line.contains("another program uses it"), "{line}");
+    assert!(line.contains("another program uses the port"), "{line}");
     daemon.wait(&["event=not_ready", "gps"]);
     drop(held);
     let feeder = Feeder::start(gps, compass);

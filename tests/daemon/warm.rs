@@ -114,7 +114,7 @@ fn a_card_that_does_not_tell_what_was_known_is_told_and_not_waited_for() {
     // Then the daemon reports that, and continues.
     let daemon = bench.start();
     let (line, seen) = daemon.wait(&["event=warm_start"]);
-    assert!(line.contains("begins anew"), "{line}");
+    assert!(line.contains("without an earlier state"), "{line}");
     daemon.wait_from(seen, &["event=ready"]);
     // And when the index is free, it is used.
     drop(held);
