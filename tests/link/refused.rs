@@ -82,7 +82,7 @@ async fn a_payload_that_calls_itself_a_station() {
     let settings = station_settings(files, None);
     let recall = std::sync::Arc::new(|_: &str, _: &str, _: u32| Default::default());
     let error = windhover::io::link::StationLink::open(&settings, recall).err().expect("refused");
-    assert!(error.to_string().contains("payload's certificate"), "{error}");
+    assert!(error.to_string().contains("the certificate of a payload, not of a station"), "{error}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
