@@ -102,7 +102,7 @@ fn hovering_still_says_what_it_cannot_tell() {
     scenario.duration_s = 30.0;
     let (found, _) = fly(scenario, 1);
     assert!(found.camera_to_compass[0].sigma > 0.2, "{:?}", found.camera_to_compass[0]);
-    assert!(found.advice().iter().any(|a| a.contains("to and fro")), "{:?}", found.advice());
+    assert!(found.advice().iter().any(|a| a.contains("in two directions")), "{:?}", found.advice());
 }
 
 #[test]
