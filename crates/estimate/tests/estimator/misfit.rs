@@ -366,7 +366,7 @@ fn a_vehicle_that_sways_on_its_springs_is_no_worse_than_its_sway() {
 #[test]
 fn a_lens_whose_distortion_is_left_out_is_found_out() {
     let lens = |out: &[EstimatorOutput]| {
-        told(out).into_iter().filter(|(cause, _)| *cause == MisfitCause::Lens).last()
+        told(out).into_iter().rfind(|(cause, _)| *cause == MisfitCause::Lens)
     };
     for scenario in ["follow", "circle20"] {
         let (world, out) = flown(scenario, 25.0, 3);
@@ -385,7 +385,7 @@ fn a_lens_whose_distortion_is_left_out_is_found_out() {
 #[test]
 fn an_antenna_that_is_elsewhere_is_found_out() {
     let antenna = |out: &[EstimatorOutput]| {
-        told(out).into_iter().filter(|(cause, _)| *cause == MisfitCause::AntennaPlace).last()
+        told(out).into_iter().rfind(|(cause, _)| *cause == MisfitCause::AntennaPlace)
     };
     let (world, out) = flown("follow", 40.0, 3);
     let twin = score(&estimates(&out), &world, 6.0);
