@@ -86,12 +86,12 @@ class Wire:
 
 
 def lines(path):
-    """(live records a second, kept, missing) of each line the station printed."""
+    """(live records a second, stored, missing) of each line the station printed."""
     found = []
     for line in path.read_text().splitlines():
-        if "/s live" in line and " kept, " in line:
+        if "/s live" in line and " stored, " in line:
             live = int(line.split("/s live")[0].rsplit(" ", 1)[1])
-            kept, missing = line.rsplit("| ", 1)[1].split(" kept, ")
+            kept, missing = line.rsplit("| ", 1)[1].split(" stored, ")
             found.append((live, int(kept), int(missing.split()[0])))
     return found
 
