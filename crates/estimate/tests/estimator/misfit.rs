@@ -365,9 +365,8 @@ fn a_vehicle_that_sways_on_its_springs_is_no_worse_than_its_sway() {
 
 #[test]
 fn a_lens_whose_distortion_is_left_out_is_found_out() {
-    let lens = |out: &[EstimatorOutput]| {
-        told(out).into_iter().rfind(|(cause, _)| *cause == MisfitCause::Lens)
-    };
+    let lens =
+        |out: &[EstimatorOutput]| told(out).into_iter().rfind(|(cause, _)| *cause == MisfitCause::Lens);
     for scenario in ["follow", "circle20"] {
         let (world, out) = flown(scenario, 25.0, 3);
         let twin = score(&estimates(&out), &world, 6.0);
