@@ -15,6 +15,8 @@ use super::state::State;
 const LEAST_S: f64 = 0.004;
 const WELL_KNOWN_S: f64 = 0.005;
 const SIGMAS: f64 = 5.0;
+/// Share of the compass's time by which the receiver's may differ, beside its sigma.
+const AGREES: f64 = 0.3;
 /// Less than this is not reported, s: exposure times and drivers have as much.
 const LEAST_REPORTED_S: f64 = 0.01;
 
@@ -31,7 +33,7 @@ impl Core {
         // The receiver must agree with the compass, and its delay be known well enough: two that are early by different
         // times have latencies that are not as configured.
         let spread_s = state.cov.sigma(own::GPS_DELAY, 0);
-        let agrees = receiver_s > 0.5 * late_s && receiver_s < 1.5 * late_s + 2.0 * spread_s;
+        let agrees = (receiver_s - late_s).abs() < AGREES * late_s + spread_s;
         let witnessed = agrees && spread_s < 0.5 * late_s;
         if known && witnessed {
             self.state.move_camera_clock(late_s);
