@@ -172,18 +172,13 @@ mod tests {
     use super::*;
     use crate::WINDOW_PX;
     use crate::intrinsics::{Wanted, calibrate};
-    use windhover_base::geo::{CameraModel, LensModel, ned_from_body_321};
+    use crate::photographed_sheet::{self, camera};
+    use windhover_base::geo::{LensModel, ned_from_body_321};
     use windhover_base::msg::GrayImage;
     use windhover_detect::{TagPattern, tag_pattern};
 
     const BOARD: CharucoBoard =
         CharucoBoard { family: TagFamily::Aruco4x4N50, columns: 7, rows: 5, square_m: 0.03, tag_m: 0.022 };
-
-    fn camera() -> CameraModel {
-        let distortion = [-0.2, 0.05, 0.0005, -0.0005, 0.0];
-        let model = LensModel::Brown;
-        CameraModel { fx: 640.0, fy: 636.0, cx: 324.0, cy: 238.0, model, distortion, skew: 0.0 }
-    }
 
     /// Light at a point of the board, metres from its outer corner.
     fn is_dark(at: Vector2<f64>, patterns: &[(usize, usize, TagPattern)]) -> bool {
@@ -216,22 +211,9 @@ mod tests {
         let camera = camera();
         let rotation: Rotation3<f64> = ned_from_body_321(yaw, pitch, roll);
         let translation = Vector3::new(shift.0, shift.1, 0.36) - rotation * Vector3::new(0.12, 0.09, 0.0);
-        let mut image = GrayImage::new(640, 480);
-        for v in 0..480 {
-            for u in 0..640 {
-                let mut light = 0.0;
-                for k in 0..16 {
-                    let aside = |n: usize| 0.4 * (n as f64 - 1.5);
-                    let px = Vector2::new(u as f64 + aside(k % 4), v as f64 + aside(k / 4));
-                    let m = camera.normalised(px).expect("inside the lens");
-                    let ray = rotation.inverse() * m.push(1.0);
-                    let origin = rotation.inverse() * -translation;
-                    let at = origin - ray * (origin.z / ray.z);
-                    light += if is_dark(at.xy(), &patterns) { 30.0 } else { 220.0 };
-                }
-                image.data[v * 640 + u] = (light / 16.0) as u8;
-            }
-        }
+        let image = photographed_sheet::photograph(&rotation, &translation, &[-0.6, -0.2, 0.2, 0.6], |at| {
+            is_dark(at, &patterns)
+        });
         let truth = (0..35).map(|k| {
             let at = Vector3::new((k % 7 + 1) as f64, (k / 7 + 1) as f64, 0.0) * BOARD.square_m;
             camera.project(&(rotation * at + translation)).expect("in front").px

@@ -12,6 +12,8 @@ mod grid;
 pub mod intrinsics;
 mod least_squares;
 pub mod montecarlo;
+#[cfg(test)]
+mod photographed_sheet;
 mod saddle;
 mod spread;
 mod subpixel;

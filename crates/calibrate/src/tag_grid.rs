@@ -126,7 +126,8 @@ mod tests {
 
     use super::*;
     use crate::intrinsics::{Wanted, calibrate};
-    use windhover_base::geo::{CameraModel, LensModel, ned_from_body_321};
+    use crate::photographed_sheet::{self, camera};
+    use windhover_base::geo::{LensModel, ned_from_body_321};
     use windhover_base::msg::GrayImage;
     use windhover_detect::{TagPattern, tag_pattern};
 
@@ -135,19 +136,6 @@ mod tests {
 
     static PATTERNS: LazyLock<Vec<TagPattern>> =
         LazyLock::new(|| (0..20).map(|id| tag_pattern(GRID.family, id)).collect());
-
-    fn camera() -> CameraModel {
-        let distortion = [-0.2, 0.05, 0.0005, -0.0005, 0.0];
-        CameraModel {
-            fx: 640.0,
-            fy: 636.0,
-            cx: 324.0,
-            cy: 238.0,
-            model: LensModel::Brown,
-            distortion,
-            skew: 0.0,
-        }
-    }
 
     /// Whether the sheet is dark at a point; with `from_below` numbers count from the bottom row up.
     fn is_dark(at: Vector2<f64>, from_below: bool) -> bool {
@@ -167,27 +155,12 @@ mod tests {
     }
 
     fn photograph(yaw: f64, pitch: f64, roll: f64, shift: Vector2<f64>, from_below: bool) -> GrayImage {
-        let camera = camera();
         let rotation = ned_from_body_321(yaw, pitch, roll);
         let middle = Vector3::new(0.124, 0.098, 0.0);
         let translation = Vector3::new(shift.x, shift.y, 0.44) - rotation * middle;
-        let mut image = GrayImage::new(640, 480);
-        for v in 0..480 {
-            for u in 0..640 {
-                let mut light = 0.0;
-                for k in 0..9 {
-                    let aside = |n: usize| 0.5 * (n as f64 - 1.0);
-                    let px = Vector2::new(u as f64 + aside(k % 3), v as f64 + aside(k / 3));
-                    let m = camera.normalised(px).expect("inside the lens");
-                    let ray = rotation.inverse() * m.push(1.0);
-                    let origin = rotation.inverse() * -translation;
-                    let at = origin - ray * (origin.z / ray.z);
-                    light += if is_dark(at.xy(), from_below) { 30.0 } else { 220.0 };
-                }
-                image.data[v * 640 + u] = (light / 9.0) as u8;
-            }
-        }
-        image
+        photographed_sheet::photograph(&rotation, &translation, &[-0.5, 0.0, 0.5], |at| {
+            is_dark(at, from_below)
+        })
     }
 
     #[test]

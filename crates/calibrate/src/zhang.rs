@@ -102,16 +102,7 @@ pub(super) fn pose_through(view: &PlaneView, camera: &CameraModel) -> Option<Pla
         Some((*p, ray))
     });
     let (plane_m, px) = rays.unzip();
-    let unit = CameraModel {
-        fx: 1.0,
-        fy: 1.0,
-        cx: 0.0,
-        cy: 0.0,
-        model: LensModel::Brown,
-        distortion: [0.0; 5],
-        skew: 0.0,
-    };
-    pose_of(&homography(&PlaneView { plane_m, px })?, &unit)
+    pose_of(&homography(&PlaneView { plane_m, px })?, &CameraModel::UNIT)
 }
 
 /// Solves `h1ᵀ B h2 = 0` and `h1ᵀ B h1 = h2ᵀ B h2` for `B = K⁻ᵀ K⁻¹` in pixels centred on `middle` and

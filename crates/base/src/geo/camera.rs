@@ -67,6 +67,10 @@ pub struct Projection {
 }
 
 impl CameraModel {
+    /// A pinhole whose pixels are normalised coordinates.
+    pub const UNIT: Self =
+        Self { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, model: LensModel::Brown, distortion: [0.0; 5], skew: 0.0 };
+
     /// Distorted normalised coordinates of undistorted ones, and the derivative.
     pub fn distort(&self, m: Vector2<f64>) -> (Vector2<f64>, Matrix2<f64>) {
         match self.model {

@@ -131,17 +131,8 @@ mod tests {
     #[test]
     fn errata_example_of_equation_12() {
         // P = (3, 4, −10), u = 0.2, level, camera axes along the body: X_G is 5.00.
-        let pinhole = CameraModel {
-            fx: 1.0,
-            fy: 1.0,
-            cx: 0.0,
-            cy: 0.0,
-            model: LensModel::Brown,
-            distortion: [0.0; 5],
-            skew: 0.0,
-        };
         let at = locate(
-            &pinhole,
+            &CameraModel::UNIT,
             &Vector3::new(3.0, 4.0, -10.0),
             &ned_from_body_312(0.0, 0.0, 0.0),
             Vector2::new(0.2, 0.0),

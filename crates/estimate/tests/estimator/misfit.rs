@@ -322,7 +322,8 @@ fn a_receiver_that_wanders_farther_than_configured_is_found_out() {
         let squares: Vec<f64> = late
             .map(|e| {
                 let (state, truth) = (e.state.expect("tracked"), world.vehicle(0, e.t_valid));
-                let covariance = state.covariance.expect("told").fixed_view::<2, 2>(0, 0).into_owned();
+                let covariance =
+                    state.covariance.expect("a covariance").fixed_view::<2, 2>(0, 0).into_owned();
                 let error = Vector2::new(state.north_m - truth.north_m, state.east_m - truth.east_m);
                 error.dot(&(covariance.try_inverse().expect("positive definite") * error))
             })
