@@ -85,6 +85,11 @@ impl Displacements {
         let [fast, slow] = [self.fast_m - self.mean_m[0], self.slow_m - self.mean_m[1]];
         let now = [fast * fast, slow * slow, self.expected_var];
         self.energy.iter_mut().zip(now).for_each(|(mean, x)| *mean += share * (x - *mean));
+        self.is_judged()
+    }
+
+    /// Whether they were taken for long enough.
+    fn is_judged(&self) -> bool {
         self.taken_s >= JUDGED_S
     }
 
@@ -127,7 +132,7 @@ impl Sway {
 
     /// Whether it was seen for long enough to be judged.
     pub(crate) fn is_judged(&self) -> bool {
-        self.displaced.iter().all(|displaced| displaced.taken_s >= JUDGED_S)
+        self.displaced.iter().all(Displacements::is_judged)
     }
 
     /// Standard deviation of its markers' displacement, m; `None` where it was not seen to sway.
