@@ -86,7 +86,7 @@ pub(crate) mod own {
     pub(crate) const TILT_GAIN: Block<1> = Block::after(HEADING_BIAS);
     /// Tilt bias (pitch, roll), rad.
     pub(crate) const TILT_BIAS: Block<2> = Block::after(TILT_GAIN);
-    /// How much older GPS is than configured, s.
+    /// How much older positions of the receiver are than configured, s.
     pub(crate) const GPS_DELAY: Block<1> = Block::after(TILT_BIAS);
     /// Drag: acceleration per metre a second over the ground, 1/s. What the wind adds is [`WIND`].
     pub(crate) const DRAG: Block<1> = Block::after(GPS_DELAY);
@@ -102,8 +102,11 @@ pub(crate) mod own {
     /// How much longer than configured the camera takes from its first row to its last, s.
     pub(crate) const READOUT: Block<1> = Block::after(LENS);
 
+    /// How much older the receiver's velocity is than its position, s.
+    pub(crate) const VELOCITY_DELAY: Block<1> = Block::after(READOUT);
+
     /// Constant error of the gyros, body axes, rad/s. From here on only where there is an IMU.
-    pub(crate) const RATE_BIAS: Block<3> = Block::after(READOUT);
+    pub(crate) const RATE_BIAS: Block<3> = Block::after(VELOCITY_DELAY);
     /// Constant error of the accelerometers, body axes, m/s².
     pub(crate) const FORCE_BIAS: Block<3> = Block::after(RATE_BIAS);
     /// Heading bias of the second source of attitude, rad. From here on only where there is one.
@@ -118,7 +121,7 @@ pub(crate) mod own {
     /// What has intensities that are fitted in flight: rate, gusts, thrust, error of the tilt reading.
     pub(crate) const MOTION: Block<{ TILT_ERROR.end() - ATTITUDE.end() }> = Block::from_start_of(RATE);
     /// Length of the helicopter's part with GPS and compass only, with an IMU, and with a second source of attitude.
-    pub(crate) const LEN: usize = READOUT.end();
+    pub(crate) const LEN: usize = VELOCITY_DELAY.end();
     pub(crate) const WITH_IMU: usize = FORCE_BIAS.end();
     pub(crate) const WITH_SECOND: usize = SECOND_TILT_ERROR.end();
     /// What moves by itself, forces and slow errors: the table of `own.rs`.

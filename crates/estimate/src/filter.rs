@@ -262,9 +262,9 @@ impl Estimator {
         Some(self.carried.ownship(&self.core.models, None, t))
     }
 
-    /// How much older GPS is than configured, as learnt so far, seconds.
+    /// How much older the receiver's velocity is than configured, as learnt so far, seconds: what motion shows best.
     pub fn gps_delay_s(&self) -> f64 {
-        self.core.state.own.gps_delay_s
+        self.core.state.own.velocity_age_s()
     }
 
     /// One line on what the filter believes of the sensors and of the intensities of motion.
@@ -275,7 +275,7 @@ impl Estimator {
             l.target_q.iter().map(|q| format!("{:.3}/{:.3}", q[0].sqrt(), q[1].sqrt())).collect();
         format!(
             "heading bias {:.2}±{:.2} deg, tilt felt {:?} (slope {:.2}) gain {:.2}±{:.2} error {:.2},{:.2}±{:.2} deg \
-             bias {:.2},{:.2}±{:.2} deg, trim {:.1},{:.1}±{:.1} deg, wind {:.2},{:.2}±{:.2} m/s2, drag {:.2}±{:.2}, delay {:.0}±{:.0} ms, compass {:.1}±{:.1} ms, camera {:.1} ms, \
+             bias {:.2},{:.2}±{:.2} deg, trim {:.1},{:.1}±{:.1} deg, wind {:.2},{:.2}±{:.2} m/s2, drag {:.2}±{:.2}, delay {:.0}±{:.0} and {:.0}±{:.0} ms, compass {:.1}±{:.1} ms, camera {:.1} ms, \
              sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} gust {:.2} thrust {:.2} targets {} pixels {:.2?} {:.2} tags {}",
             own.heading_bias.to_degrees(),
             cov.sigma(own::HEADING_BIAS, 0).to_degrees(),
@@ -299,6 +299,8 @@ impl Estimator {
             cov.sigma(own::DRAG, 0),
             own.gps_delay_s * 1e3,
             cov.sigma(own::GPS_DELAY, 0) * 1e3,
+            own.velocity_delay_s * 1e3,
+            cov.sigma(own::VELOCITY_DELAY, 0) * 1e3,
             own.compass_delay_s * 1e3,
             cov.sigma(own::COMPASS_DELAY, 0) * 1e3,
             self.core.state.camera_late_s * 1e3,

@@ -144,6 +144,7 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
     own.tilt_gain = 0.6 + within(0.5);
     own.tilt_bias = Vector2::new(within(0.02), within(0.02));
     own.gps_delay_s = within(most::DELAY_S);
+    own.velocity_delay_s = within(most::DELAY_S);
     own.drag_per_s = 0.2 + within(0.2);
     own.compass_delay_s = within(most::COMPASS_DELAY_S);
     own.lens = Vector4::new(within(0.1), within(0.1), within(0.005), within(0.005));
