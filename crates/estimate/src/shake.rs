@@ -152,7 +152,7 @@ impl Shake {
 
 impl State {
     /// Before a frame: displacements of their own.
-    fn begin_shake(&mut self, readout_s: f64) {
+    pub(crate) fn begin_shake(&mut self, readout_s: f64) {
         let shake = &mut self.shake;
         shake.length = (CORRELATION_S / readout_s.abs().max(1e-4)).clamp(LENGTHS.0, LENGTHS.1);
         let kernel = shake.kernel();

@@ -240,9 +240,7 @@ impl State {
             add(&mut target.mean, &dx[layout.target(i).all().range()]);
             add(&mut target.sway.mean, &dx[layout.sway(i).range()]);
         }
-        if self.shake.is_open() {
-            add(&mut self.shake.mean, &dx[layout.shake().range()]);
-        }
+        add(&mut self.shake.mean, &dx[layout.shake().range()]);
         for (i, feature) in self.features.iter_mut().enumerate() {
             add(&mut feature.mean, &dx[layout.feature(i).range()]);
         }

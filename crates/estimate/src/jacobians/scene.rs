@@ -11,9 +11,10 @@ use windhover_base::settings::{AttitudeConfig, EstimatorConfig, ImuConfig, Rig};
 use windhover_base::time::MonoTime;
 
 use crate::Site;
-use crate::blocks::{Block, own};
+use crate::blocks::{Block, SHAKE, own};
 use crate::core::Core;
 use crate::own::GRAVITY;
+use crate::shake::Shake;
 use crate::state::State;
 use crate::sway::Sway;
 use crate::track::{Evidence, Life};
@@ -168,6 +169,10 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
         target.sway = Sway::presumed();
         target.sway.mean = [within(0.05), within(0.05), within(0.05)];
     }
+    state.shake = Shake::presumed(&core.models);
+    state.begin_shake(0.02);
+    state.renew(state.layout().shake(), &[0.0; SHAKE]);
+    state.shake.mean = std::array::from_fn(|_| within(0.003));
     core
 }
 
@@ -222,5 +227,6 @@ pub(crate) fn difference(to: &State, from: &State) -> Vec<f64> {
     for i in 0..layout.targets {
         put(layout.sway(i).range(), &less(&to.targets[i].sway.mean, &from.targets[i].sway.mean));
     }
+    put(layout.shake().range(), &less(&to.shake.mean, &from.shake.mean));
     dx
 }
