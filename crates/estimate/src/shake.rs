@@ -183,12 +183,14 @@ impl State {
         if witnessed {
             shake.open_s += since_s;
         }
-        if !witnessed || shake.open_s < PRESUMED_S || !readout_is_known {
+        if !witnessed {
             return;
         }
+        // It may be more than presumed at once, and less only then.
+        let least_ratio = if shake.open_s < PRESUMED_S || !readout_is_known { 1.0 } else { 0.0 };
         let gain = (since_s / FIT_OVER_S).min(0.5);
         for (var, shown) in [&mut shake.displacement_var, &mut shake.roll_var].into_iter().zip(shown) {
-            fit(var, shown, gain, focal_px);
+            fit(var, shown, (gain, least_ratio), focal_px);
         }
         // Where all rows are exposed at once, displacement looks like the helicopter's own motion, of which more is expected.
         shake.displacement_var = shake.displacement_var.max(WITH_ROLL * shake.roll_var);
@@ -219,7 +221,7 @@ struct Shown {
 }
 
 /// Moves a variance to what a frame shows. A posterior mean has the variance that the measurements took away, `E[m mᵀ] = P₀ − P`.
-fn fit(var: &mut f64, shown: Shown, gain: f64, focal_px: f64) {
+fn fit(var: &mut f64, shown: Shown, (gain, least_ratio): (f64, f64), focal_px: f64) {
     if *var <= 0.0 {
         return;
     }
@@ -228,7 +230,7 @@ fn fit(var: &mut f64, shown: Shown, gain: f64, focal_px: f64) {
     // What is too small to be shown does no harm, and is let go.
     let ratio = if expected > LEAST_SHOWN * shown.freedom { ratio.min(MOST_RATIO) } else { UNSEEN_RATIO };
     if ratio.is_finite() {
-        *var = (*var * (1.0 + gain * (ratio - 1.0))).min((MOST_PX / focal_px).powi(2));
+        *var = (*var * (1.0 + gain * (ratio.max(least_ratio) - 1.0))).min((MOST_PX / focal_px).powi(2));
     }
     if *var < (LEAST_PX / focal_px).powi(2) {
         *var = 0.0;
