@@ -148,9 +148,14 @@ impl Core {
             (0..self.state.features.len()).for_each(|slot| self.drop_feature(slot));
         }
         // Heading was found by the wrong lens, and the compass was judged by it.
+        self.loosen_heading(HEADING_SIGMA);
+    }
+
+    /// The helicopter, all that is seen and the compass's error may be turned by `sigma` more than was believed, rad.
+    pub(crate) fn loosen_heading(&mut self, sigma: f64) {
         let mut along = std::mem::take(&mut self.along);
         self.state.heading_direction(&mut along);
-        self.state.add_direction(&along, HEADING_SIGMA);
+        self.state.add_direction(&along, sigma);
         self.along = along;
     }
 

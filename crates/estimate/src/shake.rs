@@ -52,6 +52,8 @@ const DOUBTED_EVERY_S: f64 = 8.0;
 /// It is presumed for so long, s, and until the time from the first row to the last is known so well, s.
 const PRESUMED_S: f64 = 3.0;
 const READOUT_KNOWN_S: f64 = 0.0015;
+/// What heading may be off by, as it was found by rows whose times were not known, rad.
+const HEADING_SIGMA: f64 = 0.01;
 /// Least variance of displacement over that of roll: what shakes about one axis shakes about the others.
 const WITH_ROLL: f64 = 0.3;
 /// Displacement that is presumed where it is found to shake; below which it does not; the most there is, px.
@@ -72,6 +74,8 @@ pub(crate) struct Shake {
     /// The covariance between nodes over the variance, inverted, and its correlation length as a share of the frame's height.
     inverse: SMatrix<f64, NODES, NODES>,
     length: f64,
+    /// Whether the read-out time was not known since it was doubted last.
+    unsettled: bool,
     /// Whether enough features were fused in the frame at hand.
     witnessed: bool,
     /// Mean of what majorities of features are off by.
@@ -101,7 +105,7 @@ impl Shake {
     /// Of a camera of which nothing is known yet.
     pub(crate) fn presumed(models: &Models) -> Self {
         let var = (PRESUMED_PX / models.camera.fx).powi(2);
-        Self { displacement_var: var, roll_var: var, ..Self::default() }
+        Self { displacement_var: var, roll_var: var, unsettled: true, ..Self::default() }
     }
 
     /// Whether the frame at hand has displacements of its own.
@@ -252,6 +256,13 @@ impl Core {
     pub(crate) fn end_shake(&mut self, since_s: f64) {
         let may_roll = self.may_roll();
         self.state.end_shake(self.models.camera.fx, may_roll, since_s);
+        let state = &mut self.state;
+        let settled = state.shake.open_s >= PRESUMED_S && state.cov.sigma(own::READOUT, 0) < READOUT_KNOWN_S;
+        let rolls = (self.models.readout_s + state.own.readout_s).abs() > MAY_ROLL_S;
+        if settled && std::mem::take(&mut state.shake.unsettled) && state.shake.shakes() && rolls {
+            // Heading was found by rows whose times were not known.
+            self.loosen_heading(HEADING_SIGMA);
+        }
     }
 
     /// Takes how far a majority of a frame's features is from being explained by one motion, and how many were fused.
@@ -291,7 +302,7 @@ impl Core {
         if may_roll {
             state.shake.undoubted_s = 0.0;
             state.cov.add_diagonal(own::READOUT, &[READOUT_DOUBT_S * READOUT_DOUBT_S]);
-            (state.shake.open_s, state.moving_share) = (0.0, 0.0);
+            (state.shake.open_s, state.shake.unsettled, state.moving_share) = (0.0, true, 0.0);
         }
     }
 }
