@@ -56,10 +56,11 @@ const READOUT_KNOWN_S: f64 = 0.0015;
 const HEADING_SIGMA: f64 = 0.01;
 /// Least variance of displacement over that of roll: what shakes about one axis shakes about the others.
 const WITH_ROLL: f64 = 0.3;
-/// Displacement that is presumed where it is found to shake; below which it does not; the most there is, px.
+/// Displacement that is presumed where it is found to shake; below which it does not; the most there is; and much, px.
 const PRESUMED_PX: f64 = 1.0;
 const LEAST_PX: f64 = 0.06;
 const MOST_PX: f64 = 6.0;
+const STRONG_PX: f64 = 0.6;
 
 /// Vibration of the camera.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
@@ -116,6 +117,11 @@ impl Shake {
     /// Whether the camera is taken to shake.
     fn shakes(&self) -> bool {
         self.displacement_var > 0.0 || self.roll_var > 0.0
+    }
+
+    /// Whether rows are taken to be displaced by more than what is small beside a centimetre on a vehicle.
+    pub(crate) fn is_strong(&self, focal_px: f64) -> bool {
+        self.displacement_var > (STRONG_PX / focal_px).powi(2)
     }
 
     /// Displacement of a row in normalised coordinates, and roll, rad, one sigma; 0 where there is none.
