@@ -44,8 +44,10 @@ const MOST_RATIO: f64 = 4.0;
 const UNSEEN_RATIO: f64 = 0.7;
 /// Share of the tracks that were refused from which on it is not they that move.
 const MOSTLY: f64 = 0.6;
-/// Shorter than this from the first row to the last, all rows are exposed at once, s; and by how much that time is doubted, s.
+/// Shorter than this from the first row to the last, all rows are exposed at once, s; by so many sigmas longer, they are not; and by how
+/// much that time is doubted, s.
 const MAY_ROLL_S: f64 = 0.004;
+const ROLLS_SIGMAS: f64 = 2.0;
 const READOUT_DOUBT_S: f64 = 0.006;
 /// That most tracks are refused is a reason to doubt it so often, s: people may be all that is seen.
 const DOUBTED_EVERY_S: f64 = 8.0;
@@ -56,11 +58,10 @@ const READOUT_KNOWN_S: f64 = 0.0015;
 const HEADING_SIGMA: f64 = 0.01;
 /// Least variance of displacement over that of roll: what shakes about one axis shakes about the others.
 const WITH_ROLL: f64 = 0.3;
-/// Displacement that is presumed where it is found to shake; below which it does not; the most there is; and much, px.
+/// Displacement that is presumed where it is found to shake; below which it does not; the most there is, px.
 const PRESUMED_PX: f64 = 1.0;
 const LEAST_PX: f64 = 0.06;
-const MOST_PX: f64 = 6.0;
-const STRONG_PX: f64 = 0.6;
+const MOST_PX: f64 = 2.5;
 
 /// Vibration of the camera.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
@@ -119,11 +120,6 @@ impl Shake {
         self.displacement_var > 0.0 || self.roll_var > 0.0
     }
 
-    /// Whether rows are taken to be displaced by more than what is small beside a centimetre on a vehicle.
-    pub(crate) fn is_strong(&self, focal_px: f64) -> bool {
-        self.displacement_var > (STRONG_PX / focal_px).powi(2)
-    }
-
     /// Displacement of a row in normalised coordinates, and roll, rad, one sigma; 0 where there is none.
     pub(crate) fn sigmas(&self) -> [f64; 2] {
         [self.displacement_var.sqrt(), self.roll_var.sqrt()]
@@ -178,7 +174,7 @@ impl State {
     }
 
     /// After a frame: what its displacements were moves their variance, and they are forgotten.
-    fn end_shake(&mut self, focal_px: f64, may_roll: bool, since_s: f64) {
+    fn end_shake(&mut self, focal_px: f64, (may_roll, rolls): (bool, bool), since_s: f64) {
         if !self.shake.is_open() {
             return;
         }
@@ -196,8 +192,12 @@ impl State {
         if !witnessed {
             return;
         }
-        // It may be more than presumed at once, and less only then.
-        let least_ratio = if shake.open_s < PRESUMED_S || !readout_is_known { 1.0 } else { 0.0 };
+        let held = shake.open_s < PRESUMED_S || !readout_is_known;
+        // Meanwhile it may only be found to be more, where rows are exposed one after the other beyond doubt.
+        if held && !rolls {
+            return;
+        }
+        let least_ratio = if held { 1.0 } else { 0.0 };
         let gain = (since_s / FIT_OVER_S).min(0.5);
         for (var, shown) in [&mut shake.displacement_var, &mut shake.roll_var].into_iter().zip(shown) {
             fit(var, shown, (gain, least_ratio), focal_px);
@@ -260,11 +260,10 @@ impl Core {
 
     /// After a frame was fused.
     pub(crate) fn end_shake(&mut self, since_s: f64) {
-        let may_roll = self.may_roll();
-        self.state.end_shake(self.models.camera.fx, may_roll, since_s);
+        let (may_roll, rolls) = (self.may_roll(), self.rolls());
+        self.state.end_shake(self.models.camera.fx, (may_roll, rolls), since_s);
         let state = &mut self.state;
         let settled = state.shake.open_s >= PRESUMED_S && state.cov.sigma(own::READOUT, 0) < READOUT_KNOWN_S;
-        let rolls = (self.models.readout_s + state.own.readout_s).abs() > MAY_ROLL_S;
         if settled && std::mem::take(&mut state.shake.unsettled) && state.shake.shakes() && rolls {
             // Heading was found by rows whose times were not known.
             self.loosen_heading(HEADING_SIGMA);
@@ -290,6 +289,12 @@ impl Core {
         if shake.taken_s >= OVER_S && (shake.disagreement > SHAKES || lost) {
             self.doubt_shake(may_roll);
         }
+    }
+
+    /// Whether rows are exposed one after the other, as far as it is known.
+    fn rolls(&self) -> bool {
+        let found_s = (self.models.readout_s + self.state.own.readout_s).abs();
+        found_s - ROLLS_SIGMAS * self.state.cov.sigma(own::READOUT, 0) > MAY_ROLL_S
     }
 
     /// Whether rows may be exposed one after the other.

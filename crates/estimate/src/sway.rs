@@ -93,11 +93,6 @@ impl Displacements {
         self.taken_s >= JUDGED_S
     }
 
-    /// Whether a sway as it is presumed would not be seen in them: vibration of the camera hides it.
-    fn hides_presumed(&self) -> bool {
-        self.energy[2] > FAST_KEEPS * PRESUMED_M * PRESUMED_M
-    }
-
     /// The variance that they show; 0 where they show none.
     fn shown(&self) -> f64 {
         let [fast, slow, expected] = self.energy;
@@ -163,15 +158,9 @@ impl Sway {
         d_point + Vector3::new(roll, pitch, 0.0).cross_matrix() * d_point
     }
 
-    /// Takes a frame's displacements to the right and downwards beside those of the states, and what was due of them, from a
-    /// camera that is taken to shake or not, of tags so high, m; whether what is taken of the vehicle has changed from or to nothing.
-    fn take(
-        &mut self,
-        moved_m: [f64; 2],
-        due: [f64; 2],
-        since_s: f64,
-        (height_m, shaken): (f64, bool),
-    ) -> bool {
+    /// Takes a frame's displacements to the right and downwards beside those of the states, and what was due of them;
+    /// whether what is taken of the vehicle has changed from or to nothing.
+    fn take(&mut self, moved_m: [f64; 2], due: [f64; 2], since_s: f64, height_m: f64) -> bool {
         let now = [height_m * self.mean[0], self.mean[2]];
         let mut judged = false;
         for (k, displaced) in self.displaced.iter_mut().enumerate() {
@@ -185,14 +174,10 @@ impl Sway {
             displaced.var = displaced.shown();
         }
         let before = self.var;
-        // What is not judged yet, or cannot be, is presumed as before.
+        // What is not judged yet is presumed as before.
         let presumed = PRESUMED_M * PRESUMED_M;
-        let open = self.is_open();
-        let taken = |displaced: Displacements| match displaced.var {
-            0.0 if !displaced.is_judged() || open && shaken && displaced.hides_presumed() => presumed,
-            var => var,
-        };
-        let [across, down] = self.displaced.map(taken);
+        let [across, down] =
+            self.displaced.map(|displaced| if displaced.is_judged() { displaced.var } else { presumed });
         self.var = [across, down.max(across)];
         (0..2).any(|k| (before[k] > 0.0) != (self.var[k] > 0.0))
     }
@@ -233,9 +218,8 @@ impl Core {
         let due = (before.across.var() - self.state.across_var(i, &before.across)).max(0.0) / slip;
         let due_down = (before.down_var - self.state.cov.var(own::POSITION.part(2))).max(0.0);
         let height_m = self.models.targets[i].markers_height_m;
-        let shaken = self.state.shake.is_strong(self.models.camera.fx);
         let sway = &mut self.state.targets[i].sway;
-        if sway.take([moved, sunk], [due, due_down], before.since_s, (height_m, shaken)) {
+        if sway.take([moved, sunk], [due, due_down], before.since_s, height_m) {
             self.state.renew_sway(i, &self.models);
         }
     }
