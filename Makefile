@@ -117,6 +117,7 @@ test-zenoh: setup-python
 
 # Tests that take minutes each; two ignored ones make goldens and captures again.
 proofs: setup
+	@sh tests/setup/venv.sh target/venv-gtsam crates/refine/tests/gtsam/requirements.txt each
 	$(CARGO) build --locked --release --example store_load
 	$(CARGO) test --locked --release --no-fail-fast --lib --tests -- --ignored --nocapture --skip make_
 

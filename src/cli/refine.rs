@@ -1,6 +1,6 @@
 //! `windhover refine FLIGHT… [--out FILE] [--adopt] [--positions FILE] [--truth TRUTH.csv]`
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -63,18 +63,7 @@ pub(super) fn run(args: &Args) -> CliResult {
     let inputs = Inputs::of(read.map(PathBuf::as_path));
     outs.iter().try_for_each(|out| place::check(out, &inputs, &Maker::Refine.marks()))?;
     let truth = args.truth.as_deref().map(Truth::read).transpose()?;
-    let bar = progress_bar();
-    let done = refine_flights(&args.flights, args.positions.as_deref(), &mut |share| {
-        bar.set_position((share * STEPS as f64) as u64);
-        true
-    });
-    bar.finish_and_clear();
-    let done = done.map_err(|error| match error {
-        RefineFlightError::Config(wrong @ (ReplayError::NoConfig { .. } | ReplayError::BadConfig { .. })) => {
-            CliError::config(wrong)
-        }
-        other => CliError::failed(other),
-    })?;
+    let done = refined(&args.flights, args.positions.as_deref())?;
     for ((done, from), to) in done.iter().zip(&args.flights).zip(&outs) {
         done.write(from, to)?;
         for warning in done.flight.warnings.iter().chain(&done.remarks) {
@@ -93,7 +82,27 @@ pub(super) fn run(args: &Args) -> CliResult {
     Ok(())
 }
 
-fn print_adopted(done: &RefinedFlight) -> CliResult {
+/// Refines flights, with a progress bar.
+pub(super) fn refined(
+    flights: &[PathBuf],
+    positions: Option<&Path>,
+) -> Result<Vec<RefinedFlight>, CliError> {
+    let bar = progress_bar();
+    let done = refine_flights(flights, positions, &mut |share| {
+        bar.set_position((share * STEPS as f64) as u64);
+        true
+    });
+    bar.finish_and_clear();
+    done.map_err(|error| match error {
+        RefineFlightError::Config(wrong @ (ReplayError::NoConfig { .. } | ReplayError::BadConfig { .. })) => {
+            CliError::config(wrong)
+        }
+        other => CliError::failed(other),
+    })
+}
+
+/// Prints the constants that a flight determines to differ from its configuration, as TOML.
+pub(super) fn print_adopted(done: &RefinedFlight) -> CliResult {
     let toml = adopted(&done.refined, &done.config);
     if toml.is_empty() {
         note!("the flight determines no constant that differs from the configuration");

@@ -29,6 +29,10 @@ pub enum Source {
     Drive(usize),
     /// Turning of a target.
     Turn(usize),
+    /// Roll and pitch of a target's body on its springs.
+    Sway(usize),
+    /// Heave of a target's body on its springs.
+    Heave(usize),
     /// External positions.
     Outside,
     /// Changes of the helicopter's velocity that are faster than a gust.
@@ -72,15 +76,17 @@ impl Source {
             Self::Known => 9,
             Self::Vibration => 10,
             Self::Outside => 11,
-            Self::Marker(target) => 12 + 3 * target,
-            Self::Drive(target) => 13 + 3 * target,
-            Self::Turn(target) => 14 + 3 * target,
+            Self::Marker(target) => 12 + 5 * target,
+            Self::Drive(target) => 13 + 5 * target,
+            Self::Turn(target) => 14 + 5 * target,
+            Self::Sway(target) => 15 + 5 * target,
+            Self::Heave(target) => 16 + 5 * target,
         }
     }
 
     /// Number of sources with this many targets.
     pub(crate) const fn count(targets: usize) -> usize {
-        12 + 3 * targets
+        12 + 5 * targets
     }
 }
 
@@ -163,6 +169,13 @@ impl Noise {
     pub(crate) fn set_local(&mut self, source: Source, figures: &[f64]) {
         let whole = self.of(source);
         self.local[source.index()] = figures.iter().map(|figure| figure / whole).collect();
+    }
+
+    /// The same with the variances of some sources multiplied by a factor.
+    pub(crate) fn scaled(&self, sources: &[Source], by: f64) -> Self {
+        let mut scaled = self.clone();
+        sources.iter().for_each(|source| scaled.figures[source.index()] *= by);
+        scaled
     }
 
     pub(crate) fn set(&mut self, source: Source, value: f64) {

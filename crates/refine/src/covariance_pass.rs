@@ -147,7 +147,7 @@ fn tallies(targets: usize, counts: &[(usize, usize)], noise: &Noise) -> Vec<Tall
     use Source as S;
     let own = [S::Outside, S::GpsPosition, S::GpsVelocity, S::Heading, S::Tilt, S::Feature];
     let motion = [S::TiltMotion, S::YawMotion, S::Gust, S::Thrust, S::Vibration];
-    let of_targets = (0..targets).flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t)]);
+    let of_targets = (0..targets).flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t), S::Sway(t), S::Heave(t)]);
     let all = own.into_iter().chain(motion).chain(of_targets);
     let tally = |source: Source| {
         let (taken, outliers) = counts[source.index()];
@@ -161,7 +161,7 @@ fn constants(problem: &Problem<'_>, values: &Values, back: &Back) -> Vec<Constan
     let constant = |(i, (prior, value)): (usize, (&Prior, &f64))| {
         let found = back.covariance(at + i, at + i).max(0.0).sqrt();
         let sigma = if prior.is_estimated() { found } else { prior.sigma };
-        Constant { kind: prior.kind, value: *value, sigma, prior: prior.mean, prior_sigma: prior.sigma }
+        Constant { kind: prior.kind, value: *value, sigma, prior: prior.mean, prior_sigma: prior.careful }
     };
     problem.priors.iter().zip(&values.constants).enumerate().map(constant).collect()
 }

@@ -115,6 +115,12 @@ impl Front {
         self.add_prior(column, information, 0.0);
     }
 
+    /// Information about an unknown by itself, and its right side.
+    #[cfg(test)]
+    pub(crate) fn alone(&self, column: usize) -> (f64, f64) {
+        (self.h[column * self.n + column], self.g[column])
+    }
+
     /// Eliminates `len` unknowns from `first` on, their diagonal increased by a share (Marquardt 1963).
     pub(crate) fn eliminate(
         &mut self,
@@ -146,15 +152,33 @@ impl Front {
         Ok(Eliminated { first, len, l, rest, w, y })
     }
 
-    /// `H_rr −= Wᵀ W`, `g_r −= Wᵀ y`.
+    /// `H_rr −= Wᵀ W`, `g_r −= Wᵀ y`, with the widest arithmetic that the processor has.
     fn take_off(&mut self, rest: &[usize], w: &[f64], y: &[f64]) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            unsafe { self.take_off_wide(rest, w, y) };
+            return;
+        }
+        self.take_off_plain(rest, w, y);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn take_off_wide(&mut self, rest: &[usize], w: &[f64], y: &[f64]) {
+        self.take_off_plain(rest, w, y);
+    }
+
+    #[inline(always)]
+    fn take_off_plain(&mut self, rest: &[usize], w: &[f64], y: &[f64]) {
         let width = rest.len();
         let mut square = vec![0.0; width];
         for (i, &column) in rest.iter().enumerate() {
             square[..=i].fill(0.0);
-            for row in w.chunks_exact(width) {
-                axpy(&mut square[..=i], row[i], &row[..=i]);
-            }
+            add_rows(&mut square[..=i], w.len() / width.max(1), |k| {
+                let row = &w[k * width..][..width];
+                (row[i], row)
+            });
             let h = &mut self.h[column * self.n..][..=column];
             rest[..=i].iter().zip(&square).for_each(|(j, square)| h[*j] -= square);
             self.g[column] -= w.chunks_exact(width).zip(y).map(|(row, y)| row[i] * y).sum::<f64>();
@@ -190,6 +214,11 @@ impl Back {
         self.p[i * self.n + j]
     }
 
+    /// `a x` of a row over some columns, with the solution x.
+    pub(crate) fn change(&self, columns: &[usize], a: &[f64]) -> f64 {
+        columns.iter().zip(a).map(|(i, a)| a * self.x[*i]).sum()
+    }
+
     /// `a P bᵀ` of two rows over the same columns.
     pub(crate) fn product(&self, columns: &[usize], a: &[f64], b: &[f64]) -> f64 {
         let terms = columns.iter().zip(a).filter(|(_, a)| **a != 0.0).map(|(i, a)| {
@@ -222,11 +251,39 @@ impl Back {
         (0..e.len).for_each(|i| inverse[i * e.len + i] = 1.0);
         forward(&e.l, e.len, &mut inverse, e.len);
         backward(&e.l, e.len, &mut inverse, e.len);
+        self.open(e, &gain, &inverse);
+        for i in e.first..e.first + e.len {
+            for j in (0..e.first).chain(e.first + e.len..n) {
+                self.p[j * n + i] = self.p[i * n + j];
+            }
+        }
+    }
+
+    /// Rows of the covariance of eliminated unknowns, `G P` and `(L Lᵀ)⁻¹ + G P Gᵀ`, with the widest arithmetic that the
+    /// processor has.
+    fn open(&mut self, e: &Eliminated, gain: &[f64], inverse: &[f64]) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            unsafe { self.open_wide(e, gain, inverse) };
+            return;
+        }
+        self.open_plain(e, gain, inverse);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn open_wide(&mut self, e: &Eliminated, gain: &[f64], inverse: &[f64]) {
+        self.open_plain(e, gain, inverse);
+    }
+
+    #[inline(always)]
+    fn open_plain(&mut self, e: &Eliminated, gain: &[f64], inverse: &[f64]) {
+        let (n, width) = (self.n, e.rest.len());
         for i in 0..e.len {
             let mut row = vec![0.0; n];
-            for (j, gain) in e.rest.iter().zip(&gain[i * width..][..width]) {
-                axpy(&mut row, *gain, &self.p[usize::from(*j) * n..][..n]);
-            }
+            let gain_of = &gain[i * width..][..width];
+            add_rows(&mut row, width, |k| (gain_of[k], &self.p[usize::from(e.rest[k]) * n..][..n]));
             for j in 0..e.len {
                 let tied = e.rest.iter().zip(&gain[j * width..][..width]);
                 row[e.first + j] =
@@ -234,11 +291,24 @@ impl Back {
             }
             self.p[(e.first + i) * n..][..n].copy_from_slice(&row);
         }
-        for i in e.first..e.first + e.len {
-            for j in (0..e.first).chain(e.first + e.len..n) {
-                self.p[j * n + i] = self.p[i * n + j];
-            }
+    }
+}
+
+/// `y += Σ a x` over `count` rows, four at once: y is read and written a quarter as often.
+#[inline(always)]
+fn add_rows<'a>(y: &mut [f64], count: usize, row: impl Fn(usize) -> (f64, &'a [f64])) {
+    let n = y.len();
+    let fours = count / 4 * 4;
+    for first in (0..fours).step_by(4) {
+        let [a, b, c, d] = [0, 1, 2, 3].map(|k| row(first + k));
+        let (p, q, r, s) = (&a.1[..n], &b.1[..n], &c.1[..n], &d.1[..n]);
+        for i in 0..n {
+            y[i] += (a.0 * p[i] + b.0 * q[i]) + (c.0 * r[i] + d.0 * s[i]);
         }
+    }
+    for k in fours..count {
+        let (a, x) = row(k);
+        axpy(y, a, x);
     }
 }
 

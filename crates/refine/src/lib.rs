@@ -5,6 +5,8 @@ mod block;
 mod initial;
 mod front;
 #[cfg(test)]
+mod gtsam;
+#[cfg(test)]
 mod jacobians;
 mod covariance_pass;
 mod measure;
@@ -14,6 +16,7 @@ mod plan;
 mod problem;
 mod recording;
 mod refine;
+mod roughness;
 mod solve;
 mod result;
 mod unknowns;

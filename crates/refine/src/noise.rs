@@ -51,8 +51,17 @@ impl Components {
         let width = block.columns.len();
         let taken: f64 =
             block.rows.chunks_exact(width).map(|row| back.product(&block.columns, row, row)).sum();
-        let (found, due) = (block.square(), (block.len() as f64 - taken).max(0.0));
+        // Of the solution: as the linear model has it from here.
+        let square = |(row, right): (&[f64], &f64)| (right - back.change(&block.columns, row)).powi(2);
+        let found: f64 = block.rows.chunks_exact(width).zip(&block.right).map(square).sum();
+        let due = (block.len() as f64 - taken).max(0.0);
         self.sums[source.index()][window].add(&Sum { found, due, absolute: found * figure }, 1.0);
+    }
+
+    /// Sum of squares and expected sum of some sources, over the whole flight.
+    pub(crate) fn sums_of(&self, sources: &[Source]) -> [f64; 2] {
+        let all = sources.iter().flat_map(|source| &self.sums[source.index()]);
+        all.fold([0.0; 2], |[found, due], sum| [found + sum.found, due + sum.due])
     }
 
     /// Updates the factors; returns the largest change (its logarithm).
@@ -106,7 +115,7 @@ fn fitted(targets: usize) -> impl Iterator<Item = Source> {
         S::Thrust,
         S::Vibration,
     ];
-    own.into_iter().chain((0..targets).flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t)]))
+    own.into_iter().chain((0..targets).flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t), S::Sway(t), S::Heave(t)]))
 }
 
 /// Limits of a factor; for measurements relative to the configured variance.
@@ -118,9 +127,14 @@ fn limits(source: Source) -> (f64, f64) {
         Source::Marker(_) | Source::Feature => (0.01, 25.0),
         // Forces change within a step.
         Source::Vibration => (1e-5, 1.0),
+        // Displacements of a millimetre to half a metre.
+        Source::Sway(_) | Source::Heave(_) => (1e-6, 0.25),
         _ => MOTION,
     }
 }
+
+/// Initial displacement of the markers of a target that sways, m.
+const SWAY_M: f64 = 0.02;
 
 /// Initial factors: intensities of jerk and its changes, variances of gusts and of the excess thrust.
 pub(crate) fn first(targets: usize, gust_mps2: f64, thrust_mps2: f64) -> Noise {
@@ -133,6 +147,7 @@ pub(crate) fn first(targets: usize, gust_mps2: f64, thrust_mps2: f64) -> Noise {
     for target in 0..targets {
         noise.set(Source::Drive(target), 6.0);
         noise.set(Source::Turn(target), 2.0);
+        [Source::Sway(target), Source::Heave(target)].iter().for_each(|s| noise.set(*s, SWAY_M.powi(2)));
     }
     noise
 }

@@ -2,12 +2,12 @@
 
 use windhover_base::geo::wrap_angle;
 use windhover_base::msg::{FixKind, GnssEpoch, MarkerId};
-use windhover_estimate::batch::Predictor;
+use windhover_estimate::batch::{Predictor, SWAY_COLUMNS};
 
 use crate::block::{Block, Noise, Source};
 use crate::front::{Front, Shape};
 use crate::measure::{self, Instant, Lens, Rows};
-use crate::motion::{Link, Processes, Pushed};
+use crate::motion::{Link, Processes, Pushed, sway_sources, sway_variances};
 use crate::plan::Plan;
 use crate::recording::Recording;
 use crate::unknowns::{Place, Prior, constant, knot, rig_offsets};
@@ -24,6 +24,8 @@ pub(crate) struct Problem<'a> {
     pub(crate) targets: usize,
     /// Whether each target moves.
     pub(crate) moves: Vec<bool>,
+    /// Height of the markers of each target that sways on its springs, m.
+    pub(crate) sways: Vec<Option<f64>>,
     pub(crate) processes: Processes,
     /// Landmarks that were found not to be on the ground.
     pub(crate) dropped: Vec<bool>,
@@ -80,7 +82,7 @@ pub(crate) struct Pass<'a> {
 const FIRST: [f64; 6] = [1e4, 100.0, 1.0, 2.0, 10.0, 1.5];
 /// The same for a target at the start of its estimation: place m, heading rad, speed m/s, yaw rate rad/s, acceleration
 /// m/s², yaw acceleration rad/s², jerk m/s³, yaw jerk rad/s³.
-const TAKEN_UP: [f64; knot::TARGET] = [1e4, 1e4, 10.0, 30.0, 5.0, 3.0, 3.0, 5.0, 5.0];
+const TAKEN_UP: [f64; knot::RIGID] = [1e4, 1e4, 10.0, 30.0, 5.0, 3.0, 3.0, 5.0, 5.0];
 
 impl<'a> Pass<'a> {
     pub(crate) fn new(problem: &'a Problem<'a>, predictor: Predictor) -> Self {
@@ -158,7 +160,7 @@ impl<'a> Pass<'a> {
         for target in 0..self.problem.targets {
             let first = at + knot::target(target);
             if !stop.held[target] {
-                (0..knot::TARGET).for_each(|i| front.add_prior(first + i, 1.0, 0.0));
+                (0..knot::RIGID).for_each(|i| front.add_prior(first + i, 1.0, 0.0));
             } else if stop.taken_up[target] {
                 for (i, sigma) in TAKEN_UP.iter().enumerate() {
                     let (information, value) = (sigma.powi(-2), values.knots[k].target(target)[i]);
@@ -167,6 +169,36 @@ impl<'a> Pass<'a> {
                     cost += pull * pull * information;
                 }
             }
+            cost += self.sway_begins(k, target, values, noise, front);
+        }
+        cost
+    }
+
+    /// Adds the prior of a target's sway where its estimation begins; where there is no sway it is zero.
+    fn sway_begins(
+        &self,
+        k: usize,
+        target: usize,
+        values: &Values,
+        noise: &Noise,
+        front: &mut Front,
+    ) -> f64 {
+        let (stop, first) = (&self.problem.plan.stops[k], knot::target(target) + knot::SWAY);
+        let at = self.problem.shape.knot_at(k) + first;
+        let Some(height_m) = self.problem.sways[target].filter(|_| stop.held[target]) else {
+            (0..SWAY_COLUMNS).for_each(|i| front.add_prior(at + i, 1.0, 0.0));
+            return 0.0;
+        };
+        if !stop.taken_up[target] {
+            return 0.0;
+        }
+        let mut cost = 0.0;
+        for (i, (var, source)) in
+            sway_variances(height_m).into_iter().zip(sway_sources(target)).enumerate()
+        {
+            let (information, value) = (1.0 / (var * noise.of(source)), values.knots[k].x[first + i]);
+            front.add_prior(at + i, information, -value);
+            cost += value * value * information;
         }
         cost
     }
@@ -207,6 +239,9 @@ impl<'a> Pass<'a> {
         for target in 0..problem.targets {
             if stop.held[target] && next.held[target] && !next.taken_up[target] {
                 link.target(target, problem.moves[target], &mut self.block, &mut take);
+                if let Some(height_m) = problem.sways[target] {
+                    link.sway(target, height_m, &mut self.block, &mut take);
+                }
             }
         }
     }

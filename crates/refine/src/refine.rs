@@ -18,7 +18,8 @@ use crate::plan::Plan;
 use crate::problem::{Pass, Problem};
 use crate::recording::Recording;
 use crate::result::Refined;
-use crate::solve::{Unsolved, solve};
+use crate::roughness::make_consistent;
+use crate::solve::{Unsolved, apply, solve};
 use crate::unknowns::{knot, outside_places, places, priors};
 use crate::values::{Knot, Values};
 
@@ -60,6 +61,7 @@ const SETTLED: f64 = 0.1;
 /// is this for each knot.
 const CONVERGED: f64 = 0.05;
 const NEARLY: f64 = 2e-3;
+const ROUGHLY: f64 = 30.0;
 /// A ground feature with a larger share of detections outside the gate is dropped.
 const MOVING: f64 = 0.25;
 /// Chi-square values that good measurements exceed once in a thousand, by number of components.
@@ -95,7 +97,7 @@ pub fn refine(
     if plan.stops.is_empty() {
         return Err(why_not_started(recordings));
     }
-    let mut problem = stated(rig, estimator, recordings, plan, &mut predictor, felt);
+    let mut problem = stated(rig, estimator, recordings, plan, &mut predictor, &firsts);
     let mut values = first_values(&problem, &firsts, &predictor, rig, site);
     let mut noise = first_noise(problem.targets, estimator.side_force_mps2, estimator.thrust_mps2);
     let total = (problem.plan.stops.len() * (ROUNDS + 1) * 3) as f64;
@@ -109,18 +111,27 @@ pub fn refine(
     for round in 0.. {
         let looked = {
             let mut pass = Pass::new(&problem, predictor.clone());
-            let factors =
-                solve(&mut pass, &mut values, &noise, if last { CONVERGED } else { nearly }, &mut step)?;
-            look(&mut pass, &factors, &values, &noise, site, recordings)
+            // Between rounds one step is enough: the next noise moves the solution again.
+            let enough = [nearly, ROUGHLY * nearly, CONVERGED][usize::from(round > 0) + usize::from(last)];
+            let factors = solve(&mut pass, &mut values, &noise, enough, &mut step)?;
+            let mut looked = look(&mut pass, &factors, &values, &noise, site, recordings);
+            if !last {
+                apply(&pass, &factors, &mut values);
+            } else {
+                drop(factors);
+                let of = (site, recordings);
+                make_consistent(&mut pass, &values, &noise, &mut looked, of, &mut step)?;
+            }
+            looked
         };
         if last {
             let mut refined = looked.refined;
             refined.finish(&problem, &firsts, felt, looked.memory.inflation());
             return Ok(refined);
         }
-        let dropped = drop_movers(&mut problem, &looked);
+        let changed = drop_movers(&mut problem, &looked) + widen(&mut problem, &values);
         let moved = looked.components.fit(problem.targets, &mut noise);
-        last = round + 1 >= ROUNDS || (moved < SETTLED && dropped == 0);
+        last = round + 1 >= ROUNDS || (moved < SETTLED && changed == 0);
     }
     unreachable!("the loop ends by its rounds")
 }
@@ -156,19 +167,26 @@ pub(crate) fn stated<'a>(
     recordings: &'a [Recording],
     plan: Plan,
     predictor: &mut Predictor,
-    felt: Option<FeltTilt>,
+    firsts: &[InitialValues],
 ) -> Problem<'a> {
     let targets = rig.target.len();
-    let share = match felt {
+    let share = match firsts.iter().find_map(|first| first.felt) {
         Some(FeltTilt::Share(share)) => Some(share),
         _ => None,
     };
+    let sways: Vec<bool> =
+        (0..targets).map(|target| firsts.iter().any(|first| first.sways[target])).collect();
+    sways.iter().enumerate().for_each(|(target, sways)| predictor.set_sways(target, *sways));
+    let wanders = firsts.iter().map(|first| first.wanders).fold(1.0, f64::max);
     let seen = plan.stops.iter().filter(|stop| stop.held.contains(&true)).count();
     let blind = (seen as f64) < BLIND * plan.stops.len() as f64;
     let priors = priors(rig, predictor, share, blind);
     let reading = predictor.tilt_error();
-    let places = places(predictor, targets, &priors);
+    let places = places(predictor, &sways, &priors);
+    let heights = sways.iter().enumerate().map(|(t, sways)| sways.then(|| predictor.markers_height_m(t)));
+    let sways = heights.collect();
     let best_fix = recordings.iter().flat_map(|r| &r.epochs).map(|e| e.value.fix).max();
+    let (vars, tau_s) = predictor.gps_bias(best_fix.unwrap_or(FixKind::ThreeD));
     let shape = Shape { knot: knot::target(targets), landmarks: plan.places, constants: priors.len() };
     Problem {
         recordings,
@@ -179,13 +197,14 @@ pub(crate) fn stated<'a>(
         places,
         priors,
         targets,
+        sways,
         moves: (0..targets).map(|target| predictor.moves(target)).collect(),
         processes: Processes {
             gust_tau_s: estimator.force_tau_s,
             thrust_tau_s: THRUST_TAU_S,
             // Motion must not explain the reading's slow error either: it is considered, not estimated.
             tilt_error: if blind { (HELD_TILT_ERROR.powi(2), reading.1) } else { reading },
-            gps_bias: predictor.gps_bias(best_fix.unwrap_or(FixKind::ThreeD)),
+            gps_bias: (vars.map(|var| var * wanders.powi(2)), tau_s),
             slip_q: predictor.slip_q(),
         },
         considered_tilt_var: if blind { reading.0 } else { 0.0 },
@@ -274,6 +293,12 @@ fn drop_movers(problem: &mut Problem<'_>, looked: &PassResult) -> usize {
     more
 }
 
+/// Widens the priors of constants that turned out to be configured wrongly; returns how many.
+fn widen(problem: &mut Problem<'_>, values: &Values) -> usize {
+    let priors = problem.priors.iter_mut().zip(&values.constants);
+    priors.map(|(prior, value)| usize::from(prior.widen(*value))).sum()
+}
+
 impl Refined {
     fn finish(
         &mut self,
@@ -284,7 +309,7 @@ impl Refined {
     ) {
         for (constant, prior) in self.constants.iter_mut().zip(&problem.priors) {
             if prior.is_estimated() {
-                constant.sigma = (constant.sigma * inflation.sqrt()).min(constant.prior_sigma);
+                constant.sigma = (constant.sigma * inflation.sqrt()).min(prior.sigma);
             }
         }
         self.outliers.sort_by(|a, b| b.ratio.total_cmp(&a.ratio));

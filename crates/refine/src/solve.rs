@@ -9,7 +9,7 @@ use crate::values::Values;
 const STEPS: usize = 25;
 const RAISED: (f64, f64, f64) = (1e-4, 10.0, 1e6);
 /// Prior information about a landmark, 1/m².
-const LANDMARK: f64 = 1e-8;
+pub(crate) const LANDMARK: f64 = 1e-8;
 
 /// The kind of eliminated unknowns.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -119,7 +119,7 @@ pub(crate) fn solve(
 }
 
 /// Changes the values by the solution.
-fn apply(pass: &Pass<'_>, factors: &Factors, values: &mut Values) {
+pub(crate) fn apply(pass: &Pass<'_>, factors: &Factors, values: &mut Values) {
     let mut back = Back::new(pass.problem.shape);
     for (what, e) in factors.steps.iter().rev() {
         back.solve(e);

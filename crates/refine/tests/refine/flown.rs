@@ -137,3 +137,19 @@ impl Score {
         }
     }
 }
+
+impl std::fmt::Display for Score {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(
+            f,
+            "heading {:.3} deg, speed {:.4} m/s, yaw rate {:.4} rad/s; normalised {:.2?}, of all three {:.2}, of position \
+             {:.2}",
+            self.rms(0).to_degrees(),
+            self.rms(1),
+            self.rms(2),
+            self.normalised.map(|n| n / self.frames),
+            self.nees / self.frames,
+            self.position / self.frames
+        )
+    }
+}
