@@ -20,6 +20,7 @@ mod report;
 mod run;
 mod simulate;
 mod store;
+mod surveyed;
 
 pub use error::{CliError, CliResult};
 

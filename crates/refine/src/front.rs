@@ -46,6 +46,8 @@ pub(crate) struct Front {
     n: usize,
     h: Vec<f64>,
     g: Vec<f64>,
+    /// Memory for a row of products.
+    square: Vec<f64>,
 }
 
 /// The stored result of eliminated unknowns.
@@ -81,27 +83,28 @@ pub(crate) struct Singular;
 impl Front {
     pub(crate) fn new(shape: Shape) -> Self {
         let n = shape.len();
-        Self { n, h: vec![0.0; n * n], g: vec![0.0; n] }
+        Self { n, h: vec![0.0; n * n], g: vec![0.0; n], square: Vec::new() }
     }
 
     /// Adds rows `J x ≈ r` of unit variance with a weight; `rows` has them one after the other, with one value for each
     /// of `columns`.
     pub(crate) fn add(&mut self, columns: &[usize], rows: &[f64], right: &[f64], weight: f64) {
         let width = columns.len();
-        for (row, right) in rows.chunks_exact(width).zip(right) {
-            for (a, &i) in row.iter().zip(columns) {
-                if *a == 0.0 {
-                    continue;
-                }
-                let a = weight * a;
-                self.g[i] += a * right;
-                for (b, &j) in row.iter().zip(columns) {
-                    if j <= i {
-                        self.h[i * self.n + j] += a * b;
-                    }
-                }
+        let mut square = std::mem::take(&mut self.square);
+        square.resize(width, 0.0);
+        for (a, &i) in columns.iter().enumerate() {
+            let square = &mut square[..=a];
+            square.fill(0.0);
+            add_rows(square, right.len(), |k| (rows[k * width + a], &rows[k * width..][..width]));
+            let product: f64 = right.iter().enumerate().map(|(k, right)| rows[k * width + a] * right).sum();
+            self.g[i] += weight * product;
+            for (b, (&j, square)) in columns.iter().zip(square.iter()).enumerate() {
+                // A column that is named twice has both mixed products in its square.
+                let by = if i == j && a != b { 2.0 * weight } else { weight };
+                self.h[i.max(j) * self.n + i.min(j)] += by * square;
             }
         }
+        self.square = square;
     }
 
     /// Adds `x ≈ value` of this information to one unknown.

@@ -26,6 +26,8 @@ pub(crate) struct InitialValues {
     pub(crate) felt: Option<FeltTilt>,
     /// Targets that the filter found to sway on their springs.
     pub(crate) sways: Vec<bool>,
+    /// What the filter found to be configured wrongly.
+    pub(crate) wrong: Vec<MisfitCause>,
     /// How many times as far as configured the receiver's slow error wanders.
     pub(crate) wanders: f64,
     /// Why and when the filter was reset.
@@ -83,6 +85,17 @@ impl InitialValues {
                 EstimatorOutput::TiltFelt { felt, .. } => self.felt = Some(felt),
                 EstimatorOutput::Misfit(misfit) => match misfit.cause {
                     MisfitCause::TargetSways { target } => self.sways[target] = true,
+                    MisfitCause::AntennaPlace
+                    | MisfitCause::Lens
+                    | MisfitCause::Readout
+                    | MisfitCause::Late
+                    | MisfitCause::MarkerSize(_)
+                    | MisfitCause::MarkerPlace(_)
+                    | MisfitCause::MarkerTurn(_)
+                        if !self.wrong.contains(&misfit.cause) =>
+                    {
+                        self.wrong.push(misfit.cause);
+                    }
                     MisfitCause::Wanders => self.wanders = self.wanders.max(misfit.figure),
                     _ => {}
                 },

@@ -85,7 +85,7 @@ fn rows_are_the_derivatives_of_what_is_left_over() {
     let plan = planned(&predictor, &recordings, &firsts, rig.target.len(), 30.0);
     let mut firsts = firsts;
     firsts[0].sways[0] = true;
-    let problem = stated(&rig, &config, &recordings, plan, &mut predictor, &firsts);
+    let problem = stated((&rig, &config, &site), &recordings, plan, &mut predictor, &firsts);
     let mut values = first_values(&problem, &firsts, &predictor, &rig, &site);
     let mut seed = 5u64;
     let mut random = move || {

@@ -17,13 +17,16 @@ mod problem;
 mod recording;
 mod refine;
 mod roughness;
+#[cfg(test)]
+mod segments;
 mod solve;
+mod surveyed;
 mod result;
 mod unknowns;
 mod values;
 
 pub use block::Source;
-pub use recording::{OutsidePosition, Recording};
+pub use recording::{OutsidePosition, Recording, SurveyedMarker};
 pub use refine::{RefineError, refine};
 pub use result::{Constant, Outlier, Refined, Tally};
 pub use unknowns::ConstantKind;

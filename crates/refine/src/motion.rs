@@ -29,8 +29,9 @@ const DRIVE: [f64; 4] = [f64::INFINITY, f64::INFINITY, 2.0, 0.4];
 const WIND_WALK: f64 = 0.1;
 /// Least variance of a step, m² or rad²: with a smaller one the absolute position is lost to rounding.
 const LEAST_VAR: f64 = 1e-13;
-/// Side slip of a target that does not move, m²/s.
-const STILL_Q: f64 = 1e-12;
+/// Walk of place and heading of a target that does not move, m²/s and rad²/s: with a smaller one the absolute place is lost to
+/// rounding.
+const STILL_Q: f64 = 1e-9;
 
 /// Constants of processes that are not fitted.
 #[derive(Clone, Copy, Debug)]
@@ -316,7 +317,7 @@ impl Link<'_> {
         }
     }
 
-    /// A target that does not move.
+    /// A target that does not move: its place and heading. Its speed and yaw rate are zero at every knot.
     fn still(
         &self,
         a: &[f64],
@@ -325,13 +326,13 @@ impl Link<'_> {
         block: &mut Block,
         take: &mut dyn FnMut(Source, &Block),
     ) {
-        for i in 0..knot::RIGID {
+        for i in 0..=knot::HEADING {
             block.begin(1);
             block.over([at[0] + i, at[1] + i]);
             (*block.at(0, 0), *block.at(0, 1)) = (-1.0, 1.0);
             let change = b[i] - a[i];
             block.right[0] = -if i == knot::HEADING { wrap_angle(change) } else { change };
-            self.finish(block, &[STILL_Q], Source::Known, take);
+            self.finish(block, &[STILL_Q * self.h], Source::Known, take);
         }
     }
 

@@ -48,6 +48,9 @@ impl Components {
 
     /// Adds a block that is not an outlier, whitened with this factor.
     pub(crate) fn take(&mut self, source: Source, window: usize, figure: f64, block: &Block, back: &Back) {
+        if source == Source::Known {
+            return;
+        }
         let width = block.columns.len();
         let taken: f64 =
             block.rows.chunks_exact(width).map(|row| back.product(&block.columns, row, row)).sum();
@@ -115,7 +118,8 @@ fn fitted(targets: usize) -> impl Iterator<Item = Source> {
         S::Thrust,
         S::Vibration,
     ];
-    own.into_iter().chain((0..targets).flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t), S::Sway(t), S::Heave(t)]))
+    own.into_iter()
+        .chain((0..targets).flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t), S::Sway(t), S::Heave(t)]))
 }
 
 /// Limits of a factor; for measurements relative to the configured variance.

@@ -10,6 +10,7 @@ use crate::measure::{self, Instant, Lens, Rows};
 use crate::motion::{Link, Processes, Pushed, sway_sources, sway_variances};
 use crate::plan::Plan;
 use crate::recording::Recording;
+use crate::surveyed::ControlPoint;
 use crate::unknowns::{Place, Prior, constant, knot, rig_offsets};
 use crate::values::{Knot, Values};
 
@@ -27,6 +28,8 @@ pub(crate) struct Problem<'a> {
     /// Height of the markers of each target that sways on its springs, m.
     pub(crate) sways: Vec<Option<f64>>,
     pub(crate) processes: Processes,
+    /// Markers at known positions, of each recording.
+    pub(crate) control_points: Vec<Vec<ControlPoint>>,
     /// Landmarks that were found not to be on the ground.
     pub(crate) dropped: Vec<bool>,
     /// Variance of the tilt readings' slow error that is not estimated, rad²: of attitude about north and east.
@@ -34,9 +37,22 @@ pub(crate) struct Problem<'a> {
     /// Where the camera is configured to be in the body, m.
     pub(crate) camera_at: nalgebra::Vector3<f64>,
     pub(crate) gates: [f64; 9],
+    /// Knots of a segment, of which all eliminations are kept at once.
+    pub(crate) segment_len: usize,
 }
 
 impl Problem<'_> {
+    /// Number of segments.
+    pub(crate) fn segments(&self) -> usize {
+        self.plan.stops.len().div_ceil(self.segment_len)
+    }
+
+    /// Knots of a segment.
+    pub(crate) fn segment(&self, index: usize) -> std::ops::Range<usize> {
+        let first = index * self.segment_len;
+        first..(first + self.segment_len).min(self.plan.stops.len())
+    }
+
     /// A knot's state at a measurement's time, `dt` after it.
     fn instant<'b>(
         &'b self,
@@ -83,6 +99,8 @@ const FIRST: [f64; 6] = [1e4, 100.0, 1.0, 2.0, 10.0, 1.5];
 /// The same for a target at the start of its estimation: place m, heading rad, speed m/s, yaw rate rad/s, acceleration
 /// m/s², yaw acceleration rad/s², jerk m/s³, yaw jerk rad/s³.
 const TAKEN_UP: [f64; knot::RIGID] = [1e4, 1e4, 10.0, 30.0, 5.0, 3.0, 3.0, 5.0, 5.0];
+/// Sigma of speed, yaw rate and their derivatives of a target that does not move, in their units.
+const STANDS: f64 = 1e-3;
 
 impl<'a> Pass<'a> {
     pub(crate) fn new(problem: &'a Problem<'a>, predictor: Predictor) -> Self {
@@ -161,8 +179,14 @@ impl<'a> Pass<'a> {
             let first = at + knot::target(target);
             if !stop.held[target] {
                 (0..knot::RIGID).for_each(|i| front.add_prior(first + i, 1.0, 0.0));
-            } else if stop.taken_up[target] {
-                for (i, sigma) in TAKEN_UP.iter().enumerate() {
+            } else {
+                let sigmas = match (self.problem.moves[target], stop.taken_up[target]) {
+                    (false, true) => [&TAKEN_UP[..3], &[STANDS; knot::RIGID - 3]].concat(),
+                    (false, false) => [&[f64::INFINITY; 3][..], &[STANDS; knot::RIGID - 3]].concat(),
+                    (true, true) => TAKEN_UP.to_vec(),
+                    (true, false) => Vec::new(),
+                };
+                for (i, sigma) in sigmas.iter().enumerate() {
                     let (information, value) = (sigma.powi(-2), values.knots[k].target(target)[i]);
                     let pull = if i < 3 { 0.0 } else { value };
                     front.add_prior(first + i, information, -pull);
@@ -175,14 +199,7 @@ impl<'a> Pass<'a> {
     }
 
     /// Adds the prior of a target's sway where its estimation begins; where there is no sway it is zero.
-    fn sway_begins(
-        &self,
-        k: usize,
-        target: usize,
-        values: &Values,
-        noise: &Noise,
-        front: &mut Front,
-    ) -> f64 {
+    fn sway_begins(&self, k: usize, target: usize, values: &Values, noise: &Noise, front: &mut Front) -> f64 {
         let (stop, first) = (&self.problem.plan.stops[k], knot::target(target) + knot::SWAY);
         let at = self.problem.shape.knot_at(k) + first;
         let Some(height_m) = self.problem.sways[target].filter(|_| stop.held[target]) else {
@@ -193,9 +210,7 @@ impl<'a> Pass<'a> {
             return 0.0;
         }
         let mut cost = 0.0;
-        for (i, (var, source)) in
-            sway_variances(height_m).into_iter().zip(sway_sources(target)).enumerate()
-        {
+        for (i, (var, source)) in sway_variances(height_m).into_iter().zip(sway_sources(target)).enumerate() {
             let (information, value) = (1.0 / (var * noise.of(source)), values.knots[k].x[first + i]);
             front.add_prior(at + i, information, -value);
             cost += value * value * information;
@@ -213,6 +228,7 @@ impl<'a> Pass<'a> {
     ) {
         self.epochs(k, values, noise, take);
         self.positions(k, values, take);
+        self.surveyed(k, values, take);
         self.readings(k, values, noise, take);
         self.frame(k, values, noise, take);
         self.link(k, values, noise, take);
@@ -275,6 +291,16 @@ impl<'a> Pass<'a> {
                     take(Origin::of(source), &self.block);
                 }
             }
+        }
+    }
+
+    /// Control points, where the estimation of their target begins: it does not move.
+    fn surveyed(&mut self, k: usize, values: &Values, take: &mut dyn FnMut(Origin, &Block)) {
+        let problem = self.problem;
+        let (stop, at) = (&problem.plan.stops[k], problem.shape.knot_at(k));
+        for point in problem.control_points[stop.flight].iter().filter(|p| stop.taken_up[p.target]) {
+            point.write(&values.knots[k], values, (problem.shape, at), &mut self.block);
+            take(Origin::of(Source::Outside), &self.block);
         }
     }
 

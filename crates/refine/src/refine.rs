@@ -20,6 +20,7 @@ use crate::recording::Recording;
 use crate::result::Refined;
 use crate::roughness::make_consistent;
 use crate::solve::{Unsolved, apply, solve};
+use crate::surveyed::control_points;
 use crate::unknowns::{knot, outside_places, places, priors};
 use crate::values::{Knot, Values};
 
@@ -70,6 +71,8 @@ const GATES: [f64; 9] = [f64::INFINITY, 10.83, 13.82, 16.27, 18.47, 20.52, 22.46
 const BLIND: f64 = 0.2;
 /// The slow error of tilt readings where it is not estimated, rad.
 const HELD_TILT_ERROR: f64 = 1e-5;
+/// Knots of which all eliminations are kept at once: some 200 MB.
+const SEGMENT: usize = 5_000;
 /// Most outliers that are listed.
 const NAMED: usize = 200;
 /// Correlation time of the thrust beyond the weight, s.
@@ -97,7 +100,7 @@ pub fn refine(
     if plan.stops.is_empty() {
         return Err(why_not_started(recordings));
     }
-    let mut problem = stated(rig, estimator, recordings, plan, &mut predictor, &firsts);
+    let mut problem = stated((rig, estimator, site), recordings, plan, &mut predictor, &firsts);
     let mut values = first_values(&problem, &firsts, &predictor, rig, site);
     let mut noise = first_noise(problem.targets, estimator.side_force_mps2, estimator.thrust_mps2);
     let total = (problem.plan.stops.len() * (ROUNDS + 1) * 3) as f64;
@@ -114,9 +117,9 @@ pub fn refine(
             // Between rounds one step is enough: the next noise moves the solution again.
             let enough = [nearly, ROUGHLY * nearly, CONVERGED][usize::from(round > 0) + usize::from(last)];
             let factors = solve(&mut pass, &mut values, &noise, enough, &mut step)?;
-            let mut looked = look(&mut pass, &factors, &values, &noise, site, recordings);
+            let mut looked = look(&mut pass, &factors, &values, &noise, site, recordings)?;
             if !last {
-                apply(&pass, &factors, &mut values);
+                apply(&mut pass, &factors, &mut values, &noise)?;
             } else {
                 drop(factors);
                 let of = (site, recordings);
@@ -162,8 +165,7 @@ pub(crate) fn planned(
 }
 
 pub(crate) fn stated<'a>(
-    rig: &Rig,
-    estimator: &EstimatorConfig,
+    (rig, estimator, site): (&Rig, &EstimatorConfig, &Site),
     recordings: &'a [Recording],
     plan: Plan,
     predictor: &mut Predictor,
@@ -180,8 +182,12 @@ pub(crate) fn stated<'a>(
     let wanders = firsts.iter().map(|first| first.wanders).fold(1.0, f64::max);
     let seen = plan.stops.iter().filter(|stop| stop.held.contains(&true)).count();
     let blind = (seen as f64) < BLIND * plan.stops.len() as f64;
-    let priors = priors(rig, predictor, share, blind);
+    let mut priors = priors(rig, predictor, share, blind);
+    for prior in &mut priors {
+        firsts.iter().for_each(|first| prior.widen_by(&first.wrong));
+    }
     let reading = predictor.tilt_error();
+    let control_points = control_points(rig, predictor, &site.frame, recordings, &priors);
     let places = places(predictor, &sways, &priors);
     let heights = sways.iter().enumerate().map(|(t, sways)| sways.then(|| predictor.markers_height_m(t)));
     let sways = heights.collect();
@@ -190,6 +196,7 @@ pub(crate) fn stated<'a>(
     let shape = Shape { knot: knot::target(targets), landmarks: plan.places, constants: priors.len() };
     Problem {
         recordings,
+        control_points,
         dropped: vec![false; plan.landmarks],
         plan,
         shape,
@@ -210,6 +217,7 @@ pub(crate) fn stated<'a>(
         considered_tilt_var: if blind { reading.0 } else { 0.0 },
         camera_at: rig.camera.mount.position(),
         gates: GATES,
+        segment_len: SEGMENT,
     }
 }
 

@@ -81,7 +81,7 @@ pub(crate) fn make_consistent(
             let alpha = by.exp();
             let noise = noise.scaled(&sources, 1.0 / alpha);
             let factors = factorise(pass, values, &noise, 0.0, watch)?;
-            let more = look(pass, &factors, values, &noise, site, recordings);
+            let more = look(pass, &factors, values, &noise, site, recordings)?;
             Ok((more.refined, Response::of(&more.components, &sources, alpha)))
         };
         let (looser, less) = scaled(-STEP, watch)?;

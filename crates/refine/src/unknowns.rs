@@ -2,6 +2,7 @@
 
 use nalgebra::Vector3;
 
+use windhover_base::msg::MisfitCause;
 use windhover_base::settings::Rig;
 use windhover_estimate::batch::{Predictor, RigOffsets, SWAY_COLUMNS, TAG_COLUMNS, TARGET_COLUMNS, columns};
 
@@ -150,6 +151,25 @@ impl Prior {
             self.sigma *= OTHERWISE;
         }
         beyond
+    }
+
+    /// Widens it where the filter found that it is configured wrongly.
+    pub(crate) fn widen_by(&mut self, wrong: &[MisfitCause]) {
+        use ConstantKind as Kind;
+        let is_it = |cause: &MisfitCause| match (*cause, self.kind) {
+            (MisfitCause::AntennaPlace, Kind::AntennaAt(_))
+            | (MisfitCause::Lens, Kind::Lens(_))
+            | (MisfitCause::Readout, Kind::Readout)
+            | (MisfitCause::Late, Kind::CameraDelay) => true,
+            (
+                MisfitCause::MarkerSize(p) | MisfitCause::MarkerPlace(p) | MisfitCause::MarkerTurn(p),
+                Kind::Tag { target, .. },
+            ) => p.target == target,
+            _ => false,
+        };
+        if self.sigma == self.careful && wrong.iter().any(is_it) {
+            self.sigma *= OTHERWISE;
+        }
     }
 }
 

@@ -103,7 +103,8 @@ fn intrinsics(found: &Found<'_>, config: &Config) -> String {
     if let Some(focal) = found.settled(ConstantKind::Focal) {
         let factor = focal.value.exp();
         for (name, configured) in [("fx", lens.fx), ("fy", lens.fy)] {
-            let _ = writeln!(text, "{name} = {:.3}    # ± {:.3}", configured * factor, configured * focal.sigma);
+            let _ =
+                writeln!(text, "{name} = {:.3}    # ± {:.3}", configured * factor, configured * focal.sigma);
         }
     }
     if (0..4).any(|i| found.settled(ConstantKind::Lens(i)).is_some()) {

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use crate::cli::CliResult;
 use crate::cli::out::note;
 use crate::cli::refine::{print_adopted, refined};
+use crate::cli::surveyed::SurveyedArgs;
 use crate::text::one_line;
 
 /// Print what flights show of their configuration, as TOML to paste.
@@ -25,10 +26,12 @@ pub(super) struct Args {
     /// External positions of the antenna, as for `windhover refine`
     #[arg(long, value_name = "FILE")]
     positions: Option<PathBuf>,
+    #[command(flatten)]
+    surveyed: SurveyedArgs,
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
-    let done = refined(&args.flights, args.positions.as_deref())?;
+    let done = refined(&args.flights, args.positions.as_deref(), &args.surveyed)?;
     for warning in done.iter().flat_map(|done| done.flight.warnings.iter().chain(&done.remarks)) {
         note!("windhover: {}", one_line(warning));
     }
