@@ -1,6 +1,6 @@
 //! A few rows of the least-squares problem, whitened, and their noise factors.
 
-use crate::front::{cholesky, forward};
+use crate::dense::{cholesky, forward};
 
 /// The source of rows.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
@@ -33,6 +33,8 @@ pub enum Source {
     Sway(usize),
     /// Heave of a target's body on its springs.
     Heave(usize),
+    /// Side slip of a target.
+    Slip(usize),
     /// External positions.
     Outside,
     /// Changes of the helicopter's velocity that are faster than a gust.
@@ -58,7 +60,7 @@ impl Source {
 
     /// Whether it is motion whose intensity changes with time: starting and turning in differ from standing still.
     pub(crate) const fn is_local(self) -> bool {
-        matches!(self, Self::TiltMotion | Self::YawMotion | Self::Drive(_) | Self::Turn(_))
+        matches!(self, Self::TiltMotion | Self::YawMotion | Self::Drive(_) | Self::Turn(_) | Self::Slip(_))
     }
 
     /// The index of its factor.
@@ -76,17 +78,18 @@ impl Source {
             Self::Known => 9,
             Self::Vibration => 10,
             Self::Outside => 11,
-            Self::Marker(target) => 12 + 5 * target,
-            Self::Drive(target) => 13 + 5 * target,
-            Self::Turn(target) => 14 + 5 * target,
-            Self::Sway(target) => 15 + 5 * target,
-            Self::Heave(target) => 16 + 5 * target,
+            Self::Marker(target) => 12 + 6 * target,
+            Self::Drive(target) => 13 + 6 * target,
+            Self::Turn(target) => 14 + 6 * target,
+            Self::Sway(target) => 15 + 6 * target,
+            Self::Heave(target) => 16 + 6 * target,
+            Self::Slip(target) => 17 + 6 * target,
         }
     }
 
     /// Number of sources with this many targets.
     pub(crate) const fn count(targets: usize) -> usize {
-        12 + 5 * targets
+        12 + 6 * targets
     }
 }
 

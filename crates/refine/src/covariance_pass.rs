@@ -107,15 +107,15 @@ impl PassResult {
         if let Some(marker) = origin.marker.filter(|_| !outside) {
             self.memory.take(marker, k, &block.right);
         }
+        let stop = &problem.plan.stops[k];
         if outside {
-            let stop = &problem.plan.stops[k];
             let Origin { source, marker, .. } = origin;
             self.refined.outliers.push(Outlier { flight: stop.flight, t: stop.t, source, marker, ratio });
-        } else {
-            let window = problem.plan.stops[k].window;
-            let figure = noise.at(origin.source, window);
-            self.components.take(origin.source, window, figure, block, back);
         }
+        // Outliers count as far as they pull: where the noise is far too small, most are outside.
+        let weight = if outside { 1.0 / ratio } else { 1.0 };
+        let figure = noise.at(origin.source, stop.window);
+        self.components.take(origin.source, (stop.window, figure, weight), block, back);
     }
 }
 
@@ -160,8 +160,8 @@ fn tallies(targets: usize, counts: &[(usize, usize)], noise: &Noise) -> Vec<Tall
     use Source as S;
     let own = [S::Outside, S::GpsPosition, S::GpsVelocity, S::Heading, S::Tilt, S::Feature];
     let motion = [S::TiltMotion, S::YawMotion, S::Gust, S::Thrust, S::Vibration];
-    let of_targets =
-        (0..targets).flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t), S::Sway(t), S::Heave(t)]);
+    let of_targets = (0..targets)
+        .flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t), S::Sway(t), S::Heave(t), S::Slip(t)]);
     let all = own.into_iter().chain(motion).chain(of_targets);
     let tally = |source: Source| {
         let (taken, outliers) = counts[source.index()];

@@ -1,7 +1,9 @@
 #![doc = include_str!("../README.md")]
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
+mod beginnings;
 mod block;
+mod dense;
 mod initial;
 mod front;
 #[cfg(test)]

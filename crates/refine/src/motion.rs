@@ -298,7 +298,7 @@ impl Link<'_> {
             *block.at(0, 3 * end + 2) = -0.5 * along;
         }
         block.right[0] = -across;
-        self.finish(block, &[self.processes.slip_q * self.h], Source::Known, take);
+        self.finish(block, &[self.processes.slip_q * self.h], Source::Slip(target), take);
     }
 
     /// Sway of a target on its springs, with markers so high, m: each of its angles and heave reverts to zero.

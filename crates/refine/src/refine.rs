@@ -21,7 +21,7 @@ use crate::result::Refined;
 use crate::roughness::make_consistent;
 use crate::solve::{Unsolved, apply, solve};
 use crate::surveyed::control_points;
-use crate::unknowns::{knot, outside_places, places, priors};
+use crate::unknowns::{constant, knot, outside_places, places, priors};
 use crate::values::{Knot, Values};
 
 /// Why a flight could not be refined.
@@ -65,6 +65,7 @@ const NEARLY: f64 = 2e-3;
 const ROUGHLY: f64 = 30.0;
 /// A ground feature with a larger share of detections outside the gate is dropped.
 const MOVING: f64 = 0.25;
+const MOST_MOVE: f64 = 0.6;
 /// Chi-square values that good measurements exceed once in a thousand, by number of components.
 const GATES: [f64; 9] = [f64::INFINITY, 10.83, 13.82, 16.27, 18.47, 20.52, 22.46, 24.32, 26.12];
 /// A flight in which a smaller share of knots has a target is blind.
@@ -292,6 +293,12 @@ fn place_landmarks(problem: &Problem<'_>, rig: &Rig, site: &Site, values: &mut V
 
 /// Drops landmarks that were too often outside the gate; returns how many.
 fn drop_movers(problem: &mut Problem<'_>, looked: &PassResult) -> usize {
+    let [seen, outside] =
+        looked.landmarks.iter().fold([0; 2], |[all, out], (seen, outside)| [all + seen, out + outside]);
+    // Where everything moves, it is the noise that is not known yet.
+    if outside as f64 > MOST_MOVE * seen as f64 {
+        return 0;
+    }
     let mut more = 0;
     for (dropped, (seen, outside)) in problem.dropped.iter_mut().zip(&looked.landmarks) {
         let moves = *outside as f64 > MOVING * *seen as f64;
@@ -302,9 +309,14 @@ fn drop_movers(problem: &mut Problem<'_>, looked: &PassResult) -> usize {
 }
 
 /// Widens the priors of constants that turned out to be configured wrongly; returns how many.
+///
+/// A camera that is late makes fixes and readings early, both by as much.
 fn widen(problem: &mut Problem<'_>, values: &Values) -> usize {
     let priors = problem.priors.iter_mut().zip(&values.constants);
-    priors.map(|(prior, value)| usize::from(prior.widen(*value))).sum()
+    let widened: usize = priors.map(|(prior, value)| usize::from(prior.widen(*value))).sum();
+    let camera = &mut problem.priors[constant::CAMERA_DELAY];
+    let early = [constant::GPS_DELAY, constant::COMPASS_DELAY].map(|delay| -values.constants[delay]);
+    widened + usize::from(camera.widen(camera.mean + early[0].min(early[1]).max(0.0)))
 }
 
 impl Refined {

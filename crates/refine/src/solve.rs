@@ -3,7 +3,8 @@
 use std::borrow::Cow;
 
 use crate::block::{Block, Loss, Noise};
-use crate::front::{Back, Eliminated, Front, Singular};
+use crate::dense::Singular;
+use crate::front::{Back, Eliminated, Front};
 use crate::problem::{Origin, Pass};
 use crate::values::Values;
 

@@ -79,6 +79,7 @@ pub fn source_name(source: Source, targets: &[TargetConfig]) -> String {
         Source::Drive(target) => format!("{}/drive", of(target)),
         Source::Turn(target) => format!("{}/turn", of(target)),
         Source::Sway(target) => format!("{}/sway", of(target)),
+        Source::Slip(target) => format!("{}/slip", of(target)),
         Source::Heave(target) => format!("{}/heave", of(target)),
         Source::Outside => "position_from_outside".into(),
         Source::Known => "known".into(),
