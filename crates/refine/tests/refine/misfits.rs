@@ -16,8 +16,8 @@ const OF_MARKERS: [&str; 6] =
 const OF_VEHICLES: [&str; 5] = ["sway", "bounce", "rolls-and-bounces", "slip", "hurry"];
 /// A camera that is late, and a rolling shutter that vibrates, are not met: docs/refine.md.
 const OF_TIME: [&str; 4] = ["readout", "stamp-jitter", "gps-late", "compass-late"];
-const OF_RIG: [&str; 8] =
-    ["antenna", "velocity-filter", "gps-wander", "focal", "no-distortion", "mount", "iron", "all-a-little"];
+const OF_RIG: [&str; 7] =
+    ["antenna", "velocity-filter", "gps-wander", "focal", "no-distortion", "mount", "iron"];
 
 /// The true value of a constant in a scenario; `None` where it is not known here.
 fn truth(kind: Kind, scenario: &Scenario) -> Option<f64> {
