@@ -197,9 +197,13 @@ fn readable_body(kind: Kind, sentence: &Sentence<'_>, report: &mut Report) -> St
         fields.resize(last + 1, String::new());
     }
     if let Some(time) = time_field(kind).and_then(|index| fields.get_mut(index))
-        && time.get(4..6) == Some("60")
+        && !time.is_empty()
     {
-        time.replace_range(4..6, "59");
+        let whole = time.find('.').unwrap_or(time.len());
+        time.insert_str(0, &"000000"[whole.min(6)..]);
+        if time.get(4..6) == Some("60") {
+            time.replace_range(4..6, "59");
+        }
     }
     if let Some(lat) = latitude_field(kind) {
         fields.iter_mut().skip(lat).take(4).for_each(String::clear);
@@ -219,6 +223,9 @@ fn readable_body(kind: Kind, sentence: &Sentence<'_>, report: &mut Report) -> St
 /// The date only where it is valid (000000 means none yet), and no variation.
 fn readable_rmc(fields: &mut [String], report: &mut Report) {
     let date = &mut fields[9];
+    if date.len() == 5 {
+        date.insert(0, '0');
+    }
     if Date::of_ddmmyy(date).is_none() {
         if !date.bytes().all(|byte| byte == b'0') {
             report.left_out.push("RMC date");
@@ -428,6 +435,27 @@ mod tests {
             (gga.alt_msl_m, gga.geoid_m, gga.hdop, gga.sats),
             (Some(1577.4), Some(-24.6), Some(1.1), Some(8))
         );
+    }
+
+    #[test]
+    fn times_and_dates_read_the_same_without_leading_zeros() {
+        for (plain, padded) in [
+            (
+                "GPRMC,93021.20,A,530.0,N,100.0,E,0.1,,10226,,,A",
+                "GPRMC,093021.20,A,530.0,N,100.0,E,0.1,,010226,,,A",
+            ),
+            (
+                "GPGGA,3021,530.0,N,100.0,E,1,8,1.1,10.0,M,,M,,",
+                "GPGGA,003021,530.0,N,100.0,E,1,8,1.1,10.0,M,,M,,",
+            ),
+            ("GNGNS,1,530.0,N,100.0,E,AN,8,1.1,10.0,,,", "GNGNS,000001,530.0,N,100.0,E,AN,8,1.1,10.0,,,"),
+            ("GPGLL,530.0,N,100.0,E,0.50,A,A", "GPGLL,530.0,N,100.0,E,000000.50,A,A"),
+            ("GPZDA,93021,1,2,2026,,", "GPZDA,093021,01,02,2026,,"),
+        ] {
+            let read = report(plain);
+            assert_eq!(read, report(padded), "{plain}");
+            assert!(read.left_out.is_empty() && read.time_of_day_ns.is_some(), "{plain}");
+        }
     }
 
     #[test]

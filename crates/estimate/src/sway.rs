@@ -21,7 +21,7 @@ use super::slip::Across;
 use super::state::State;
 
 /// Correlation time of the displacement, s: that of oscillations with periods of 0.5 to 2 s.
-const CORRELATION_S: f64 = 0.25;
+pub(crate) const CORRELATION_S: f64 = 0.25;
 /// Time constants of the two high-pass filters, s.
 const FAST_S: f64 = 0.15;
 const SLOW_S: f64 = 1.5;
