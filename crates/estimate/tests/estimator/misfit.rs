@@ -332,7 +332,7 @@ fn a_receiver_that_wanders_farther_than_configured_is_found_out() {
     };
     // Nine times the variance configured: not fitted the mean is 12.
     let mean = (1..7).map(of_flight).sum::<f64>() / 6.0;
-    assert!(mean < 5.0, "{mean}");
+    assert!(mean < 5.5, "{mean}");
 }
 
 #[test]
@@ -348,17 +348,17 @@ fn a_vehicle_that_slides_is_no_tag_that_is_turned() {
 
 #[test]
 fn a_vehicle_that_sways_on_its_springs_is_no_worse_than_its_sway() {
-    let (world, out) = flown("follow", 25.0, 3);
-    let still = score(&estimates(&out), &world, 6.0);
+    let still = means("follow", 1..4);
     for deviation in ["sway=3+bounce=5", "sway=3", "bounce=5"] {
-        let (world, out) = flown(&format!("follow+{deviation}"), 25.0, 3);
-        let score = score(&estimates(&out), &world, 6.0);
-        println!("{deviation}: {score:?}");
-        assert!(score.coverage >= 0.99 && score.nees <= 4.2, "{deviation}: {score:?}");
+        let scenario = format!("follow+{deviation}");
+        let [heading, speed, nees] = means(&scenario, 1..4);
+        println!("{deviation}: heading {heading}, speed {speed}, NEES {nees}");
+        assert!(nees <= 4.2, "{deviation}: {nees}");
         assert!(
-            score.heading < 1.6 * still.heading && score.speed < 6.0 * still.speed,
-            "{deviation}: {score:?}"
+            heading < 1.6 * still[0] && speed < 6.0 * still[1],
+            "{deviation}: {heading}, {speed}: {still:?}"
         );
+        let (_, out) = flown(&scenario, 25.0, 3);
         let sways = |(cause, _): &(MisfitCause, f64)| matches!(cause, MisfitCause::TargetSways { target: 0 });
         assert!(told(&out).iter().any(sways), "{deviation}");
     }
@@ -495,5 +495,37 @@ fn table_of_misfits() {
         let (heading, speed, yaw_rate) = (s.heading / t.heading, s.speed / t.speed, s.yaw_rate / t.yaw_rate);
         println!("{what:10} {heading:.2} {speed:.2} {yaw_rate:.2} {s:.4?} told {:.3?}", words.borrow());
         assert!(s.coverage > 0.95, "{what}: {s:?}");
+    }
+}
+
+/// Means over flights of the errors of heading and speed, and of the normalised square of three.
+fn means(scenario: &str, seeds: std::ops::Range<u64>) -> [f64; 3] {
+    let scores: Vec<_> = seeds
+        .map(|seed| {
+            let (world, out) = flown(scenario, 25.0, seed);
+            assert!(score(&estimates(&out), &world, 6.0).coverage >= 0.99, "{scenario}, seed {seed}");
+            score(&estimates(&out), &world, 6.0)
+        })
+        .collect();
+    let mean = |of: fn(&Score) -> f64| scores.iter().map(of).sum::<f64>() / scores.len() as f64;
+    [mean(|s| s.heading), mean(|s| s.speed), mean(|s| s.nees)]
+}
+
+#[test]
+fn a_camera_that_vibrates_shows_the_vehicle_nearly_as_well() {
+    let still = means("follow", 1..4);
+    let shaken = means("follow+vibration=0.1", 1..4);
+    println!("{still:?} {shaken:?}");
+    assert!(shaken[0] < 1.3 * still[0] && shaken[1] < 1.5 * still[1] && shaken[2] < 4.2, "{shaken:?}");
+}
+
+#[test]
+fn rows_of_a_camera_that_vibrates_are_displaced_each_by_itself() {
+    let still = means("follow", 1..4);
+    for scenario in ["follow+readout=15+vibration=0.1", "follow+told-readout=25+vibration=0.1"] {
+        let shaken = means(scenario, 1..4);
+        println!("{scenario}: {still:?} {shaken:?}");
+        // Without states of their own for the rows speed is thirty times as far off.
+        assert!(shaken[1] < 8.0 * still[1] && shaken[2] < 6.0, "{scenario}: {still:?} {shaken:?}");
     }
 }
