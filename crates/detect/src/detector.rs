@@ -1,20 +1,18 @@
 //! The tag detector: from an image to tags with their corners.
 
 use super::binarise::{Binariser, Bitmap, Where};
+use super::candidate::{Found, decode, detection, same_place, straighten};
 use super::components::{Labeller, Touch};
 use super::detection::TagDetection;
-use super::edges::{EdgeSearch, fit_sides};
-use super::family::{Family, TagLayout, Word};
+use super::family::{Family, TagLayout};
 use super::noise::noise_sigma;
-use super::payload;
-use super::pyramid::{Base, Level, Pyramid, Rim};
-use super::quad::{Quad, QuadFinder, SizeLimits, distance, looks_like_tag, may_be_border, polygon_area};
+use super::pyramid::{Base, Pyramid, Rim};
+use super::quad::{Quad, QuadFinder, SizeLimits, distance, may_be_border};
 use super::refine::Refiner;
 use super::roi::Roi;
 use super::simd::Simd;
-use super::tag_model::Refined;
-use nalgebra::{Matrix2, Vector2};
-use windhover_base::msg::{GrayImage, ImageView, TagFamily};
+use nalgebra::Vector2;
+use windhover_base::msg::{GrayImage, ImageView};
 
 /// Finds square tags. Buffers are kept from image to image: with images of one size the second and later ones
 /// take no memory.
@@ -56,17 +54,6 @@ impl Default for Limits {
     fn default() -> Self {
         Self { min_px: 16.0, max_hamming: 2 }
     }
-}
-
-/// A decoded tag.
-#[derive(Clone, Copy, PartialEq, Debug)]
-struct Found {
-    family: TagFamily,
-    word: Word,
-    margin: f32,
-    /// As found, in the tag's own order.
-    corners: Quad,
-    refined: Refined,
 }
 
 /// How regions of a level are looked at once more, those that touch by a corner alone taken apart.
@@ -387,83 +374,8 @@ impl Detector {
     }
 }
 
-/// A quadrilateral of a level, in frame coordinates, with its sides fitted to the image; `None` where the
-/// image does not step from dark to light along them.
-fn straighten(level: Level<'_>, quad: &Quad, gate: u8, least_share: f32) -> Option<Quad> {
-    // Seen aslant, a cell is narrower one way than the other.
-    let narrow = polygon_area(quad) / longest_edge(quad).max(1.0);
-    let least_step = f32::from(gate) / 3.0;
-    if !looks_like_tag(level.image, quad, (narrow / 16.0).clamp(0.8, 4.0), least_step, least_share) {
-        return None;
-    }
-    let search = EdgeSearch { reach: (narrow / 8.0).clamp(1.0, 3.0), least_step };
-    let quad = fit_sides(level.image, quad, search)?;
-    Some(quad.map(|p| p.map(|c| level.to_frame(c))))
-}
-
-fn longest_edge(quad: &Quad) -> f32 {
-    (0..4).map(|i| distance(quad[i], quad[(i + 1) % 4])).fold(0.0, f32::max)
-}
-
 fn negate(image: ImageView<'_>, to: &mut GrayImage) {
     (to.width, to.height, to.stride) = (image.width, image.height, image.width);
     to.data.clear();
     (0..image.height).for_each(|v| to.data.extend(image.row(v).iter().map(|p| !p)));
-}
-
-fn decode(
-    image: ImageView<'_>,
-    pyramid: &Pyramid,
-    quad: &Quad,
-    family: &Family,
-    refiner: &mut Refiner,
-) -> Option<Found> {
-    let reading = payload::read(image, pyramid, quad, family)?;
-    let word = reading.word;
-    let corners: Quad = std::array::from_fn(|i| quad[(i + word.turns) % 4]);
-    let refined = refiner
-        .refine(image, &corners, family, word.id, reading.is_over_exposed)
-        .unwrap_or_else(|| unrefined(&corners));
-    let fitted = refined.corners.map(|c| [c.x as f32, c.y as f32]);
-    if !payload::agrees(image, pyramid, &fitted, family, word.id) {
-        return None;
-    }
-    Some(Found { family: family.family, word, margin: reading.margin, corners, refined })
-}
-
-/// Corners as the coarse fit left them: good to about a tenth of a cell.
-fn unrefined(corners: &Quad) -> Refined {
-    let corners = corners.map(|p| Vector2::new(f64::from(p[0]), f64::from(p[1])));
-    let sigma = 0.5 + 0.01 * (corners[2] - corners[0]).norm();
-    let cov = Matrix2::identity() * sigma * sigma;
-    let center = corners.iter().sum::<Vector2<f64>>() / 4.0;
-    Refined { corners, corner_cov: [cov; 4], center, center_cov: cov / 2.0 }
-}
-
-/// From where on, over the outer one, a tag is no other inside it: 48h12 leaves two of its ten cells free.
-const NESTED: f32 = 0.5;
-
-/// Whether two quadrilaterals are of one tag, the first of one that was found: neither one inside it nor one around it.
-fn same_place(a: &Quad, b: &Quad) -> bool {
-    let centre = |q: &Quad| [0, 1].map(|k| q.iter().map(|p| p[k]).sum::<f32>() / 4.0);
-    let size = |q: &Quad| distance(q[0], q[2]) + distance(q[1], q[3]);
-    distance(centre(a), centre(b)) < 0.2 * distance(a[0], a[2])
-        && size(b) > NESTED * size(a)
-        && size(a) > NESTED * size(b)
-}
-
-fn detection(found: &Found) -> TagDetection {
-    let refined = &found.refined;
-    let corners = refined.corners;
-    TagDetection {
-        family: found.family,
-        id: found.word.id,
-        hamming: found.word.hamming,
-        margin: found.margin,
-        center_px: refined.center,
-        center_cov_px2: refined.center_cov,
-        corners_px: corners,
-        corner_cov_px2: refined.corner_cov,
-        size_px: (0..4).map(|i| (corners[i] - corners[(i + 1) % 4]).norm()).sum::<f64>() / 4.0,
-    }
 }

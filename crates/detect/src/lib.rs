@@ -2,6 +2,7 @@
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
 mod binarise;
+mod candidate;
 mod components;
 mod corners;
 mod detection;
