@@ -4,6 +4,7 @@ mod blind;
 mod filter;
 mod ground;
 mod honesty;
+mod matrix;
 mod misfit;
 mod ownship;
 mod time;
