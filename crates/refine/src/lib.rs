@@ -7,7 +7,7 @@ mod dense;
 mod initial;
 mod front;
 #[cfg(test)]
-mod gtsam;
+mod gtsam_tests;
 #[cfg(test)]
 mod jacobians;
 mod covariance_pass;
