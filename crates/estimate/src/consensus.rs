@@ -63,8 +63,7 @@ impl Innovations {
 
     /// Finds those inside a gate, each one alone.
     pub(crate) fn inside(&mut self, gate: f64) {
-        self.given.value[..self.n].copy_from_slice(&self.value[..self.n]);
-        self.given.cov.copy_from(&self.cov);
+        self.given.begin(self.n, &self.value, &self.cov);
         for i in 0..self.n {
             self.best[i] = self.given.square(i).is_some_and(|square| square <= gate);
         }
@@ -109,9 +108,7 @@ impl Innovations {
     /// The same with this first member.
     fn majority_from(&mut self, first: usize) -> f64 {
         let (n, given) = (self.n, &mut self.given);
-        given.value[..n].copy_from_slice(&self.value[..n]);
-        given.cov.copy_from(&self.cov);
-        given.taken[..n].fill(false);
+        given.begin(n, &self.value, &self.cov);
         given.take(first, n);
         let mut largest: f64 = 0.0;
         for _ in 0..n / 2 {
@@ -125,9 +122,7 @@ impl Innovations {
     /// Grows a set from its first member; how many it has, and the sum of their normalised squares.
     fn grow(&mut self, first: usize, gate: f64) -> (usize, f64) {
         let (n, given) = (self.n, &mut self.given);
-        given.value[..n].copy_from_slice(&self.value[..n]);
-        given.cov.copy_from(&self.cov);
-        given.taken[..n].fill(false);
+        given.begin(n, &self.value, &self.cov);
         let Some(square) = given.square(first) else { return (0, f64::INFINITY) };
         let (mut members, mut squares) = (1, square);
         given.take(first, n);
@@ -144,6 +139,13 @@ impl Innovations {
 }
 
 impl Given {
+    /// Begins with `n` of them, of which none is taken.
+    fn begin(&mut self, n: usize, value: &[Vector2<f64>], cov: &Grid) {
+        self.value[..n].copy_from_slice(&value[..n]);
+        self.cov.copy_from(cov);
+        self.taken[..n].fill(false);
+    }
+
     fn block(&self, i: usize, j: usize) -> Matrix2<f64> {
         Matrix2::from_fn(|a, b| self.cov.at(2 * i + a, 2 * j + b))
     }

@@ -272,6 +272,8 @@ impl Estimator {
     pub fn inside(&self) -> String {
         let (own, l) = (&self.core.state.own, &self.core.state.learnt);
         let cov = &self.core.state.cov;
+        let [shake_px, roll_px] =
+            self.core.state.shake.sigmas().map(|sigma| sigma * self.core.models.camera.fx);
         let targets: Vec<String> =
             l.target_q.iter().map(|q| format!("{:.3}/{:.3}", q[0].sqrt(), q[1].sqrt())).collect();
         format!(
@@ -307,8 +309,8 @@ impl Estimator {
             self.core.state.camera_late_s * 1e3,
             own.readout_s * 1e3,
             cov.sigma(own::READOUT, 0) * 1e3,
-            self.core.state.shake.sigmas()[0] * self.core.models.camera.fx,
-            self.core.state.shake.sigmas()[1] * self.core.models.camera.fx,
+            shake_px,
+            roll_px,
             own.lens.as_slice(),
             cov.sigma(own::LENS, 0),
             own.arm.x,

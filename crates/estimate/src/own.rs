@@ -363,6 +363,11 @@ impl Own {
         self.velocity + self.ned_from_body * self.rate.cross(lever_m)
     }
 
+    /// Time from the first row of a frame to the last, of which so much is configured, s.
+    pub(crate) fn whole_readout_s(&self, configured_s: f64) -> f64 {
+        configured_s + self.readout_s
+    }
+
     /// How much older the receiver's velocity is than configured, s.
     pub(crate) fn velocity_age_s(&self) -> f64 {
         self.gps_delay_s + self.velocity_delay_s

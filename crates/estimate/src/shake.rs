@@ -44,9 +44,10 @@ const MOST_RATIO: f64 = 4.0;
 const UNSEEN_RATIO: f64 = 0.7;
 /// Share of the tracks that were refused from which on it is not they that move.
 const MOSTLY: f64 = 0.6;
-/// Shorter than this from the first row to the last, all rows are exposed at once, s; by so many sigmas longer, they are not; and by how
-/// much that time is doubted, s.
+/// Shorter than this from the first row to the last, s, all rows are exposed at once: they may be exposed one after the other where
+/// it is longer with so many sigmas added, and are with so many taken off; and by how much that time is doubted, s.
 const MAY_ROLL_S: f64 = 0.004;
+const MAY_ROLL_SIGMAS: f64 = 3.0;
 const ROLLS_SIGMAS: f64 = 2.0;
 const READOUT_DOUBT_S: f64 = 0.006;
 /// That most tracks are refused is a reason to doubt it so often, s: people may be all that is seen.
@@ -173,32 +174,30 @@ impl State {
         self.cov.add(at.column(ROLL), at.column(ROLL), roll_var);
     }
 
-    /// After a frame: what its displacements were moves their variance, and they are forgotten.
-    fn end_shake(&mut self, focal_px: f64, (may_roll, rolls): (bool, bool), since_s: f64) {
-        if !self.shake.is_open() {
-            return;
-        }
+    /// After a frame: its displacements are forgotten; what they were moved by.
+    fn forget_shake(&mut self) -> [Shown; 2] {
         let at = self.layout().shake();
         let shown = self.shake_shown(at);
-        let readout_is_known = self.cov.sigma(own::READOUT, 0) < READOUT_KNOWN_S;
-        // Rows that are exposed at once can only be displaced together.
-        let witnessed = self.shake.witnessed || !may_roll;
         self.renew(at, &[0.0; SHAKE]);
-        let shake = &mut self.shake;
-        (shake.begun, shake.mean) = (false, [0.0; SHAKE]);
-        if witnessed {
-            shake.open_s += since_s;
-        }
-        if !witnessed {
-            return;
-        }
-        let held = shake.open_s < PRESUMED_S || !readout_is_known;
+        (self.shake.begun, self.shake.mean) = (false, [0.0; SHAKE]);
+        shown
+    }
+
+    /// Whether the camera was presumed to shake for long enough, and the times of its rows are known.
+    fn shake_is_settled(&self) -> bool {
+        self.shake.open_s >= PRESUMED_S && self.cov.sigma(own::READOUT, 0) < READOUT_KNOWN_S
+    }
+
+    /// Moves the variances to what a frame has shown.
+    fn fit_shake(&mut self, shown: [Shown; 2], rolls: bool, since_s: f64, focal_px: f64) {
+        let held = !self.shake_is_settled();
         // Meanwhile it may only be found to be more, where rows are exposed one after the other beyond doubt.
         if held && !rolls {
             return;
         }
         let least_ratio = if held { 1.0 } else { 0.0 };
         let gain = (since_s / FIT_OVER_S).min(0.5);
+        let shake = &mut self.shake;
         for (var, shown) in [&mut shake.displacement_var, &mut shake.roll_var].into_iter().zip(shown) {
             fit(var, shown, (gain, least_ratio), focal_px);
         }
@@ -253,18 +252,25 @@ impl Core {
         if self.at_truth || !self.state.shake.shakes() || tracks.min(self.state.features.len()) < WITNESSES {
             return;
         }
-        let readout_s = self.models.readout_s + self.state.own.readout_s;
-        let readout_s = readout_s.hypot(self.state.cov.sigma(own::READOUT, 0));
-        self.state.begin_shake(readout_s);
+        let [readout_s, sigma_s] = self.readout();
+        self.state.begin_shake(readout_s.hypot(sigma_s));
     }
 
     /// After a frame was fused.
     pub(crate) fn end_shake(&mut self, since_s: f64) {
-        let (may_roll, rolls) = (self.may_roll(), self.rolls());
-        self.state.end_shake(self.models.camera.fx, (may_roll, rolls), since_s);
+        let rolls = self.rolls();
+        if self.state.shake.is_open() {
+            let witnessed = self.state.shake.witnessed || !self.may_roll();
+            let shown = self.state.forget_shake();
+            // Rows that are exposed at once can only be displaced together: they need no witnesses.
+            if witnessed {
+                self.state.shake.open_s += since_s;
+                self.state.fit_shake(shown, rolls, since_s, self.models.camera.fx);
+            }
+        }
         let state = &mut self.state;
-        let settled = state.shake.open_s >= PRESUMED_S && state.cov.sigma(own::READOUT, 0) < READOUT_KNOWN_S;
-        if settled && std::mem::take(&mut state.shake.unsettled) && state.shake.shakes() && rolls {
+        let settled = state.shake_is_settled() && std::mem::take(&mut state.shake.unsettled);
+        if settled && state.shake.shakes() && rolls {
             // Heading was found by rows whose times were not known.
             self.loosen_heading(HEADING_SIGMA);
         }
@@ -291,16 +297,22 @@ impl Core {
         }
     }
 
+    /// Time from the first row of a frame to the last, and its sigma, s.
+    fn readout(&self) -> [f64; 2] {
+        let readout_s = self.state.own.whole_readout_s(self.models.readout_s);
+        [readout_s, self.state.cov.sigma(own::READOUT, 0)]
+    }
+
     /// Whether rows are exposed one after the other, as far as it is known.
     fn rolls(&self) -> bool {
-        let found_s = (self.models.readout_s + self.state.own.readout_s).abs();
-        found_s - ROLLS_SIGMAS * self.state.cov.sigma(own::READOUT, 0) > MAY_ROLL_S
+        let [readout_s, sigma_s] = self.readout();
+        readout_s.abs() - ROLLS_SIGMAS * sigma_s > MAY_ROLL_S
     }
 
     /// Whether rows may be exposed one after the other.
     fn may_roll(&self) -> bool {
-        let found_s = (self.models.readout_s + self.state.own.readout_s).abs();
-        found_s + 3.0 * self.state.cov.sigma(own::READOUT, 0) > MAY_ROLL_S
+        let [readout_s, sigma_s] = self.readout();
+        readout_s.abs() + MAY_ROLL_SIGMAS * sigma_s > MAY_ROLL_S
     }
 
     /// The ground does not agree with itself: the camera shakes, and what rows have shown of their times was wrong.

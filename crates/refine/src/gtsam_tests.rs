@@ -173,15 +173,15 @@ fn proof_gtsam_agrees() {
     child.stdin.take().expect("piped").write_all(text.as_bytes()).expect("it reads");
     let output = child.wait_with_output().expect("it ends");
     assert!(output.status.success());
-    let told = String::from_utf8(output.stdout).expect("numbers");
+    let answer = String::from_utf8(output.stdout).expect("numbers");
     let numbers =
         |line: &str| -> Vec<f64> { line.split(' ').map(|x| x.parse().expect("a number")).collect() };
-    let lines: Vec<Vec<f64>> = told.lines().map(numbers).collect();
+    let lines: Vec<Vec<f64>> = answer.lines().map(numbers).collect();
     let (mut worst, mut compared) = ([0.0f64; 2], 0);
-    for (key, told) in wanted.iter().zip(lines.chunks_exact(2)) {
+    for (key, other) in wanted.iter().zip(lines.chunks_exact(2)) {
         for (i, (x, sigma)) in solution[key].iter().zip(&sigmas[key]).enumerate() {
-            worst[0] = worst[0].max((told[1][i] - 1.0).abs());
-            worst[1] = worst[1].max((x / sigma - told[0][i]).abs());
+            worst[0] = worst[0].max((other[1][i] - 1.0).abs());
+            worst[1] = worst[1].max((x / sigma - other[0][i]).abs());
             compared += 1;
         }
     }

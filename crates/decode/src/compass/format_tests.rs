@@ -113,8 +113,8 @@ fn a_field_that_does_not_decide_is_left_out_alone() {
         (Vectornav, "VNYMR,98.3,1.0,2.0,0,0,0,5000,0,-9.8,0,0,0", "forces"),
     ] {
         let (out, counts) = readings(format, format!("{}\r\n", framed(body)).as_bytes());
-        let [heard] = &out[..] else { panic!("{body}: {counts}") };
-        assert_eq!(heard.reading.heading_deg, Some(98.3), "{body}");
+        let [read] = &out[..] else { panic!("{body}: {counts}") };
+        assert_eq!(read.reading.heading_deg, Some(98.3), "{body}");
         assert_eq!(counts.left_out().collect::<Vec<_>>(), [(field, 1)], "{body}");
     }
     let (out, counts) = readings(Nmea, format!("{}\r\n", framed("HCHDG,98.3,0.0,,,")).as_bytes());

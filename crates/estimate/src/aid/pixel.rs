@@ -80,7 +80,7 @@ impl Moment {
     ) -> Self {
         let share = px.y / (models.image_px.1 - 1.0) - 0.5;
         let flow = view.d_point * (velocity - own.velocity) + view.d_attitude * (own.rotation() * own.rate);
-        Self { after_s: share * (models.readout_s + own.readout_s), share, flow }
+        Self { after_s: share * own.whole_readout_s(models.readout_s), share, flow }
     }
 }
 

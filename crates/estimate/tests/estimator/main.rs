@@ -8,3 +8,4 @@ mod matrix;
 mod misfit;
 mod ownship;
 mod time;
+mod vibration;

@@ -4,7 +4,7 @@
 use windhover_base::msg::EstimatorOutput;
 use windhover_simulate::Scenario;
 
-use super::filter::{Flight, Heard, fly};
+use super::filter::{Flight, Input, fly};
 
 /// What the camera shows.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -32,9 +32,9 @@ fn flight(described: &str, shown: Shown, seed: u64) -> Flight {
             scenario.camera.features = 0;
         }
     });
-    for heard in &mut flight.heard {
-        match heard {
-            Heard::Frame(frame) if shown != Shown::Tag => frame.value.markers.clear(),
+    for input in &mut flight.inputs {
+        match input {
+            Input::Frame(frame) if shown != Shown::Tag => frame.value.markers.clear(),
             _ => {}
         }
     }
