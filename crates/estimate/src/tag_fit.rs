@@ -20,6 +20,7 @@ use super::core::Core;
 use super::matrix::Shear;
 use super::measurement::Measurement;
 use super::models::Marker;
+use super::size_test::SizeTest;
 use super::state::State;
 use super::update::Outcome;
 
@@ -45,6 +46,9 @@ pub(crate) struct TagFit {
     contradicted: u32,
     /// Whether it was opened by itself, and with all others along scale and turn.
     open: bool,
+    /// Its size beside that of the first tag of its frame, and whether it alone was opened by that.
+    pub(crate) size: SizeTest,
+    size_open: bool,
     scale_open: bool,
     turn_open: bool,
 }
@@ -53,6 +57,11 @@ impl TagFit {
     /// Whether size, place and turn of its own are open.
     pub(crate) fn is_open(&self) -> bool {
         self.open
+    }
+
+    /// Whether it is thought to be otherwise than configured.
+    pub(crate) fn differs(&self) -> bool {
+        self.open || self.size_open
     }
 }
 
@@ -136,6 +145,14 @@ impl Core {
         self.open_turn(target);
     }
 
+    /// Opens the size of a tag.
+    pub(crate) fn open_size(&mut self, target: usize, slot: usize) {
+        self.state.tags[slot].size_open = true;
+        let size = self.state.layout().tag(slot).all().part::<1>(0);
+        self.state.cov.add_diagonal(size, &[OTHERWISE[0] * OTHERWISE[0]]);
+        self.open_scale(target);
+    }
+
     /// A velocity of the receiver was compared with what is seen.
     pub(crate) fn judge_scale(&mut self, outcome: &Outcome) {
         let velocity = self.state.own.velocity;
@@ -163,7 +180,7 @@ impl Core {
             self.state.add_direction(&along, SCALE_SIGMA);
             slots().for_each(|slot| self.state.tags[slot].scale_open = true);
             let size = |slot: usize| self.state.layout().tag(slot).all().column(0);
-            let reference = slots().min_by_key(|slot| self.state.tags[*slot].open);
+            let reference = slots().min_by_key(|slot| self.state.tags[*slot].differs());
             self.state.scale = self.state.scale.or(reference.map(|slot| Scale { column: size(slot), share }));
         }
         self.along = along;
@@ -234,7 +251,7 @@ impl Core {
             model.markers.iter().enumerate().map(move |(marker, m)| (target, marker, m))
         });
         all.filter_map(|(target, marker, model)| {
-            let opened = model.fit.is_some_and(|slot| self.state.tags[slot].open);
+            let opened = model.fit.is_some_and(|slot| self.state.tags[slot].differs());
             let (against, reference) = opened.then(|| self.reference(target, marker)).flatten()?;
             let pair = MarkerPair { target, marker, against };
             Some(self.state.apart(model, reference).map(move |(k, figure)| match k {
@@ -248,7 +265,7 @@ impl Core {
 
     /// Another tag of the vehicle to measure against: one that was not opened by itself, if there is one.
     fn reference(&self, target: usize, marker: usize) -> Option<(usize, &Marker)> {
-        let open = |m: &Marker| m.fit.is_none_or(|slot| self.state.tags[slot].open);
+        let open = |m: &Marker| m.fit.is_none_or(|slot| self.state.tags[slot].differs());
         let others = self.models.targets[target].markers.iter().enumerate();
         others.filter(|(i, m)| *i != marker && m.fit.is_some()).min_by_key(|(_, m)| open(m))
     }
