@@ -58,7 +58,7 @@ impl Core {
         let tilt_var = (0..2).map(|i| self.state.cov.sigma(own::ATTITUDE, i).powi(2)).sum::<f64>();
         let common = apart * apart * (tilt_var + INCLINED * INCLINED);
         if self.state.tags[slot].size.take(by - first_by, var + first_var, common) {
-            self.open_size(target, slot);
+            self.open_sizes(target, first_slot, slot);
         }
     }
 

@@ -145,12 +145,22 @@ impl Core {
         self.open_turn(target);
     }
 
-    /// Opens the size of a tag.
-    pub(crate) fn open_size(&mut self, target: usize, slot: usize) {
-        self.state.tags[slot].size_open = true;
-        let size = self.state.layout().tag(slot).all().part::<1>(0);
-        self.state.cov.add_diagonal(size, &[OTHERWISE[0] * OTHERWISE[0]]);
-        self.open_scale(target);
+    /// Opens the sizes of two tags that contradict each other. By the first of them everything else is scaled: if it is the
+    /// wrong one, all of this is larger but the vehicle. Where the tags lie on it tells which.
+    pub(crate) fn open_sizes(&mut self, target: usize, first: usize, second: usize) {
+        let size = |slot: usize| self.state.layout().tag(slot).all().part::<1>(0);
+        let (of_first, of_second) = (size(first), size(second));
+        let mut along = std::mem::take(&mut self.along);
+        if self.scale_direction(target, &mut along).is_some() {
+            for marker in self.models.targets[target].markers.iter().filter_map(|marker| marker.fit) {
+                along[self.state.layout().tag(marker).all().range()].fill(0.0);
+            }
+            along[of_first.column(0)] = 1.0;
+            self.state.add_direction(&along, OTHERWISE[0]);
+            self.state.cov.add_diagonal(of_second, &[OTHERWISE[0] * OTHERWISE[0]]);
+            [first, second].iter().for_each(|slot| self.state.tags[*slot].size_open = true);
+        }
+        self.along = along;
     }
 
     /// A velocity of the receiver was compared with what is seen.
@@ -253,6 +263,10 @@ impl Core {
         all.filter_map(|(target, marker, model)| {
             let opened = model.fit.is_some_and(|slot| self.state.tags[slot].differs());
             let (against, reference) = opened.then(|| self.reference(target, marker)).flatten()?;
+            // Of two whose sizes alone were opened only one may be wrong.
+            if self.doubt(model) < self.doubt(reference) {
+                return None;
+            }
             let pair = MarkerPair { target, marker, against };
             Some(self.state.apart(model, reference).map(move |(k, figure)| match k {
                 0 => (FusionSource::Marker, MisfitCause::MarkerSize(pair), figure.exp()),
@@ -263,11 +277,20 @@ impl Core {
         .flatten()
     }
 
-    /// Another tag of the vehicle to measure against: one that was not opened by itself, if there is one.
+    /// Another tag of the vehicle to measure against: the one that is most likely as configured.
     fn reference(&self, target: usize, marker: usize) -> Option<(usize, &Marker)> {
-        let open = |m: &Marker| m.fit.is_none_or(|slot| self.state.tags[slot].differs());
         let others = self.models.targets[target].markers.iter().enumerate();
-        others.filter(|(i, m)| *i != marker && m.fit.is_some()).min_by_key(|(_, m)| open(m))
+        let fitted = others.filter(|(i, m)| *i != marker && m.fit.is_some());
+        fitted.min_by(|(_, a), (_, b)| self.doubt(a).total_cmp(&self.doubt(b)))
+    }
+
+    /// How much speaks against a tag being as configured; less where its size alone was opened, with another one's.
+    fn doubt(&self, marker: &Marker) -> f64 {
+        match marker.fit.map(|slot| &self.state.tags[slot]) {
+            Some(tag) if tag.open => 1.0,
+            Some(tag) if tag.size_open => tag.mean[0].abs().min(0.5),
+            _ => 0.0,
+        }
     }
 }
 
