@@ -21,6 +21,8 @@ pub(super) struct Refined {
 
 /// Part of an edge's error that remains when noise is averaged out: sampling, neighbouring cells, print. Pixels.
 pub(super) const FLOOR_PX: f64 = 0.02;
+/// The same of a fit to pixels, whose model includes neighbouring cells and sampling.
+pub(super) const PIXELS_FLOOR_PX: f64 = 0.004;
 
 /// Homography in ξ, η (row by row, last entry 1), the bow, the barrel, the twist, the shifts of edges and
 /// the spread of light.
@@ -106,12 +108,29 @@ impl Model {
         self.theta[13 + axis]
     }
 
+    /// The homography alone.
+    pub fn without_lens(&self) -> Self {
+        let mut model = *self;
+        model.theta.rows_mut(8, PARAMETERS - 8).fill(0.0);
+        model
+    }
+
+    /// The pixel of a tag point.
+    pub fn pixel(&self, xi: f64, eta: f64) -> Vector2<f64> {
+        self.at(xi, eta).0 + self.origin
+    }
+
+    /// Where the pixel coordinates of the parameters begin.
+    pub fn origin(&self) -> Vector2<f64> {
+        self.origin
+    }
+
     /// Corners and centre with their covariances; `common` are variances that all edges crossed along ξ and all those
-    /// along η share, px².
-    pub fn result(&self, covariance: &Information, common: [f64; 2]) -> Option<Refined> {
+    /// along η share, px², `floor_px` is an error that no other term contains.
+    pub fn result(&self, covariance: &Information, common: [f64; 2], floor_px: f64) -> Option<Refined> {
         let axes = self.sides.map(|s| s / s.norm().max(1e-9));
         let shared = (0..2).map(|i| axes[i] * axes[i].transpose() * common[i]);
-        let floor = shared.fold(Matrix2::identity() * FLOOR_PX.powi(2), |sum, c| sum + c);
+        let floor = shared.fold(Matrix2::identity() * floor_px.powi(2), |sum, c| sum + c);
         let at = |xi: f64, eta: f64| {
             let (p, jacobian) = self.at(xi, eta);
             (p + self.origin, jacobian * covariance * jacobian.transpose() + floor)
