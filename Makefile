@@ -93,14 +93,12 @@ SOAK_S ?= 3600
 soak: setup-python debug
 	$(VENV)/bin/python tests/soak/soak.py --seconds $(SOAK_S)
 
-# Every parser of foreign bytes under a fuzzer, a minute each; FUZZ_S=600 for ten.
+# Every parser of foreign bytes under a fuzzer, a minute each; FUZZ_S=600 for ten, TARGETS="mcap link" for some.
 FUZZ_S ?= 60
+TARGETS ?=
 fuzz: setup
 	test -x target/tools/bin/cargo-fuzz || $(CARGO) install cargo-fuzz --locked --root target/tools
-	python3 fuzz/seeds.py fuzz/corpus
-	for target in $$(sed -n 's/^name = "\(.*\)"/\1/p' fuzz/Cargo.toml | tail -n +2); do \
-	    PATH="$$PWD/target/tools/bin:$$PATH" RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run -s none $$target -- \
-	        -max_total_time=$(FUZZ_S) -rss_limit_mb=3000 || exit 1; done
+	PATH="$$PWD/target/tools/bin:$$PATH" sh fuzz/run.sh $(FUZZ_S) $(TARGETS)
 
 # Real recordings and frames against limits: make test-real DATA=FOLDER.
 test-real: debug
@@ -117,6 +115,7 @@ test-zenoh: setup-python
 
 # Tests that take minutes each; two ignored ones make goldens and captures again.
 proofs: setup
+	@sh tests/setup/venv.sh target/venv-gtsam crates/refine/tests/gtsam/requirements.txt each
 	$(CARGO) build --locked --release --example store_load
 	$(CARGO) test --locked --release --no-fail-fast --lib --tests -- --ignored --nocapture --skip make_
 

@@ -68,7 +68,7 @@ fn main() -> Result<()> {
         simulate(&args, &flight)?;
     }
     let camera = tempfile::tempdir_in(&args.frames_in)?;
-    let bytes = unpack(&flight, camera.path())?;
+    let Unpacked { bytes, first_exposure } = unpack(&flight, camera.path())?;
     let card = dir.join("card");
     let _ = fs::remove_dir_all(&card);
     fs::create_dir(&card)?;
@@ -88,7 +88,11 @@ fn main() -> Result<()> {
         .stderr(File::create(&log)?)
         .spawn()?;
     let flight_s = args.flight_s;
-    let feeder = Background::start(move |asked| feed(&bytes, flight_s, gps.0, compass.0, asked));
+    let began = camera_up(&log, &mut daemon)?;
+    let feeder = Background::start(move |asked| {
+        let lines = Lines { bytes: &bytes, gps: gps.0, compass: compass.0 };
+        feed(lines, flight_s, began, first_exposure, asked)
+    });
     let bystander = Background::start(stand_by);
     let busy: Vec<_> = (0..args.busy).map(|_| Background::start(compute)).collect();
     let memory = watch(&mut daemon, args.seconds)?;
@@ -137,9 +141,17 @@ fn simulate(args: &Args, flight: &Path) -> Result<()> {
 /// Bytes of a line, and when they came.
 type Bytes = Vec<(Span, bool, Vec<u8>)>;
 
-/// Writes the frames into a folder that the recorded camera plays; returns the bytes of both lines.
-fn unpack(flight: &Path, camera: &Path) -> Result<Bytes> {
+/// What a flight holds beside its frames; times since its first event.
+struct Unpacked {
+    bytes: Bytes,
+    /// Exposure of the first frame. It is negative where the frame's arrival is the first event.
+    first_exposure: Span,
+}
+
+/// Writes the frames into a folder that the recorded camera plays.
+fn unpack(flight: &Path, camera: &Path) -> Result<Unpacked> {
     let (mut list, mut bytes, mut first) = ("time_s,file\n".to_owned(), Vec::new(), None);
+    let mut first_exposure = None;
     for event in CaptureReader::open(flight)?.filter_map(|item| item.event) {
         let since = event.t_recv - *first.get_or_insert(event.t_recv);
         match event.body {
@@ -149,13 +161,29 @@ fn unpack(flight: &Path, camera: &Path) -> Result<Bytes> {
                 let name = format!("{:05}.pgm", frame.index);
                 let head = format!("P5\n{} {}\n255\n", frame.width, frame.height);
                 fs::write(camera.join(&name), [head.as_bytes(), &frame.data].concat())?;
-                list += &format!("{:.6},{name}\n", (since + (frame.t_exposure - event.t_recv)).s());
+                let exposed = since + (frame.t_exposure - event.t_recv);
+                first_exposure.get_or_insert(exposed);
+                list += &format!("{:.6},{name}\n", exposed.s());
             }
             _ => {}
         }
     }
     fs::write(camera.join("times.csv"), list)?;
-    Ok(bytes)
+    Ok(Unpacked { bytes, first_exposure: first_exposure.ok_or("the flight has no frames")? })
+}
+
+/// Waits until the daemon plays the camera's frames; returns when that was, to a millisecond.
+fn camera_up(log: &Path, daemon: &mut Child) -> Result<Instant> {
+    loop {
+        let text = fs::read_to_string(log)?;
+        if text.lines().any(|line| line.contains("event=device_up") && line.contains("about=camera")) {
+            return Ok(Instant::now());
+        }
+        if let Some(status) = daemon.try_wait()? {
+            return Err(format!("the daemon ended before its camera was up: {status}").into());
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
 }
 
 /// A pseudo-terminal: its far end, and the path of its near end.
@@ -213,14 +241,29 @@ struct Written {
     data: Vec<u8>,
 }
 
-/// Feeds both lines at the real pace, repeatedly; returns what it wrote.
-fn feed(bytes: &Bytes, flight_s: u64, mut gps: File, mut compass: File, asked: &AtomicBool) -> Vec<Written> {
-    let began = Instant::now();
+/// Both serial lines, and what is written into them.
+struct Lines<'a> {
+    bytes: &'a Bytes,
+    gps: File,
+    compass: File,
+}
+
+/// Feeds both lines at the real pace, repeatedly; returns what it wrote. The first frame was exposed at `began`, so that
+/// bytes and frames have the flight's own times to each other.
+fn feed(
+    lines: Lines<'_>,
+    flight_s: u64,
+    began: Instant,
+    first_exposure: Span,
+    asked: &AtomicBool,
+) -> Vec<Written> {
+    let Lines { bytes, mut gps, mut compass } = lines;
     let clock = HostClock::start();
     let mut written = Vec::new();
     for round in 0.. {
         for (since, is_gps, data) in bytes {
-            let due = Duration::from_secs(round * flight_s) + Duration::from_secs_f64(since.s().max(0.0));
+            let since_exposure = (*since - first_exposure).s().max(0.0);
+            let due = Duration::from_secs(round * flight_s) + Duration::from_secs_f64(since_exposure);
             std::thread::sleep(due.saturating_sub(began.elapsed()));
             if asked.load(Ordering::Acquire) {
                 return written;

@@ -1,6 +1,7 @@
 """Small whole inputs for fuzz targets whose formats a fuzzer does not find by itself in minutes: seeds.py CORPUS. Nothing but Python's
 library is needed; inputs already there are kept."""
 
+import base64
 import io
 import pathlib
 import sqlite3
@@ -93,11 +94,95 @@ def y4m():
     return out.getvalue()
 
 
+# 16 by 16 pixels in colour.
+JPEG = base64.b64decode(
+    "/9j/4AAQSkZJRgABAgAAAQABAAD/2wBDAAgEBAQEBAUFBQUFBQYGBgYGBgYGBgYGBgYHBwcICAgHBwcGBgcHCAgICAkJCQgICAgJCQoKCgwMCwsODg4RERT/"
+    "xABsAAEBAQAAAAAAAAAAAAAAAAAGAwUBAQEAAAAAAAAAAAAAAAAAAAECEAACAgEEAAUFAQAAAAAAAAADBAIFAREHEgYiIRQAExYkIzFBFREAAgEEAwEBAQAA"
+    "AAAAAAAAAQIDBgURBBMSFCEiFf/AABEIABAAEAMBIgACEQADEQD/2gAMAwEAAhEDEQA/ADMqi1292romk7A6djZJL2k2q9o4ZwC9JdpQUCQiAkJQVc4sRjrj"
+    "JZExznDEc+23ee4r7NdsRsaqvTUqwtL/AOggkitCJEyelGx6cQ5LRixETJyL/lGPJ8xyXlHXGcq3V693DbTrYvqWrRgjV1dUYvzLHjDKSya0Sk+7FgfzSUlo"
+    "OWfDmWY8pcfOO7dX2Pca/sagFDbK5Fw4FEo07k2mAS8I4gD+4g5eUpeUtf57m4COpkpGSk8ILa1QmpMH+U07EW7pyLt+ZriY1Gz8hE/EGOeocZNRl2Kks1P3"
+    "fo1zhN5G3HthRA546jWxZ25Mak7RxvZPFiVzGIoCuOD8/wD/2Q=="
+)
+
+
+def avi():
+    """The target puts RIFF before it."""
+    chunk = lambda name, body: name + struct.pack("<I", len(body)) + body + bytes(len(body) % 2)  # noqa: E731
+    header = chunk(b"LIST", b"hdrl" + chunk(b"avih", struct.pack("<I", 66_667) + bytes(52)))
+    body = b"AVI " + header + chunk(b"LIST", b"movi" + chunk(b"00dc", JPEG) + chunk(b"00dc", b""))
+    return struct.pack("<I", len(body)) + body
+
+
+def geotiff():
+    """4 by 4 heights of 16 bits at 30 degrees north, 86 west; the second has no height."""
+    heights = struct.pack("<16h", 10, -32768, *range(14))
+    scale, tie, keys = struct.pack("<3d", 0.1, 0.1, 0), struct.pack("<6d", 0, 0, 0, -86, 30, 0), struct.pack("<8H", 1, 1, 0, 1, 1024, 0, 1, 2)
+    entries = [(256, 3, 1, 4), (257, 3, 1, 4), (258, 3, 1, 16), (259, 3, 1, 1), (262, 3, 1, 1), (273, 4, 1, "heights"), (277, 3, 1, 1),
+               (278, 3, 1, 4), (279, 4, 1, len(heights)), (339, 3, 1, 2), (33550, 12, 3, "scale"), (33922, 12, 6, "tie"),
+               (34735, 3, 8, "keys"), (42113, 2, 7, "void")]
+    parts = {"heights": heights, "scale": scale, "tie": tie, "keys": keys, "void": b"-32768\0"}
+    at, places = 8 + 2 + 12 * len(entries) + 4, {}
+    for name, part in parts.items():
+        places[name], at = at, at + len(part)
+    ifd = b"".join(struct.pack("<HHII", tag, kind, count, places.get(value, value)) for tag, kind, count, value in entries)
+    return b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", len(entries)) + ifd + bytes(4) + b"".join(parts.values())
+
+
+def mcap():
+    """A serial read and a frame, beside a chunk and in one without compression and checksum. The target puts the magic before it."""
+    text = lambda value: struct.pack("<I", len(value)) + value  # noqa: E731
+    record = lambda op, body: bytes([op]) + struct.pack("<Q", len(body)) + body  # noqa: E731
+    field = lambda number, body: bytes([number << 3 | 2, len(body) & 127 | 128, len(body) >> 7]) + body  # noqa: E731
+    stamp = field(1, b"\x08" + bytes([0xE5, 0xD5, 0xF5, 0xD7, 0x06]))
+    kinds = [(b"/gps/serial", b"windhover.SerialBytes", stamp + field(2, b"$GPZDA,,,,,,*48\r\n")),
+             (b"/camera/image", b"foxglove.CompressedImage", stamp + field(2, JPEG) + field(3, b"jpeg") + field(4, b"camera"))]
+    records = b""
+    for n, (topic, schema, data) in enumerate(kinds, 1):
+        records += record(3, struct.pack("<H", n) + text(schema) + text(b"protobuf") + text(b""))
+        records += record(4, struct.pack("<HH", n, n) + text(topic) + text(b"protobuf") + text(b""))
+        records += record(5, struct.pack("<HIQQ", n, n, UTC_S * 10**9, UTC_S * 10**9) + data)
+    chunk = record(6, struct.pack("<QQQI", 0, UTC_S * 10**9, len(records), 0) + text(b"") + struct.pack("<Q", len(records)) + records)
+    configuration = record(9, struct.pack("<QQ", 0, 0) + text(b"windhover.toml") + text(b"text/plain") + struct.pack("<Q", 4) + b"[gps" + bytes(4))
+    return record(1, text(b"") + text(b"seed")) + records + chunk + configuration + record(15, bytes(4)) + record(2, bytes(20)) + b"\x89MCAP0\r\n"
+
+
+def receiver():
+    """Bodies of sentences, a line each, to which the target gives checksums; its first byte is the length of reads."""
+    return b"\x20" + "\n".join([
+        "GPRMC,101112.2,A,3030.0000,S,08530.0000,W,010.0,090.5,010226,003.4,W,D", "GPGGA,101112.2,3030.0,S,08530.0,W,2,08,1.1,1577.4,M,-24.6,M,,",
+        "GNGNS,101112.2,3030.0,S,08530.0,W,AAN,14,0.6,50.1,48.0,1.0,0000,V", "GPGSA,A,3,01,03,,14,,,,,,,,,3.1,3.0,1.0",
+        "GPGLL,3030.0,S,08530.0,W,101112.2,A,A", "GPZDA,101112.2,18,11,2026,00,00", "GPGST,101112.2,1,1,1,0,1.0,1.0,2.0", "GPVTG,90.0,T,,M,10,N,36.0,K,A",
+        "PGRME,15.0,M,45.0,M,25.0,M", "PGRMV,-2.5,-1.1,0.3", "PGRMF,223,424802,010226,140002,13,3030.0000,N,08530.0000,W,A,2,36,090,2,1"]).encode()
+
+
+def compass():
+    """The same for compasses; the first byte is also the format."""
+    return b"\x07" + "\n".join([
+        "C328.3P28.4R-12.4X55.11T22.3E000", "OHPR,320.5,0.2,-18.3,19.0", "PTNTHPR,85.9,N,-0.9,M,0.8,O", "PTNTHTM,16384,N,182,N,-182,N,13641,2454",
+        "PASHR,204132.000,010.51,T,+00.39,-00.79,-00.84,0.151,0.075,0.555,1,0", "HCHDG,359.0,2.0,E,3.4,W", "HCXDR,A,-1.5,D,PITCH,A,2.5,D,ROLL",
+        "GPTHS,274.0,A", "VNYMR,+085.123,-000.900,+000.800,+01.06,-00.25,+03.06,+00.005,+00.344,-09.758,-0.001,+0.002,-0.003",
+        "VNQTN,0,0,0,1", "PTNL,AVR,212405.20,-10.5,Yaw,+1.5,Tilt,-2.5,Roll,12.575,3,1.4,16", "PSSN,HRP,142820.2,010120,127.5,,-1.5,0.1,,0.2,12,2,E"]).encode()
+
+
+def timed():
+    return b"1795014245.501 $GPZDA,,,,,,*48\n2026-11-18 16:04:05,501+0100\t$GPZDA,,,,,,*48\nWed Nov 18 15:04:05 2026: x\n"
+
+
+def rows():
+    return b"1.0,90,1,2,0.1,0.2,-9.8\n2026-11-18T15:04:05Z,1,2,3,,,\n"
+
+
 SEEDS = {
     "logs": {"ulog": ulog, "dataflash": dataflash, "tlog": tlog, "srt": srt},
     "bags": {"ros1": ros1, "ros2": ros2},
     # The target puts the magic before it.
-    "video": {"y4m": y4m},
+    "video": {"y4m": y4m, "avi": avi, "jpeg": lambda: JPEG},
+    "terrain": {"tiff": geotiff},
+    "mcap": {"flight": mcap},
+    "gnss": {"sentences": receiver},
+    "compass": {"sentences": compass},
+    "mavlink": {"heartbeat": tlog},
+    "texts": {"log": timed, "table": rows},
 }
 
 

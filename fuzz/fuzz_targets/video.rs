@@ -9,7 +9,7 @@ use windhover_base::time::MonoTime;
 /// Starts of the supported formats; any other input would be given to an installed ffmpeg.
 const BEGINS: [&[u8]; 2] = [b"YUV4MPEG2 ", b"RIFF"];
 
-fuzz_target!(|data: &[u8]| {
+fuzz_target!(init: without_programs(), |data: &[u8]| {
     for begin in BEGINS {
         windhover_fuzz::with_file("video", &[begin, data], |path| {
             let Ok((_, frames)) = open_video(path, MonoTime::default()) else { return };
@@ -20,3 +20,9 @@ fuzz_target!(|data: &[u8]| {
     }
     let _ = pixels::picture(data);
 });
+
+/// Hides ffmpeg, which is called for what is not Motion JPEG: a process for each input, and its parsers are not ours.
+fn without_programs() {
+    // SAFETY: called once, before any other thread begins.
+    unsafe { std::env::set_var("PATH", "") };
+}

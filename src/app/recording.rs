@@ -53,6 +53,7 @@ pub fn whole(flight: &Flight) -> windhover_refine::Recording {
         readings: attitude,
         frames: flight.detections.iter().map(frame).collect(),
         positions: Vec::new(),
+        surveyed: Vec::new(),
     }
 }
 

@@ -1,5 +1,6 @@
 //! `windhover calibrate`
 
+mod adopt;
 mod board;
 mod boresight;
 mod intrinsics;
@@ -10,7 +11,7 @@ use super::CliResult;
 /// Calibrate the camera and its mounting.
 ///
 /// First the lens, from photographs of a printed board; then, from a flight over a tag at rest, the mounting angles of
-/// camera and compass and the latency of each sensor.
+/// camera and compass and the latency of each sensor. Any later flight shows what of its configuration is wrong.
 #[derive(clap::Args, Debug)]
 pub(super) struct Args {
     #[command(subcommand)]
@@ -22,6 +23,7 @@ enum What {
     Board(board::Args),
     Intrinsics(intrinsics::Args),
     Boresight(boresight::Args),
+    Adopt(adopt::Args),
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
@@ -29,5 +31,6 @@ pub(super) fn run(args: &Args) -> CliResult {
         What::Board(args) => board::run(args),
         What::Intrinsics(args) => intrinsics::run(args),
         What::Boresight(args) => boresight::run(args),
+        What::Adopt(args) => adopt::run(args),
     }
 }

@@ -20,6 +20,7 @@ mod report;
 mod run;
 mod simulate;
 mod store;
+mod surveyed;
 
 pub use error::{CliError, CliResult};
 
@@ -78,11 +79,12 @@ pub fn main() -> ExitCode {
     let matches = with_negative_numbers(Cli::command()).try_get_matches();
     let cli = match matches.and_then(|matches| Cli::from_arg_matches(&matches)) {
         Ok(cli) => cli,
-        Err(error) => {
-            let code = if error.use_stderr() { error::WRONG_USAGE } else { error::DONE };
+        // Help and version.
+        Err(asked) if !asked.use_stderr() => return error::exit_code(out::written(asked.print())),
+        Err(wrong) => {
             // Where even the message cannot be written, nothing can be done.
-            let _ = error.print();
-            return ExitCode::from(code);
+            let _ = wrong.print();
+            return ExitCode::from(error::WRONG_USAGE);
         }
     };
     let result = match cli.command {

@@ -1,15 +1,16 @@
-//! `windhover refine FLIGHT… [--out FILE] [--adopt] [--positions FILE] [--truth TRUTH.csv]`
+//! `windhover refine FLIGHT… [--out FILE] [--adopt] [--redetect] [--positions FILE] [--surveyed ID:PLACE] [--truth TRUTH.csv]`
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::surveyed::SurveyedArgs;
 use super::{CliError, CliResult, place};
 use crate::app::flight::Flight;
 use crate::app::refine::{
     RefineFlightError, RefinedFlight, adopted, beside, constant_words, refine_flights, source_name,
 };
-use crate::app::replay::ReplayError;
+use crate::app::replay::{self, ReplayError};
 use crate::app::report;
 use crate::app::truth::Truth;
 use crate::cli::out::{note, out, outln};
@@ -27,8 +28,10 @@ use crate::text::one_line;
   windhover refine flight.mcap                              # flight.refined.mcap
   windhover refine flight.mcap --adopt                      # and the determined constants as TOML
   windhover refine flight.mcap --truth flight.truth.csv --out refined.mcap
+  windhover refine flight.mcap --redetect                   # from its pictures, with this version's detector
   windhover refine monday.mcap tuesday.mcap                 # two flights over the same markers, with constants in common
   windhover refine flight.mcap --positions base.pos         # with a base station's solution (RTKLIB, GPX, CSV)
+  windhover refine survey.mcap --surveyed 7:30.069604785,-85.575391587,6.0
   windhover export refined.mcap --format csv                # refined.csv among the tables")]
 pub(super) struct Args {
     /// Flights: .mcap files, or directories of segments; several are of the same vehicles and configuration
@@ -40,10 +43,15 @@ pub(super) struct Args {
     /// Print the constants that the flight determines (beyond three sigmas) as TOML for the configuration
     #[arg(long)]
     adopt: bool,
+    /// Detect markers and ground features in the pictures again, with this version's detector, and refine that
+    #[arg(long)]
+    redetect: bool,
     /// External positions of the antenna: RTKLIB's .pos, a .gpx track, or .csv with time_ns or utc, lat_deg, lon_deg,
     /// height_m (above the ellipsoid), sigma_m
     #[arg(long, value_name = "FILE")]
     positions: Option<PathBuf>,
+    #[command(flatten)]
+    surveyed: SurveyedArgs,
     /// Compare the first flight with true positions: CSV as `windhover report` takes it
     #[arg(long, value_name = "TRUTH.csv")]
     truth: Option<PathBuf>,
@@ -63,19 +71,13 @@ pub(super) fn run(args: &Args) -> CliResult {
     let inputs = Inputs::of(read.map(PathBuf::as_path));
     outs.iter().try_for_each(|out| place::check(out, &inputs, &Maker::Refine.marks()))?;
     let truth = args.truth.as_deref().map(Truth::read).transpose()?;
-    let bar = progress_bar();
-    let done = refine_flights(&args.flights, args.positions.as_deref(), &mut |share| {
-        bar.set_position((share * STEPS as f64) as u64);
-        true
-    });
-    bar.finish_and_clear();
-    let done = done.map_err(|error| match error {
-        RefineFlightError::Config(wrong @ (ReplayError::NoConfig { .. } | ReplayError::BadConfig { .. })) => {
-            CliError::config(wrong)
-        }
-        other => CliError::failed(other),
-    })?;
-    for ((done, from), to) in done.iter().zip(&args.flights).zip(&outs) {
+    let anew = if args.redetect { redetected(&args.flights, &outs)? } else { Vec::new() };
+    let flights: Vec<PathBuf> = match args.redetect {
+        true => anew.iter().map(|anew| anew.0.clone()).collect(),
+        false => args.flights.clone(),
+    };
+    let done = refined(&flights, args.positions.as_deref(), &args.surveyed)?;
+    for ((done, from), to) in done.iter().zip(&flights).zip(&outs) {
         done.write(from, to)?;
         for warning in done.flight.warnings.iter().chain(&done.remarks) {
             note!("windhover: {}", one_line(warning));
@@ -93,7 +95,52 @@ pub(super) fn run(args: &Args) -> CliResult {
     Ok(())
 }
 
-fn print_adopted(done: &RefinedFlight) -> CliResult {
+/// A flight as the pipeline makes it of a recording, while it is needed.
+struct Redetected(PathBuf);
+
+impl Drop for Redetected {
+    fn drop(&mut self) {
+        // Nothing is lost where it stays.
+        let _ = std::fs::remove_file(&self.0);
+    }
+}
+
+/// Replays flights, each beside its result.
+fn redetected(flights: &[PathBuf], outs: &[PathBuf]) -> Result<Vec<Redetected>, CliError> {
+    let one = |(flight, out): (&PathBuf, &PathBuf)| {
+        let config = replay::config_of(flight).map_err(|error| match error {
+            ReplayError::BadConfig { .. } | ReplayError::NoConfig { .. } => CliError::config(error),
+            other => CliError::failed(other),
+        })?;
+        let anew = Redetected(out.with_extension("redetected.mcap"));
+        replay::replay(flight, &config, Some(&anew.0), false, &mut |_| {})?;
+        Ok(anew)
+    };
+    flights.iter().zip(outs).map(one).collect()
+}
+
+/// Refines flights, with a progress bar.
+pub(super) fn refined(
+    flights: &[PathBuf],
+    positions: Option<&Path>,
+    surveyed: &SurveyedArgs,
+) -> Result<Vec<RefinedFlight>, CliError> {
+    let bar = progress_bar();
+    let done = refine_flights(flights, positions, &surveyed.tags(), &mut |share| {
+        bar.set_position((share * STEPS as f64) as u64);
+        true
+    });
+    bar.finish_and_clear();
+    done.map_err(|error| match error {
+        RefineFlightError::Config(wrong @ (ReplayError::NoConfig { .. } | ReplayError::BadConfig { .. })) => {
+            CliError::config(wrong)
+        }
+        other => CliError::failed(other),
+    })
+}
+
+/// Prints the constants that a flight determines to differ from its configuration, as TOML.
+pub(super) fn print_adopted(done: &RefinedFlight) -> CliResult {
     let toml = adopted(&done.refined, &done.config);
     if toml.is_empty() {
         note!("the flight determines no constant that differs from the configuration");

@@ -96,6 +96,10 @@ struct Frame {
 /// Most warnings that are kept: a badly damaged file has more than anyone reads.
 const MOST_WARNINGS: usize = 100;
 
+/// 1 January 2200, Unix time: a message that is stamped later is damaged. One such stamp would have the pipeline wait for
+/// centuries of silence.
+const LATEST_NS: u64 = 7_258_118_400_000_000_000;
+
 /// Adds a warning, or once a note that further ones are not listed.
 pub(super) fn warn(warnings: &mut Vec<String>, text: String) {
     match warnings.len() {
@@ -300,6 +304,10 @@ impl OpenFile {
         };
         if let McapRecord::Message { header, data } = record {
             let Some(channel) = self.definitions.channels.get(&header.channel_id) else { return Step::Other };
+            if header.log_time > LATEST_NS {
+                warn(warnings, self.damaged("a message of the year 2200 or later"));
+                return Step::Other;
+            }
             return Step::Message(RawMessage {
                 channel: Arc::clone(channel),
                 log_time: MonoTime::from_unsigned_ns(header.log_time),

@@ -148,7 +148,8 @@ fn a_reader_who_goes_ends_a_command_quietly_and_a_full_disk_is_an_error() {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/windhover.toml");
     std::fs::copy(shipped, dir.path().join("c.toml")).unwrap();
     std::fs::create_dir_all(dir.path().join("card/FLIGHTS")).unwrap();
-    let commands: [&[&str]; 8] = [
+    let commands: [&[&str]; 9] = [
+        &["--help"],
         &["check-config", "c.toml"],
         &["detect", "a.png"],
         &["detect", "a.png", "--json"],

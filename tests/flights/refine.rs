@@ -23,6 +23,9 @@ fn a_refined_flight_stands_beside_the_real_one() {
     // Then constants that it determines are printed, and those that it does not.
     assert!(text.contains("constants of the configuration"), "{text}");
     assert!(text.contains("not determined by this flight"), "{text}");
+    // What of them differs from the configuration beyond doubt is TOML.
+    let adopted = run(&["calibrate", "adopt", "flight.mcap"], dir.path());
+    assert!(adopted.parse::<toml::Table>().is_ok(), "{adopted}");
     // And a file beside it has the flight without its pictures, and a refined estimate a frame.
     let (flight, refined) = (
         Flight::read(&dir.path().join("flight.mcap")).expect("a flight"),

@@ -97,6 +97,21 @@ fn a_wrong_byte_costs_a_chunk_at_most_and_never_the_program() {
 }
 
 #[test]
+fn a_stamp_that_cannot_be_costs_its_message() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("capture.mcap");
+    let mut writer = CaptureWriter::create(&path, CONFIG, at(0)).unwrap();
+    let event = |t_recv| Event { t_recv, seq: 0, body: EventBody::SourceUp(Source::Gps) };
+    for t_recv in [at(0), at(50), MonoTime::from_ns(i64::MAX)] {
+        writer.write(&event(t_recv)).unwrap();
+    }
+    writer.finish().unwrap();
+    let (got, warnings) = read(&path);
+    assert_eq!(got.iter().map(|event| event.t_recv).collect::<Vec<_>>(), [at(0), at(50)]);
+    assert!(matches!(&warnings[..], [one] if one.contains("damaged and skipped")), "{warnings:?}");
+}
+
+#[test]
 fn other_files_are_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("notes.mcap");

@@ -24,8 +24,8 @@ fn of_pgrme(sentence: &Sentence<'_>) -> Result<Report, Refusal> {
         return Err(Refusal::Malformed);
     }
     let mut report = Report::new(Kind::Pgrme);
-    report.hpe_m = sentence.number(1, 0.0, 1e6)?;
-    report.vpe_m = sentence.number(3, 0.0, 1e6)?;
+    report.hpe_m = report.optional("PGRME horizontal error", sentence.number(1, 0.0, 1e6));
+    report.vpe_m = report.optional("PGRME vertical error", sentence.number(3, 0.0, 1e6));
     Ok(report)
 }
 
@@ -50,6 +50,9 @@ fn of_pgrmf(sentence: &Sentence<'_>) -> Result<Report, Refusal> {
     }
     let mut report = Report::new(Kind::Pgrmf);
     report.date = Date::of_ddmmyy(sentence.field(3));
+    if report.date.is_none() && sentence.field(3).bytes().any(|byte| byte != b'0') {
+        report.left_out.push("PGRMF date");
+    }
     report.time_of_day_ns = time_of_day_ns(sentence.field(4))?;
     let lat_deg = angle_deg(sentence.field(6), sentence.field(7), "N", "S")?;
     let lon_deg = angle_deg(sentence.field(8), sentence.field(9), "E", "W")?;
@@ -101,8 +104,18 @@ mod tests {
     }
 
     #[test]
+    fn a_field_that_does_not_decide_is_left_out_alone() {
+        let errors = report("PGRME,-1.0,M,45.0,M,25.0,M");
+        assert_eq!((errors.hpe_m, errors.vpe_m), (None, Some(45.0)));
+        assert_eq!(errors.left_out, ["PGRME horizontal error"]);
+        let fix = report("PGRMF,x,424802,310226,140002,13,3030.0000,N,08530.0000,W,A,2,36,090,x,1");
+        assert_eq!((fix.date, fix.position_deg), (None, Some((30.5, -85.5))));
+        assert_eq!(fix.left_out, ["PGRMF date"]);
+    }
+
+    #[test]
     fn damage_is_refused() {
-        for body in ["PGRME", "PGRMV,1,2", "PGRMV,1,x,3", "PGRMF,1,2,3", "PGRME,-1.0,M,1.0,M,1.0,M"] {
+        for body in ["PGRME", "PGRMV,1,2", "PGRMV,1,x,3", "PGRMF,1,2,3"] {
             assert!(read(&Sentence { body }).is_err(), "{body}");
         }
     }

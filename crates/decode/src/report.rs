@@ -51,12 +51,13 @@ impl Date {
         real.then_some(Self { year, month, day })
     }
 
-    /// `ddmmyy` as in RMC and PGRMF; years 83 to 99 are of the last century, because NMEA 0183 is of 1983. `None` where
+    /// `ddmmyy` as in RMC and PGRMF, also without a leading zero; years 83 to 99 are of the last century, because NMEA 0183 is of 1983. `None` where
     /// empty or not a day.
     pub(super) fn of_ddmmyy(text: &str) -> Option<Self> {
-        if text.len() != 6 || !text.bytes().all(|byte| byte.is_ascii_digit()) {
+        if !(5..=6).contains(&text.len()) || !text.bytes().all(|byte| byte.is_ascii_digit()) {
             return None;
         }
+        let text = format!("{text:0>6}");
         let two = |from: usize| text[from..from + 2].parse::<u8>().ok();
         let year = i32::from(two(4)?);
         Self::new(if year >= 83 { 1900 + year } else { 2000 + year }, two(2)?, two(0)?)
@@ -141,16 +142,18 @@ impl Report {
     }
 }
 
-/// Time of day from `hhmmss[.fraction]`, nanoseconds; second 60 only in the day's last minute.
+/// Time of day from `hhmmss[.fraction]`, nanoseconds; second 60 only in the day's last minute. As in angles the last two digits
+/// before the point are seconds, whatever the number of leading zeros.
 pub(super) fn time_of_day_ns(text: &str) -> Result<Option<i64>, Refusal> {
     if text.is_empty() {
         return Ok(None);
     }
     let (whole, fraction) = text.split_once('.').unwrap_or((text, ""));
     let digits = |part: &str| part.bytes().all(|byte| byte.is_ascii_digit());
-    if whole.len() != 6 || !digits(whole) || !digits(fraction) || fraction.len() > 9 {
+    if !(1..=6).contains(&whole.len()) || !digits(whole) || !digits(fraction) || fraction.len() > 9 {
         return Err(Refusal::Malformed);
     }
+    let whole = format!("{whole:0>6}");
     let two = |from: usize| whole[from..from + 2].parse::<i64>().map_err(|_| Refusal::Malformed);
     let (hour, minute, second) = (two(0)?, two(2)?, two(4)?);
     let leap = (hour, minute, second) == (23, 59, 60);
@@ -202,6 +205,11 @@ mod tests {
         assert_eq!(time_of_day_ns("000001.2"), Ok(Some(1_200_000_000)));
         assert_eq!(time_of_day_ns("235960.5"), Ok(Some(86_400_500_000_000)));
         assert_eq!(time_of_day_ns(""), Ok(None));
+        assert_eq!(time_of_day_ns("93021.00"), time_of_day_ns("093021"));
+        assert_eq!(time_of_day_ns("3021"), time_of_day_ns("003021"));
+        assert_eq!(time_of_day_ns("0.5"), Ok(Some(500_000_000)));
+        assert_eq!(time_of_day_ns(".5"), Err(Refusal::Malformed));
+        assert_eq!(time_of_day_ns("9961"), Err(Refusal::OutOfRange));
         assert_eq!(time_of_day_ns("115960"), Err(Refusal::OutOfRange));
         assert_eq!(time_of_day_ns("240000"), Err(Refusal::OutOfRange));
         assert_eq!(time_of_day_ns("1234567"), Err(Refusal::Malformed));
@@ -265,6 +273,8 @@ mod tests {
         assert_eq!(Date::of_ddmmyy("290224"), Date::new(2024, 2, 29));
         assert!(Date::of_ddmmyy("290223").is_none());
         assert!(Date::of_ddmmyy("000000").is_none());
+        assert_eq!(Date::of_ddmmyy("10226"), Date::new(2026, 2, 1));
+        assert!(Date::of_ddmmyy("226").is_none());
         assert_eq!(Date::of_ddmmyy("060183").map(|date| date.year), Some(1983));
     }
 }

@@ -260,8 +260,8 @@ fn covariance(cov: &NavCovRef<'_>) -> Result<Option<Report>, Refusal> {
     let mut report = Report::new(Kind::Cov);
     let position = [cov.pos_cov_nn(), cov.pos_cov_ee(), cov.pos_cov_dd()];
     let velocity = [cov.vel_cov_nn(), cov.vel_cov_ee(), cov.vel_cov_dd()];
-    report.position_sigma_m = of(cov.pos_cov_valid(), position)?;
-    report.velocity_sigma_mps = of(cov.vel_cov_valid(), velocity)?;
+    report.position_sigma_m = report.optional("NAV-COV position", of(cov.pos_cov_valid(), position));
+    report.velocity_sigma_mps = report.optional("NAV-COV velocity", of(cov.vel_cov_valid(), velocity));
     Ok(Some(report))
 }
 

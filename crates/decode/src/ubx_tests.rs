@@ -150,8 +150,10 @@ fn accuracies_and_rtk_are_told() {
     let half = epoch(&[with(1, 120), cov([0, 1], [0.25; 3], [0.01; 3])]);
     assert_eq!(of(half.position_sigma_m), Vector3::new(0.8, 0.8, 1.2), "an invalid half is left out");
     for odd in [f32::NAN, f32::INFINITY, -1.0, 0.0] {
-        let counts = decode(GpsFormat::Auto, &[with(1, 120), cov([1, 1], [odd; 3], [0.01; 3])].concat()).1;
-        assert_eq!((counts.used, counts.refused(Refusal::OutOfRange)), (1, 1), "{odd}");
+        let packets = [with(1, 120), cov([1, 1], [odd; 3], [0.01; 3])].concat();
+        let (epochs, counts) = decode(GpsFormat::Auto, &packets);
+        assert_eq!(counts.left_out().collect::<Vec<_>>(), [("NAV-COV position", 1)], "{odd}");
+        assert!(near(of(epochs[0].epoch.velocity_sigma_mps), Vector3::repeat(0.1)), "{odd}");
     }
     assert_eq!(epoch(&[pvt(5, 0, 0, 0), cov([1, 1], [0.25; 3], [0.01; 3])]).position_sigma_m, None);
 }

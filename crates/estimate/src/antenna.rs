@@ -11,7 +11,7 @@ use super::core::Core;
 use super::own::ARM_SIGMA_M;
 
 /// Sigmas of a careful measurement beyond which the place was measured wrongly; what it may be off by then, m.
-const BEYOND: f64 = 2.5;
+const BEYOND: f64 = 3.5;
 const ANYWHERE_M: f64 = 0.5;
 /// It is reported from this many of its sigmas on, and this far from its configured place, m.
 const REPORTED_SIGMAS: f64 = 4.0;

@@ -25,6 +25,7 @@ use super::kind::Felt;
 use super::measurement::Measurement;
 use super::output::target_state;
 use super::own::{COMPASS, Own};
+use super::sway::Sway;
 
 /// Columns of the filter's error state, by name.
 pub mod columns {
@@ -60,12 +61,18 @@ pub mod columns {
     pub const GPS_DELAY: Range<usize> = own::GPS_DELAY.range();
     /// Drag, 1/s.
     pub const DRAG: Range<usize> = own::DRAG.range();
+    /// Errors of the lens's first four distortion terms.
+    pub const LENS: Range<usize> = own::LENS.range();
 }
 
 /// Length of a target's part of the error state: north, east, heading, speed, yaw rate.
 pub const TARGET_COLUMNS: usize = TARGET;
 /// What a tag may be beside its configuration: ln of its size, place forward and right (m), turn (rad).
 pub const TAG_COLUMNS: usize = super::blocks::TAG_FIT;
+/// How a vehicle sways on its springs: roll and pitch of its body, rad, and how much lower it is, m.
+pub const SWAY_COLUMNS: usize = super::blocks::SWAY;
+/// Correlation time of sway, s.
+pub const SWAY_TAU_S: f64 = super::sway::CORRELATION_S;
 
 /// A measurement linearised: `z − h(x)`, its noise, and `∂h/∂x` in the columns that it touches.
 #[derive(Clone, Copy, Debug)]
@@ -182,6 +189,21 @@ impl Predictor {
         self.core.state.layout().tag(tag).all().range()
     }
 
+    /// Columns of a target's sway; of a target that does not sway they have no effect.
+    pub fn sway_columns(&self, target: usize) -> Range<usize> {
+        self.core.state.layout().sway(target).range()
+    }
+
+    /// Sets whether a target sways on its springs.
+    pub fn set_sways(&mut self, target: usize, sways: bool) {
+        self.core.state.targets[target].sway = if sways { Sway::presumed() } else { Sway::default() };
+    }
+
+    /// Height of a target's markers over the ground, m.
+    pub fn markers_height_m(&self, target: usize) -> f64 {
+        self.core.models.targets[target].markers_height_m
+    }
+
     /// Tags whose size, place and turn are columns: target and marker of each.
     pub fn tags(&self) -> Vec<(usize, usize)> {
         let mut tags = vec![(0, 0); self.core.models.fitted_tags()];
@@ -209,6 +231,7 @@ impl Predictor {
         own.inject(means, layout);
         for (i, target) in self.core.state.targets.iter_mut().enumerate() {
             target.mean.copy_from_slice(&means[layout.target(i).all().range()]);
+            target.sway.mean.copy_from_slice(&means[layout.sway(i).range()]);
         }
         self.core.state.features[0].mean.copy_from_slice(&means[layout.feature(0).range()]);
         for (i, tag) in self.core.state.tags.iter_mut().enumerate() {

@@ -1,7 +1,7 @@
 //! Which part of the joint state lies in which columns of the error state.
 //!
 //! Order: the helicopter and its sensors' slow errors ([`own`], as many as there are sensors), each target
-//! ([`TargetBlock`]), each ground feature (two columns), each fitted tag ([`TagFitBlock`]), the sway of each target. A new state of the helicopter is a
+//! ([`TargetBlock`]), each ground feature (two columns), each fitted tag ([`TagFitBlock`]), the sway of each target, the vibration of a frame. A new state of the helicopter is a
 //! constant of [`own`].
 
 use std::ops::Range;
@@ -86,7 +86,7 @@ pub(crate) mod own {
     pub(crate) const TILT_GAIN: Block<1> = Block::after(HEADING_BIAS);
     /// Tilt bias (pitch, roll), rad.
     pub(crate) const TILT_BIAS: Block<2> = Block::after(TILT_GAIN);
-    /// How much older GPS is than configured, s.
+    /// How much older positions of the receiver are than configured, s.
     pub(crate) const GPS_DELAY: Block<1> = Block::after(TILT_BIAS);
     /// Drag: acceleration per metre a second over the ground, 1/s. What the wind adds is [`WIND`].
     pub(crate) const DRAG: Block<1> = Block::after(GPS_DELAY);
@@ -102,8 +102,11 @@ pub(crate) mod own {
     /// How much longer than configured the camera takes from its first row to its last, s.
     pub(crate) const READOUT: Block<1> = Block::after(LENS);
 
+    /// How much older the receiver's velocity is than its position, s.
+    pub(crate) const VELOCITY_DELAY: Block<1> = Block::after(READOUT);
+
     /// Constant error of the gyros, body axes, rad/s. From here on only where there is an IMU.
-    pub(crate) const RATE_BIAS: Block<3> = Block::after(READOUT);
+    pub(crate) const RATE_BIAS: Block<3> = Block::after(VELOCITY_DELAY);
     /// Constant error of the accelerometers, body axes, m/s².
     pub(crate) const FORCE_BIAS: Block<3> = Block::after(RATE_BIAS);
     /// Heading bias of the second source of attitude, rad. From here on only where there is one.
@@ -118,7 +121,7 @@ pub(crate) mod own {
     /// What has intensities that are fitted in flight: rate, gusts, thrust, error of the tilt reading.
     pub(crate) const MOTION: Block<{ TILT_ERROR.end() - ATTITUDE.end() }> = Block::from_start_of(RATE);
     /// Length of the helicopter's part with GPS and compass only, with an IMU, and with a second source of attitude.
-    pub(crate) const LEN: usize = READOUT.end();
+    pub(crate) const LEN: usize = VELOCITY_DELAY.end();
     pub(crate) const WITH_IMU: usize = FORCE_BIAS.end();
     pub(crate) const WITH_SECOND: usize = SECOND_TILT_ERROR.end();
     /// What moves by itself, forces and slow errors: the table of `own.rs`.
@@ -134,6 +137,10 @@ pub(crate) const FEATURE: usize = 2;
 
 /// Length of a vehicle's sway: roll, pitch, heave of its body.
 pub(crate) const SWAY: usize = 3;
+
+/// Rows of a frame at which its vibration is a state, and length of its part: displacements along x and y, roll.
+pub(crate) const SHAKE_NODES: usize = 6;
+pub(crate) const SHAKE: usize = 2 * SHAKE_NODES + 1;
 
 /// Length of a tag's part: logarithm of its size, place forward and right, turn, each beside its configuration.
 pub(crate) const TAG_FIT: usize = 4;
@@ -209,7 +216,7 @@ pub(crate) struct Layout {
 impl Layout {
     /// Length of the error state.
     pub(crate) const fn len(self) -> usize {
-        self.sway(self.targets).0
+        self.shake().end()
     }
 
     /// The states of the helicopter's part that move by themselves.
@@ -237,6 +244,11 @@ impl Layout {
         Block(self.tag(self.tags).0.0 + SWAY * i)
     }
 
+    /// The vibration of the frame at hand.
+    pub(crate) const fn shake(self) -> Block<SHAKE> {
+        Block(self.sway(self.targets).0)
+    }
+
     /// Every pair of columns that is a place on the ground: of targets, then of features.
     pub(crate) fn places(self) -> impl Iterator<Item = Block<2>> {
         let targets = (0..self.targets).map(move |i| self.target(i).place());
@@ -260,7 +272,8 @@ mod tests {
         assert_eq!(layout.feature(0).column(0), layout.target(1).all().end());
         assert_eq!(layout.feature(2).end(), layout.tag(0).all().column(0));
         assert_eq!(layout.tag(1).all().end(), layout.sway(0).column(0));
-        assert_eq!(layout.sway(1).end(), layout.len());
+        assert_eq!(layout.sway(1).end(), layout.shake().column(0));
+        assert_eq!(layout.shake().end(), layout.len());
         let places: Vec<_> = layout.places().map(Block::range).collect();
         assert_eq!(places.len(), 5);
         assert_eq!(places[4].end, layout.tag(0).all().column(0));

@@ -28,11 +28,11 @@ impl Core {
         }
         let state = &self.state;
         let sigma_s = state.cov.sigma(own::COMPASS_DELAY, 0);
-        let (late_s, receiver_s) = (-state.own.compass_delay_s, -state.own.gps_delay_s);
+        let (late_s, receiver_s) = (-state.own.compass_delay_s, -state.own.velocity_age_s());
         let known = sigma_s < WELL_KNOWN_S && late_s > LEAST_S.max(SIGMAS * sigma_s);
         // The receiver must agree with the compass, and its delay be known well enough: two that are early by different
         // times have latencies that are not as configured.
-        let spread_s = state.cov.sigma(own::GPS_DELAY, 0);
+        let spread_s = state.velocity_age_sigma_s();
         let agrees = (receiver_s - late_s).abs() < AGREES * late_s + spread_s;
         let witnessed = agrees && spread_s < 0.5 * late_s;
         if known && witnessed {
@@ -54,6 +54,14 @@ impl Core {
 }
 
 impl State {
+    /// One sigma of how much older the receiver's velocity is than configured, s.
+    fn velocity_age_sigma_s(&self) -> f64 {
+        let (position, more) = (own::GPS_DELAY.column(0), own::VELOCITY_DELAY.column(0));
+        let var =
+            self.cov.at(position, position) + self.cov.at(more, more) + 2.0 * self.cov.at(position, more);
+        var.max(0.0).sqrt()
+    }
+
     /// What stands here of a time by the camera is true of an earlier one.
     fn move_camera_clock(&mut self, late_s: f64) {
         let late = Span::from_s(late_s);

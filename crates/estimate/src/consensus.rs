@@ -63,8 +63,7 @@ impl Innovations {
 
     /// Finds those inside a gate, each one alone.
     pub(crate) fn inside(&mut self, gate: f64) {
-        self.given.value[..self.n].copy_from_slice(&self.value[..self.n]);
-        self.given.cov.copy_from(&self.cov);
+        self.given.begin(self.n, &self.value, &self.cov);
         for i in 0..self.n {
             self.best[i] = self.given.square(i).is_some_and(|square| square <= gate);
         }
@@ -100,19 +99,35 @@ impl Innovations {
         most
     }
 
+    /// The largest normalised square within a majority, each member given those before it, where that is least over all first
+    /// members.
+    pub(crate) fn majority_square(&mut self) -> f64 {
+        (0..self.n).map(|first| self.majority_from(first)).fold(f64::INFINITY, f64::min)
+    }
+
+    /// The same with this first member.
+    fn majority_from(&mut self, first: usize) -> f64 {
+        let (n, given) = (self.n, &mut self.given);
+        given.begin(n, &self.value, &self.cov);
+        given.take(first, n);
+        let mut largest: f64 = 0.0;
+        for _ in 0..n / 2 {
+            let Some((next, square)) = given.nearest(n) else { break };
+            given.take(next, n);
+            largest = largest.max(square);
+        }
+        largest
+    }
+
     /// Grows a set from its first member; how many it has, and the sum of their normalised squares.
     fn grow(&mut self, first: usize, gate: f64) -> (usize, f64) {
         let (n, given) = (self.n, &mut self.given);
-        given.value[..n].copy_from_slice(&self.value[..n]);
-        given.cov.copy_from(&self.cov);
-        given.taken[..n].fill(false);
+        given.begin(n, &self.value, &self.cov);
         let Some(square) = given.square(first) else { return (0, f64::INFINITY) };
         let (mut members, mut squares) = (1, square);
         given.take(first, n);
         loop {
-            let open = (0..n).filter(|i| !given.taken[*i]);
-            let next = open.filter_map(|i| Some((i, given.square(i)?))).min_by(|a, b| a.1.total_cmp(&b.1));
-            match next {
+            match given.nearest(n) {
                 Some((i, square)) if square <= gate => {
                     given.take(i, n);
                     (members, squares) = (members + 1, squares + square);
@@ -124,6 +139,13 @@ impl Innovations {
 }
 
 impl Given {
+    /// Begins with `n` of them, of which none is taken.
+    fn begin(&mut self, n: usize, value: &[Vector2<f64>], cov: &Grid) {
+        self.value[..n].copy_from_slice(&value[..n]);
+        self.cov.copy_from(cov);
+        self.taken[..n].fill(false);
+    }
+
     fn block(&self, i: usize, j: usize) -> Matrix2<f64> {
         Matrix2::from_fn(|a, b| self.cov.at(2 * i + a, 2 * j + b))
     }
@@ -132,6 +154,12 @@ impl Given {
     fn square(&self, i: usize) -> Option<f64> {
         let square = self.value[i].dot(&(self.block(i, i).try_inverse()? * self.value[i]));
         square.is_finite().then_some(square)
+    }
+
+    /// The one not taken that is nearest to what the others say, and its normalised square.
+    fn nearest(&self, n: usize) -> Option<(usize, f64)> {
+        let open = (0..n).filter(|i| !self.taken[*i]);
+        open.filter_map(|i| Some((i, self.square(i)?))).min_by(|a, b| a.1.total_cmp(&b.1))
     }
 
     /// Takes a member: its information on all others is subtracted from them.

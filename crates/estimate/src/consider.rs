@@ -22,6 +22,7 @@ const ALWAYS: Held = Held::NONE.and(own::TILT_GAIN).and(own::SECOND_TILT_GAIN);
 /// All slow errors of force, tilt reading and IMU, and the receiver's delay.
 const BLIND: Held = ALWAYS
     .and(own::GPS_DELAY)
+    .and(own::VELOCITY_DELAY)
     .and(own::COMPASS_DELAY)
     .and(own::ARM)
     .and(own::READOUT)

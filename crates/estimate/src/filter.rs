@@ -15,6 +15,7 @@ use super::Site;
 use super::blocks::own;
 use super::core::Core;
 use super::inertial::Blocks;
+use super::shake::Shake;
 use super::sources::{AnyMeasurement, Kind};
 use super::start::start;
 use super::state::State;
@@ -262,20 +263,22 @@ impl Estimator {
         Some(self.carried.ownship(&self.core.models, None, t))
     }
 
-    /// How much older GPS is than configured, as learnt so far, seconds.
+    /// How much older the receiver's velocity is than configured, as learnt so far, seconds: what motion shows best.
     pub fn gps_delay_s(&self) -> f64 {
-        self.core.state.own.gps_delay_s
+        self.core.state.own.velocity_age_s()
     }
 
     /// One line on what the filter believes of the sensors and of the intensities of motion.
     pub fn inside(&self) -> String {
         let (own, l) = (&self.core.state.own, &self.core.state.learnt);
         let cov = &self.core.state.cov;
+        let [shake_px, roll_px] =
+            self.core.state.shake.sigmas().map(|sigma| sigma * self.core.models.camera.fx);
         let targets: Vec<String> =
             l.target_q.iter().map(|q| format!("{:.3}/{:.3}", q[0].sqrt(), q[1].sqrt())).collect();
         format!(
             "heading bias {:.2}±{:.2} deg, tilt felt {:?} (slope {:.2}) gain {:.2}±{:.2} error {:.2},{:.2}±{:.2} deg \
-             bias {:.2},{:.2}±{:.2} deg, trim {:.1},{:.1}±{:.1} deg, wind {:.2},{:.2}±{:.2} m/s2, drag {:.2}±{:.2}, delay {:.0}±{:.0} ms, compass {:.1}±{:.1} ms, camera {:.1} ms, \
+             bias {:.2},{:.2}±{:.2} deg, trim {:.1},{:.1}±{:.1} deg, wind {:.2},{:.2}±{:.2} m/s2, drag {:.2}±{:.2}, delay {:.0}±{:.0} and {:.0}±{:.0} ms, compass {:.1}±{:.1} ms, camera {:.1} ms, read-out {:.1}±{:.1} ms, shake {:.2} px roll {:.2} px, lens {:.3?} k1 ±{:.3}, arm {:.2},{:.2}±{:.2} m, \
              sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} gust {:.2} thrust {:.2} targets {} pixels {:.2?} {:.2} tags {}",
             own.heading_bias.to_degrees(),
             cov.sigma(own::HEADING_BIAS, 0).to_degrees(),
@@ -299,9 +302,20 @@ impl Estimator {
             cov.sigma(own::DRAG, 0),
             own.gps_delay_s * 1e3,
             cov.sigma(own::GPS_DELAY, 0) * 1e3,
+            own.velocity_delay_s * 1e3,
+            cov.sigma(own::VELOCITY_DELAY, 0) * 1e3,
             own.compass_delay_s * 1e3,
             cov.sigma(own::COMPASS_DELAY, 0) * 1e3,
             self.core.state.camera_late_s * 1e3,
+            own.readout_s * 1e3,
+            cov.sigma(own::READOUT, 0) * 1e3,
+            shake_px,
+            roll_px,
+            own.lens.as_slice(),
+            cov.sigma(own::LENS, 0),
+            own.arm.x,
+            own.arm.y,
+            cov.sigma(own::ARM, 0),
             l.heading_var[0].sqrt().to_degrees(),
             l.tilt_var[0].sqrt().to_degrees(),
             l.tilt_rate_q.sqrt(),
@@ -325,6 +339,9 @@ impl Estimator {
         core.state.learnt.copy_from(&core.learning.start);
         if !start(&mut core.state, epoch.t_valid, &epoch.value, &typical, &core.models) {
             return false;
+        }
+        if core.learning.on {
+            core.state.shake = Shake::presumed(&core.models);
         }
         if let Some(warm) = self.warm.take() {
             core.state.resume(&warm, &core.models, &core.learning);

@@ -11,7 +11,9 @@ use super::track::{OnSight, Verdict};
 impl Core {
     /// Fuses a frame's ground features, then its markers.
     pub(crate) fn fuse_frame(&mut self, frame: &FrameObservations) {
-        self.fuse_features(&frame.features);
+        let since_s = self.state.since_frame();
+        self.begin_shake(frame.features.len());
+        self.fuse_features(&frame.features, since_s);
         let mut chosen = std::mem::take(&mut self.chosen);
         self.choose_markers(&frame.markers, &mut chosen);
         for target in 0..self.state.targets.len() {
@@ -23,6 +25,7 @@ impl Core {
                 self.refuse(FusionSource::Marker, Disposition::Unknown);
             }
         }
+        self.end_shake(since_s);
         self.state.learn_targets(&self.learning);
         self.judge_turns();
         self.judge_lens();

@@ -26,6 +26,7 @@ use super::core::Core;
 use super::matrix::{Grid, axpy};
 use super::measurement::Measurement;
 use super::models::Models;
+use super::shake::WITNESSES;
 use super::state::{Feature, GUESSED_VAR, State};
 
 /// How long a feature must stay at its place, s, and the number of frames after the first in which it must be seen,
@@ -96,12 +97,13 @@ impl GroundWork {
 
 impl Core {
     /// Ground features of a frame: those in use are fused, compared or given up, and free slots taken.
-    pub(crate) fn fuse_features(&mut self, tracks: &[FeatureTrack]) {
+    pub(crate) fn fuse_features(&mut self, tracks: &[FeatureTrack], since_s: f64) {
         for slot in 0..self.state.features.len() {
             self.follow_feature(slot, tracks);
         }
-        let agreed = self.fuse_proven(tracks);
-        self.compare_others(tracks, agreed >= JUDGES);
+        let (agreed, disagreement) = self.fuse_proven(tracks);
+        let of_others = self.compare_others(tracks, agreed >= JUDGES);
+        self.judge_shake(disagreement.or(of_others), agreed, since_s);
         self.state.note_movers(tracks);
         for slot in 0..self.state.features.len() {
             if self.state.features[slot].id.is_none()
@@ -123,9 +125,10 @@ impl Core {
         }
     }
 
-    /// Fuses those of the proven features that agree; how many.
-    fn fuse_proven(&mut self, tracks: &[FeatureTrack]) -> usize {
+    /// Fuses those of the proven features that agree; how many, and how far a majority disagrees.
+    fn fuse_proven(&mut self, tracks: &[FeatureTrack]) -> (usize, Option<f64>) {
         let n = self.expect_features(tracks, true);
+        let disagreement = self.disagreement(n);
         let agreed = self.ground.innovations.agreeing(self.models.gates[2]);
         // Without a majority it is not known which of them are ground.
         let believed = 2 * agreed > n;
@@ -135,7 +138,7 @@ impl Core {
             let inside = agrees && self.fuse_feature(slot, tracks);
             self.judge_feature(slot, inside, PROBATION);
         }
-        if believed { agreed } else { 0 }
+        (if believed { agreed } else { 0 }, disagreement)
     }
 
     /// Fuses a proven feature; whether it was inside the gate.
@@ -145,13 +148,21 @@ impl Core {
         outcome.is_some_and(|outcome| outcome.ratio <= 1.0)
     }
 
-    /// Compares the features on probation: with what the proven ones made of the state, or else with each other.
-    fn compare_others(&mut self, tracks: &[FeatureTrack], judged: bool) {
+    /// How far a majority of the `n` features that were expected last is from one motion; `None` of too few.
+    fn disagreement(&mut self, n: usize) -> Option<f64> {
+        (n >= WITNESSES).then(|| self.ground.innovations.majority_square())
+    }
+
+    /// Compares the features on probation: with what the proven ones made of the state, or else with each other; then how far
+    /// a majority of them disagrees.
+    fn compare_others(&mut self, tracks: &[FeatureTrack], judged: bool) -> Option<f64> {
         let n = self.expect_features(tracks, false);
         let gate = self.models.gates[2];
+        let mut disagreement = None;
         if judged {
             self.ground.innovations.inside(gate);
         } else {
+            disagreement = self.disagreement(n);
             // All of them may be on the same vehicle; the helicopter's own motion shows it.
             self.ground.innovations.agreeing(gate);
             self.ground.innovations.keep_inside(gate);
@@ -166,6 +177,7 @@ impl Core {
                 self.fuse_feature(slot, tracks);
             }
         }
+        disagreement
     }
 
     /// Updates a feature by a frame: it is proven once it has stayed at its place long enough, and refused when seen
@@ -249,9 +261,14 @@ impl Core {
 }
 
 impl State {
+    /// Time since the frame before, s, at most some seconds.
+    pub(crate) fn since_frame(&self) -> f64 {
+        (self.t - self.movers_noted).s().clamp(0.0, MOVERS_OVER_S)
+    }
+
     /// Keeps the share of a frame's tracks that move.
     fn note_movers(&mut self, tracks: &[FeatureTrack]) {
-        let since_s = (self.t - self.movers_noted).s().clamp(0.0, MOVERS_OVER_S);
+        let since_s = self.since_frame();
         self.movers_noted = self.t;
         let moving = tracks.iter().filter(|track| self.refused_tracks.contains(track.id)).count();
         let share = moving as f64 / tracks.len().max(1) as f64;

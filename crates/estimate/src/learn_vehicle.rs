@@ -64,7 +64,8 @@ impl State {
         if ratio.is_finite() && ratio > 0.0 {
             // Never beyond what explains this one.
             let grown = q * (gain * (ratio - 1.0)).min(ratio.ln().max(0.0)).exp();
-            self.learnt.target_q[i][k] = grown.clamp(start * STILL * STILL, start * MOST * MOST);
+            let least = self.least_walk();
+            self.learnt.target_q[i][k] = grown.clamp(start * least * least, start * MOST * MOST);
             self.targets[i].fitted_memory_s[k] = memory_s;
         }
     }
@@ -78,6 +79,7 @@ impl State {
         let at = self.layout().target(i);
         let (vv, ww) = (self.cov.var(at.speed()), self.cov.var(at.yaw_rate()));
         let vw = self.cov.at(at.speed().column(0), at.yaw_rate().column(0));
+        let least = self.least_walk();
         let target = &mut self.targets[i];
         let [.., v, w] = target.mean;
         let test = (v * v * ww - 2.0 * v * w * vw + w * w * vv) / (vv * ww - vw * vw).max(1e-18);
@@ -85,9 +87,16 @@ impl State {
         if target.standstill.stands() {
             let keep = (-since_s / REST_S).exp();
             for (q, start) in self.learnt.target_q[i].iter_mut().zip(&learning.start.target_q[i]) {
-                *q = (*q * keep).max(start * STILL * STILL);
+                *q = (*q * keep).max(start * least * least);
             }
         }
+    }
+
+    /// Least factor on the configured walks of a vehicle. Where no ground is seen beside it, its own place is what tilt is
+    /// known by: one that is certain to stand would then leave its driving off to the helicopter's tilt.
+    fn least_walk(&self) -> f64 {
+        let ground = self.features.iter().filter(|feature| feature.proven).count();
+        if ground >= GROUND { STILL } else { STILL_ALONE }
     }
 
     /// A target that stood has begun to move, as far as is measured: as [`Self::wake`] has it.
@@ -118,6 +127,10 @@ impl State {
         }
     }
 }
+
+/// Features that show the helicopter's motion by themselves; least factor on walks where there are fewer.
+const GROUND: usize = 3;
+const STILL_ALONE: f64 = 0.2;
 
 /// By what factor variances of a vehicle's motion are raised when it moves otherwise than was expected.
 const RAISE: f64 = 4.0;

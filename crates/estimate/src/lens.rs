@@ -4,10 +4,11 @@
 //! may be off; pixels that move through the picture show it within seconds. One that comes out beyond that is of another
 //! lens, or of none that was calibrated: then all four are open.
 
-use nalgebra::{Matrix2, Matrix2x4, Vector2};
+use nalgebra::{Matrix2, Matrix2x4, Vector2, Vector4};
 
 use windhover_base::geo::{CameraModel, LensModel};
 use windhover_base::msg::{FusionSource, MisfitCause};
+use windhover_base::time::MonoTime;
 
 use super::blocks::{Block, own};
 use super::core::Core;
@@ -22,9 +23,35 @@ const FAR_BEYOND: f64 = 4.0;
 const OTHERWISE: [f64; 4] = [0.15, 0.15, 0.003, 0.003];
 /// What heading may be off by where the lens was another one, rad.
 const HEADING_SIGMA: f64 = 0.035;
+/// Its errors are looked at again so often, s; a movement of k1 beyond so many of its sigmas says that they are larger than
+/// believed, by this share of the above.
+const CHECKED_EVERY_S: f64 = 0.7;
+const MOVED_SIGMAS: f64 = 3.0;
+const AGAIN: f64 = 0.3;
+/// Until pixels move by less than this between two such looks, heading is doubted, px.
+const SETTLED_PX: f64 = 0.2;
 /// It is reported from this many of its sigmas on, and from this error of k1 on.
 const REPORTED_SIGMAS: f64 = 5.0;
 const REPORTED: f64 = 0.02;
+
+/// A lens that is another one than configured, as it was found to be.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct LensCheck {
+    t: MonoTime,
+    /// Its errors then, and the sigma of the first.
+    lens: Vector4<f64>,
+    k1_sigma: f64,
+    /// Whether it no longer changed then.
+    settled: bool,
+}
+
+impl LensCheck {
+    /// By how much pixels at half a focal length from the axis moved since.
+    fn moved_px(&self, now: &Self, focal_px: f64) -> f64 {
+        let moved = now.lens - self.lens;
+        (focal_px * (moved[0] * 0.125 + moved[1] * 0.031)).abs()
+    }
+}
 
 impl Models {
     /// The camera with its lens as it is found to be.
@@ -92,15 +119,43 @@ impl Core {
         // A vehicle that sways bends what is seen of the lens, until it is known to.
         let judged = |target: &Target| !target.life.is_held() || target.sway.is_judged();
         let limit = if state.targets.iter().all(judged) { BEYOND } else { FAR_BEYOND };
-        if self.at_truth || state.lens_open || state.own.lens[0].abs() < limit * LENS_K1_SIGMA {
-            return;
+        let now = LensCheck {
+            t: state.t,
+            lens: state.own.lens,
+            k1_sigma: state.cov.sigma(own::LENS, 0),
+            settled: false,
+        };
+        let share = match state.lens_open {
+            _ if self.at_truth => return,
+            None if now.lens[0].abs() < limit * LENS_K1_SIGMA => return,
+            None => Some(1.0),
+            Some(before) if (now.t - before.t).s() < CHECKED_EVERY_S => return,
+            Some(before) if (now.lens[0] - before.lens[0]).abs() > MOVED_SIGMAS * before.k1_sigma => {
+                Some(AGAIN)
+            }
+            Some(before) => {
+                let settled = before.moved_px(&now, self.models.camera.fx) < SETTLED_PX;
+                state.lens_open = Some(LensCheck { settled: before.settled || settled, ..now });
+                if before.settled {
+                    return;
+                }
+                None
+            }
+        };
+        if let Some(share) = share {
+            state.cov.add_diagonal(own::LENS, &OTHERWISE.map(|sigma| (share * sigma).powi(2)));
+            state.lens_open = Some(LensCheck { k1_sigma: state.cov.sigma(own::LENS, 0), ..now });
+            (0..self.state.features.len()).for_each(|slot| self.drop_feature(slot));
         }
-        state.lens_open = true;
-        state.cov.add_diagonal(own::LENS, &OTHERWISE.map(|sigma| sigma * sigma));
         // Heading was found by the wrong lens, and the compass was judged by it.
+        self.loosen_heading(HEADING_SIGMA);
+    }
+
+    /// The helicopter, all that is seen and the compass's error may be turned by `sigma` more than was believed, rad.
+    pub(crate) fn loosen_heading(&mut self, sigma: f64) {
         let mut along = std::mem::take(&mut self.along);
         self.state.heading_direction(&mut along);
-        self.state.add_direction(&along, HEADING_SIGMA);
+        self.state.add_direction(&along, sigma);
         self.along = along;
     }
 

@@ -45,6 +45,7 @@ mod spin;
 mod standstill;
 mod start;
 mod state;
+mod shake;
 mod sway;
 mod tag_fit;
 mod track;

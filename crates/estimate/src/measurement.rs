@@ -6,7 +6,7 @@ use super::blocks::Block;
 use super::matrix::{MAX_MEASURED, Small};
 
 /// Most state columns one measurement touches.
-pub(crate) const MAX_COLUMNS: usize = 30;
+pub(crate) const MAX_COLUMNS: usize = 44;
 
 /// `r = H δx + noise` of `m` components that touches few columns.
 #[derive(Clone, Debug)]

@@ -47,6 +47,8 @@ pub(crate) struct Own {
     pub(crate) lens: Vector4<f64>,
     /// How much longer than configured the camera takes from its first row to its last, s.
     pub(crate) readout_s: f64,
+    /// How much older the receiver's velocity is than its position, s.
+    pub(crate) velocity_delay_s: f64,
     /// Of the gyros, rad/s, and of the accelerometers, m/s², body axes.
     pub(crate) rate_bias: Vector3<f64>,
     pub(crate) force_bias: Vector3<f64>,
@@ -120,6 +122,7 @@ impl Default for Own {
             arm: Vector2::zeros(),
             lens: Vector4::zeros(),
             readout_s: 0.0,
+            velocity_delay_s: 0.0,
             rate_bias: Vector3::zeros(),
             force_bias: Vector3::zeros(),
             second: AttitudeErrors::default(),
@@ -178,7 +181,7 @@ struct Slow {
 }
 
 /// The slow states in the order of their columns.
-const SLOW: [Slow; 22] = [
+const SLOW: [Slow; 23] = [
     Slow {
         first: place(own::GUST),
         mean: |own| own.gust.as_mut_slice(),
@@ -285,6 +288,13 @@ const SLOW: [Slow; 22] = [
         wander: Drift::Walk(0.0),
     },
     Slow {
+        first: place(own::VELOCITY_DELAY),
+        mean: |own| std::slice::from_mut(&mut own.velocity_delay_s),
+        // Receivers filter velocity over some tenths of a second.
+        start_var: |_| [0.1f64.powi(2); 3],
+        wander: Drift::Walk(2e-4),
+    },
+    Slow {
         first: place(own::RATE_BIAS),
         mean: |own| own.rate_bias.as_mut_slice(),
         start_var: |terms| [terms.models.rate_bias_var; 3],
@@ -351,6 +361,16 @@ impl Own {
     /// Velocity of a point at `lever_m` in the body frame: `v + R (ω × l)`.
     pub(crate) fn velocity_of(&self, lever_m: &Vector3<f64>) -> Vector3<f64> {
         self.velocity + self.ned_from_body * self.rate.cross(lever_m)
+    }
+
+    /// Time from the first row of a frame to the last, of which so much is configured, s.
+    pub(crate) fn whole_readout_s(&self, configured_s: f64) -> f64 {
+        configured_s + self.readout_s
+    }
+
+    /// How much older the receiver's velocity is than configured, s.
+    pub(crate) fn velocity_age_s(&self) -> f64 {
+        self.gps_delay_s + self.velocity_delay_s
     }
 
     /// Errors of the compass (0) or of the second source of attitude (1).

@@ -20,7 +20,7 @@ impl Core {
     /// After a frame: keeps the time from the first row to the last within what a camera does.
     pub(crate) fn bound_readout(&mut self) {
         let configured_s = self.models.readout_s;
-        let readout_s = (configured_s + self.state.own.readout_s).clamp(LIMITS_S.0, LIMITS_S.1);
+        let readout_s = self.state.own.whole_readout_s(configured_s).clamp(LIMITS_S.0, LIMITS_S.1);
         self.state.own.readout_s = readout_s - configured_s;
     }
 
@@ -28,7 +28,7 @@ impl Core {
     pub(crate) fn readout_misfit(&self) -> Option<(FusionSource, MisfitCause, f64)> {
         let (found_s, sigma_s) = (self.state.own.readout_s, self.state.cov.sigma(own::READOUT, 0));
         let beyond = found_s.abs() > REPORTED_S.max(REPORTED_SIGMAS * sigma_s) && sigma_s < WELL_KNOWN_S;
-        let readout_s = self.models.readout_s + found_s;
+        let readout_s = self.state.own.whole_readout_s(self.models.readout_s);
         beyond.then_some((FusionSource::Marker, MisfitCause::Readout, readout_s))
     }
 }

@@ -12,8 +12,10 @@ use super::fitted::Learnt;
 use super::ground::RefusedTracks;
 use super::height::HeightCheck;
 use super::kind::TiltWatch;
+use super::lens::LensCheck;
 use super::matrix::{Grid, Shear};
 use super::own::{Own, Senses};
+use super::shake::Shake;
 use super::slip::Slip;
 use super::spin::Spin;
 use super::standstill::{Standstill, Unrest};
@@ -103,6 +105,7 @@ pub(crate) struct State {
     /// Share of the tracked features that move, over the last seconds.
     pub(crate) moving_share: f64,
     pub(crate) movers_noted: MonoTime,
+    pub(crate) shake: Shake,
     /// Share of the last markers that were outside the gate.
     pub(crate) markers_outside: f64,
     /// Tracks that are of no ground.
@@ -126,8 +129,8 @@ pub(crate) struct State {
     pub(crate) height: HeightCheck,
     /// By how much lower than configured the ground lies, m: the receiver's heights are over that.
     pub(crate) ground_lower_m: f64,
-    /// Whether the lens was found to be another one than configured.
-    pub(crate) lens_open: bool,
+    /// The lens where it was found to be another one than configured.
+    pub(crate) lens_open: Option<LensCheck>,
     /// Whether the antenna's place was found to be measured wrongly.
     pub(crate) antenna_anywhere: bool,
     /// By how much earlier than stamped frames are true, as was found out, s.
@@ -192,6 +195,7 @@ impl State {
         (self.scale_test, self.scale, self.unrest) = (other.scale_test, other.scale, other.unrest);
         (self.moving_share, self.movers_noted) = (other.moving_share, other.movers_noted);
         self.markers_outside = other.markers_outside;
+        self.shake = other.shake;
         self.refused_tracks = other.refused_tracks;
         self.cov.copy_from(&other.cov);
         self.learnt.copy_from(&other.learnt);
@@ -203,7 +207,8 @@ impl State {
         self.features.fill(Feature::default());
         self.tags.fill(TagFit::default());
         self.scale = None;
-        (self.antenna_anywhere, self.lens_open) = (false, false);
+        self.shake = Shake::default();
+        (self.antenna_anywhere, self.lens_open) = (false, None);
         self.cov.fill(0.0);
         (self.past_motion.in_use, self.past_bias.in_use) = (false, false);
         self.copies.iter_mut().for_each(|copy| copy.in_use = false);
@@ -235,6 +240,7 @@ impl State {
             add(&mut target.mean, &dx[layout.target(i).all().range()]);
             add(&mut target.sway.mean, &dx[layout.sway(i).range()]);
         }
+        add(&mut self.shake.mean, &dx[layout.shake().range()]);
         for (i, feature) in self.features.iter_mut().enumerate() {
             add(&mut feature.mean, &dx[layout.feature(i).range()]);
         }

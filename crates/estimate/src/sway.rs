@@ -21,7 +21,7 @@ use super::slip::Across;
 use super::state::State;
 
 /// Correlation time of the displacement, s: that of oscillations with periods of 0.5 to 2 s.
-const CORRELATION_S: f64 = 0.25;
+pub(crate) const CORRELATION_S: f64 = 0.25;
 /// Time constants of the two high-pass filters, s.
 const FAST_S: f64 = 0.15;
 const SLOW_S: f64 = 1.5;
@@ -170,9 +170,14 @@ impl Sway {
         if !judged {
             return false;
         }
-        self.displaced.iter_mut().for_each(|displaced| displaced.var = displaced.shown());
+        for displaced in self.displaced.iter_mut().filter(|displaced| displaced.is_judged()) {
+            displaced.var = displaced.shown();
+        }
         let before = self.var;
-        let [across, down] = self.displaced.map(|displaced| displaced.var);
+        // What is not judged yet is presumed as before.
+        let presumed = PRESUMED_M * PRESUMED_M;
+        let [across, down] =
+            self.displaced.map(|displaced| if displaced.is_judged() { displaced.var } else { presumed });
         self.var = [across, down.max(across)];
         (0..2).any(|k| (before[k] > 0.0) != (self.var[k] > 0.0))
     }

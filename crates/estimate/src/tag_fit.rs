@@ -119,7 +119,9 @@ impl Core {
     /// A tag was fused in a frame that shows another one of its vehicle as well.
     pub(crate) fn judge_tag(&mut self, target: usize, marker: usize, inside: bool) {
         let Some(slot) = self.models.targets[target].markers[marker].fit else { return };
-        if self.at_truth {
+        // A body that pitches makes its tags contradict each other as well, until it is known to.
+        let sway = &self.state.targets[target].sway;
+        if self.at_truth || sway.is_open() && !sway.is_judged() {
             return;
         }
         let fit = &mut self.state.tags[slot];

@@ -1,6 +1,6 @@
 //! A few rows of the least-squares problem, whitened, and their noise factors.
 
-use crate::front::{cholesky, forward};
+use crate::dense::{cholesky, forward};
 
 /// The source of rows.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
@@ -29,6 +29,12 @@ pub enum Source {
     Drive(usize),
     /// Turning of a target.
     Turn(usize),
+    /// Roll and pitch of a target's body on its springs.
+    Sway(usize),
+    /// Heave of a target's body on its springs.
+    Heave(usize),
+    /// Side slip of a target.
+    Slip(usize),
     /// External positions.
     Outside,
     /// Changes of the helicopter's velocity that are faster than a gust.
@@ -54,7 +60,7 @@ impl Source {
 
     /// Whether it is motion whose intensity changes with time: starting and turning in differ from standing still.
     pub(crate) const fn is_local(self) -> bool {
-        matches!(self, Self::TiltMotion | Self::YawMotion | Self::Drive(_) | Self::Turn(_))
+        matches!(self, Self::TiltMotion | Self::YawMotion | Self::Drive(_) | Self::Turn(_) | Self::Slip(_))
     }
 
     /// The index of its factor.
@@ -72,15 +78,18 @@ impl Source {
             Self::Known => 9,
             Self::Vibration => 10,
             Self::Outside => 11,
-            Self::Marker(target) => 12 + 3 * target,
-            Self::Drive(target) => 13 + 3 * target,
-            Self::Turn(target) => 14 + 3 * target,
+            Self::Marker(target) => 12 + 6 * target,
+            Self::Drive(target) => 13 + 6 * target,
+            Self::Turn(target) => 14 + 6 * target,
+            Self::Sway(target) => 15 + 6 * target,
+            Self::Heave(target) => 16 + 6 * target,
+            Self::Slip(target) => 17 + 6 * target,
         }
     }
 
     /// Number of sources with this many targets.
     pub(crate) const fn count(targets: usize) -> usize {
-        12 + 3 * targets
+        12 + 6 * targets
     }
 }
 
@@ -163,6 +172,13 @@ impl Noise {
     pub(crate) fn set_local(&mut self, source: Source, figures: &[f64]) {
         let whole = self.of(source);
         self.local[source.index()] = figures.iter().map(|figure| figure / whole).collect();
+    }
+
+    /// The same with the variances of some sources multiplied by a factor.
+    pub(crate) fn scaled(&self, sources: &[Source], by: f64) -> Self {
+        let mut scaled = self.clone();
+        sources.iter().for_each(|source| scaled.figures[source.index()] *= by);
+        scaled
     }
 
     pub(crate) fn set(&mut self, source: Source, value: f64) {

@@ -13,7 +13,7 @@ use crate::noise::Components;
 use crate::problem::{Origin, Pass, Problem};
 use crate::recording::Recording;
 use crate::result::{Constant, Outlier, Refined, Tally};
-use crate::solve::{EliminatedKind, Factors};
+use crate::solve::{EliminatedKind, Factors, Unsolved};
 use crate::unknowns::{Prior, knot};
 use crate::values::Values;
 
@@ -35,7 +35,7 @@ pub(crate) fn look(
     noise: &Noise,
     site: &Site,
     recordings: &[Recording],
-) -> PassResult {
+) -> Result<PassResult, Unsolved> {
     let problem = pass.problem;
     let mut looked = PassResult {
         components: Components::new(problem.targets, problem.plan.windows),
@@ -45,23 +45,17 @@ pub(crate) fn look(
     };
     let mut counts = vec![(0usize, 0usize); Source::count(problem.targets)];
     let mut back = Back::new(problem.shape);
-    for (what, e) in factors.steps.iter().rev() {
-        back.solve_with_covariance(e);
-        match what {
-            EliminatedKind::Constants => looked.refined.constants = constants(problem, values, &back),
-            EliminatedKind::Landmark(_) => {}
-            EliminatedKind::Knot(k) => {
-                let stop = &problem.plan.stops[*k];
-                pass.blocks(*k, values, noise, &mut |origin: Origin, block: &Block| {
-                    looked.take(origin, block, &back, problem, (*k, noise), &mut counts);
-                });
-                let own = ownship(problem, values, &back, *k, site, recordings);
-                looked.refined.own.push((stop.flight, own));
-                if stop.frame.is_some() {
-                    for target in 0..problem.targets {
-                        let estimate = target_estimate(pass, values, &back, *k, target, recordings);
-                        looked.refined.targets.push((stop.flight, estimate));
-                    }
+    for index in (0..factors.segments()).rev() {
+        for (what, e) in factors.segment(index, pass, values, noise)?.iter().rev() {
+            back.solve_with_covariance(e);
+            match what {
+                EliminatedKind::Constants => looked.refined.constants = constants(problem, values, &back),
+                EliminatedKind::Landmark(_) => {}
+                EliminatedKind::Knot(k) => {
+                    pass.blocks(*k, values, noise, &mut |origin: Origin, block: &Block| {
+                        looked.take(origin, block, &back, problem, (*k, noise), &mut counts);
+                    });
+                    looked.estimate(pass, values, &back, *k, (site, recordings));
                 }
             }
         }
@@ -69,10 +63,29 @@ pub(crate) fn look(
     looked.refined.own.reverse();
     looked.refined.targets.reverse();
     looked.refined.tallies = tallies(problem.targets, &counts, noise);
-    looked
+    Ok(looked)
 }
 
 impl PassResult {
+    /// Adds the estimates of a knot.
+    fn estimate(
+        &mut self,
+        pass: &Pass<'_>,
+        values: &Values,
+        back: &Back,
+        k: usize,
+        (site, recordings): (&Site, &[Recording]),
+    ) {
+        let (problem, stop) = (pass.problem, &pass.problem.plan.stops[k]);
+        self.refined.own.push((stop.flight, ownship(problem, values, back, k, site, recordings)));
+        if stop.frame.is_some() {
+            for target in 0..problem.targets {
+                let estimate = target_estimate(pass, values, back, k, target, recordings);
+                self.refined.targets.push((stop.flight, estimate));
+            }
+        }
+    }
+
     fn take(
         &mut self,
         origin: Origin,
@@ -94,15 +107,15 @@ impl PassResult {
         if let Some(marker) = origin.marker.filter(|_| !outside) {
             self.memory.take(marker, k, &block.right);
         }
+        let stop = &problem.plan.stops[k];
         if outside {
-            let stop = &problem.plan.stops[k];
             let Origin { source, marker, .. } = origin;
             self.refined.outliers.push(Outlier { flight: stop.flight, t: stop.t, source, marker, ratio });
-        } else {
-            let window = problem.plan.stops[k].window;
-            let figure = noise.at(origin.source, window);
-            self.components.take(origin.source, window, figure, block, back);
         }
+        // Outliers count as far as they pull: where the noise is far too small, most are outside.
+        let weight = if outside { 1.0 / ratio } else { 1.0 };
+        let figure = noise.at(origin.source, stop.window);
+        self.components.take(origin.source, (stop.window, figure, weight), block, back);
     }
 }
 
@@ -147,7 +160,8 @@ fn tallies(targets: usize, counts: &[(usize, usize)], noise: &Noise) -> Vec<Tall
     use Source as S;
     let own = [S::Outside, S::GpsPosition, S::GpsVelocity, S::Heading, S::Tilt, S::Feature];
     let motion = [S::TiltMotion, S::YawMotion, S::Gust, S::Thrust, S::Vibration];
-    let of_targets = (0..targets).flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t)]);
+    let of_targets = (0..targets)
+        .flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t), S::Sway(t), S::Heave(t), S::Slip(t)]);
     let all = own.into_iter().chain(motion).chain(of_targets);
     let tally = |source: Source| {
         let (taken, outliers) = counts[source.index()];
@@ -161,7 +175,7 @@ fn constants(problem: &Problem<'_>, values: &Values, back: &Back) -> Vec<Constan
     let constant = |(i, (prior, value)): (usize, (&Prior, &f64))| {
         let found = back.covariance(at + i, at + i).max(0.0).sqrt();
         let sigma = if prior.is_estimated() { found } else { prior.sigma };
-        Constant { kind: prior.kind, value: *value, sigma, prior: prior.mean, prior_sigma: prior.sigma }
+        Constant { kind: prior.kind, value: *value, sigma, prior: prior.mean, prior_sigma: prior.careful }
     };
     problem.priors.iter().zip(&values.constants).enumerate().map(constant).collect()
 }

@@ -9,6 +9,8 @@
 //! Backward, `x_e = L⁻ᵀ (y − W x_r)`, and of the inverse of the whole matrix only the part over each front is computed
 //! (selected inversion; Takahashi 1973): `G = −L⁻ᵀ W`, `P_er = G P_rr`, `P_ee = (L Lᵀ)⁻¹ + P_er Gᵀ`.
 
+use crate::dense::{Singular, add_rows, backward, cholesky, forward};
+
 /// Layout of a front: two knots, then landmarks of two components each, then the constants.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(crate) struct Shape {
@@ -46,6 +48,8 @@ pub(crate) struct Front {
     n: usize,
     h: Vec<f64>,
     g: Vec<f64>,
+    /// Memory for a row of products.
+    square: Vec<f64>,
 }
 
 /// The stored result of eliminated unknowns.
@@ -74,34 +78,31 @@ impl Eliminated {
     }
 }
 
-/// The normal equations are singular, or not finite.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(crate) struct Singular;
-
 impl Front {
     pub(crate) fn new(shape: Shape) -> Self {
         let n = shape.len();
-        Self { n, h: vec![0.0; n * n], g: vec![0.0; n] }
+        Self { n, h: vec![0.0; n * n], g: vec![0.0; n], square: Vec::new() }
     }
 
     /// Adds rows `J x ≈ r` of unit variance with a weight; `rows` has them one after the other, with one value for each
     /// of `columns`.
     pub(crate) fn add(&mut self, columns: &[usize], rows: &[f64], right: &[f64], weight: f64) {
         let width = columns.len();
-        for (row, right) in rows.chunks_exact(width).zip(right) {
-            for (a, &i) in row.iter().zip(columns) {
-                if *a == 0.0 {
-                    continue;
-                }
-                let a = weight * a;
-                self.g[i] += a * right;
-                for (b, &j) in row.iter().zip(columns) {
-                    if j <= i {
-                        self.h[i * self.n + j] += a * b;
-                    }
-                }
+        let mut square = std::mem::take(&mut self.square);
+        square.resize(width, 0.0);
+        for (a, &i) in columns.iter().enumerate() {
+            let square = &mut square[..=a];
+            square.fill(0.0);
+            add_rows(square, right.len(), |k| (rows[k * width + a], &rows[k * width..][..width]));
+            let product: f64 = right.iter().enumerate().map(|(k, right)| rows[k * width + a] * right).sum();
+            self.g[i] += weight * product;
+            for (b, (&j, square)) in columns.iter().zip(square.iter()).enumerate() {
+                // A column that is named twice has both mixed products in its square.
+                let by = if i == j && a != b { 2.0 * weight } else { weight };
+                self.h[i.max(j) * self.n + i.min(j)] += by * square;
             }
         }
+        self.square = square;
     }
 
     /// Adds `x ≈ value` of this information to one unknown.
@@ -113,6 +114,12 @@ impl Front {
     /// Adds information about an unknown with the value zero.
     pub(crate) fn hold(&mut self, column: usize, information: f64) {
         self.add_prior(column, information, 0.0);
+    }
+
+    /// Information about an unknown by itself, and its right side.
+    #[cfg(test)]
+    pub(crate) fn alone(&self, column: usize) -> (f64, f64) {
+        (self.h[column * self.n + column], self.g[column])
     }
 
     /// Eliminates `len` unknowns from `first` on, their diagonal increased by a share (Marquardt 1963).
@@ -146,15 +153,33 @@ impl Front {
         Ok(Eliminated { first, len, l, rest, w, y })
     }
 
-    /// `H_rr −= Wᵀ W`, `g_r −= Wᵀ y`.
+    /// `H_rr −= Wᵀ W`, `g_r −= Wᵀ y`, with the widest arithmetic that the processor has.
     fn take_off(&mut self, rest: &[usize], w: &[f64], y: &[f64]) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            unsafe { self.take_off_wide(rest, w, y) };
+            return;
+        }
+        self.take_off_plain(rest, w, y);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn take_off_wide(&mut self, rest: &[usize], w: &[f64], y: &[f64]) {
+        self.take_off_plain(rest, w, y);
+    }
+
+    #[inline(always)]
+    fn take_off_plain(&mut self, rest: &[usize], w: &[f64], y: &[f64]) {
         let width = rest.len();
         let mut square = vec![0.0; width];
         for (i, &column) in rest.iter().enumerate() {
             square[..=i].fill(0.0);
-            for row in w.chunks_exact(width) {
-                axpy(&mut square[..=i], row[i], &row[..=i]);
-            }
+            add_rows(&mut square[..=i], w.len() / width.max(1), |k| {
+                let row = &w[k * width..][..width];
+                (row[i], row)
+            });
             let h = &mut self.h[column * self.n..][..=column];
             rest[..=i].iter().zip(&square).for_each(|(j, square)| h[*j] -= square);
             self.g[column] -= w.chunks_exact(width).zip(y).map(|(row, y)| row[i] * y).sum::<f64>();
@@ -190,6 +215,11 @@ impl Back {
         self.p[i * self.n + j]
     }
 
+    /// `a x` of a row over some columns, with the solution x.
+    pub(crate) fn change(&self, columns: &[usize], a: &[f64]) -> f64 {
+        columns.iter().zip(a).map(|(i, a)| a * self.x[*i]).sum()
+    }
+
     /// `a P bᵀ` of two rows over the same columns.
     pub(crate) fn product(&self, columns: &[usize], a: &[f64], b: &[f64]) -> f64 {
         let terms = columns.iter().zip(a).filter(|(_, a)| **a != 0.0).map(|(i, a)| {
@@ -222,11 +252,39 @@ impl Back {
         (0..e.len).for_each(|i| inverse[i * e.len + i] = 1.0);
         forward(&e.l, e.len, &mut inverse, e.len);
         backward(&e.l, e.len, &mut inverse, e.len);
+        self.open(e, &gain, &inverse);
+        for i in e.first..e.first + e.len {
+            for j in (0..e.first).chain(e.first + e.len..n) {
+                self.p[j * n + i] = self.p[i * n + j];
+            }
+        }
+    }
+
+    /// Rows of the covariance of eliminated unknowns, `G P` and `(L Lᵀ)⁻¹ + G P Gᵀ`, with the widest arithmetic that the
+    /// processor has.
+    fn open(&mut self, e: &Eliminated, gain: &[f64], inverse: &[f64]) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            unsafe { self.open_wide(e, gain, inverse) };
+            return;
+        }
+        self.open_plain(e, gain, inverse);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn open_wide(&mut self, e: &Eliminated, gain: &[f64], inverse: &[f64]) {
+        self.open_plain(e, gain, inverse);
+    }
+
+    #[inline(always)]
+    fn open_plain(&mut self, e: &Eliminated, gain: &[f64], inverse: &[f64]) {
+        let (n, width) = (self.n, e.rest.len());
         for i in 0..e.len {
             let mut row = vec![0.0; n];
-            for (j, gain) in e.rest.iter().zip(&gain[i * width..][..width]) {
-                axpy(&mut row, *gain, &self.p[usize::from(*j) * n..][..n]);
-            }
+            let gain_of = &gain[i * width..][..width];
+            add_rows(&mut row, width, |k| (gain_of[k], &self.p[usize::from(e.rest[k]) * n..][..n]));
             for j in 0..e.len {
                 let tied = e.rest.iter().zip(&gain[j * width..][..width]);
                 row[e.first + j] =
@@ -234,60 +292,6 @@ impl Back {
             }
             self.p[(e.first + i) * n..][..n].copy_from_slice(&row);
         }
-        for i in e.first..e.first + e.len {
-            for j in (0..e.first).chain(e.first + e.len..n) {
-                self.p[j * n + i] = self.p[i * n + j];
-            }
-        }
-    }
-}
-
-fn axpy(y: &mut [f64], a: f64, x: &[f64]) {
-    if a != 0.0 {
-        y.iter_mut().zip(x).for_each(|(y, x)| *y += a * x);
-    }
-}
-
-/// Lower Cholesky factor in place of a lower triangle.
-pub(crate) fn cholesky(l: &mut [f64], n: usize) -> Result<(), Singular> {
-    for i in 0..n {
-        for j in 0..=i {
-            let dot: f64 = l[i * n..][..j].iter().zip(&l[j * n..][..j]).map(|(a, b)| a * b).sum();
-            let left = l[i * n + j] - dot;
-            if i == j {
-                if !(left > 0.0 && left.is_finite()) {
-                    return Err(Singular);
-                }
-                l[i * n + i] = left.sqrt();
-            } else {
-                l[i * n + j] = left / l[j * n + j];
-            }
-        }
-    }
-    Ok(())
-}
-
-/// `B ← L⁻¹ B` of `width` columns.
-pub(crate) fn forward(l: &[f64], n: usize, b: &mut [f64], width: usize) {
-    for i in 0..n {
-        let (done, open) = b.split_at_mut(i * width);
-        let row = &mut open[..width];
-        for (k, done) in done.chunks_exact(width.max(1)).enumerate() {
-            axpy(row, -l[i * n + k], done);
-        }
-        row.iter_mut().for_each(|x| *x /= l[i * n + i]);
-    }
-}
-
-/// `B ← L⁻ᵀ B` of `width` columns.
-fn backward(l: &[f64], n: usize, b: &mut [f64], width: usize) {
-    for i in (0..n).rev() {
-        let (open, done) = b.split_at_mut((i + 1) * width);
-        let row = &mut open[i * width..];
-        for (k, done) in done.chunks_exact(width.max(1)).enumerate() {
-            axpy(row, -l[(i + 1 + k) * n + i], done);
-        }
-        row.iter_mut().for_each(|x| *x /= l[i * n + i]);
     }
 }
 

@@ -2,7 +2,7 @@
 
 use nalgebra::{UnitQuaternion, Vector3};
 
-use windhover_base::msg::{EstimatorOutput, FeltTilt, Ownship, TargetEstimate, TrackStatus};
+use windhover_base::msg::{EstimatorOutput, FeltTilt, MisfitCause, Ownship, TargetEstimate, TrackStatus};
 use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::{MonoTime, Span};
 use windhover_estimate::{Estimator, Site};
@@ -24,6 +24,12 @@ pub(crate) struct InitialValues {
     /// Of each target, where it was tracked, in order of time.
     pub(crate) targets: Vec<Vec<TargetEstimate>>,
     pub(crate) felt: Option<FeltTilt>,
+    /// Targets that the filter found to sway on their springs.
+    pub(crate) sways: Vec<bool>,
+    /// What the filter found to be configured wrongly.
+    pub(crate) wrong: Vec<MisfitCause>,
+    /// How many times as far as configured the receiver's slow error wanders.
+    pub(crate) wanders: f64,
     /// Why and when the filter was reset.
     pub(crate) resets: Vec<(MonoTime, String)>,
 }
@@ -36,7 +42,12 @@ pub(crate) fn filtered(
     recording: &Recording,
 ) -> InitialValues {
     let mut filter = Estimator::new(rig, estimator, site);
-    let mut first = InitialValues { targets: vec![Vec::new(); rig.target.len()], ..InitialValues::default() };
+    let mut first = InitialValues {
+        targets: vec![Vec::new(); rig.target.len()],
+        sways: vec![false; rig.target.len()],
+        wanders: 1.0,
+        ..InitialValues::default()
+    };
     let (mut out, mut asked) = (Vec::new(), None);
     for heard in recording.in_order() {
         match heard {
@@ -72,6 +83,22 @@ impl InitialValues {
                     self.targets[e.target].push(e);
                 }
                 EstimatorOutput::TiltFelt { felt, .. } => self.felt = Some(felt),
+                EstimatorOutput::Misfit(misfit) => match misfit.cause {
+                    MisfitCause::TargetSways { target } => self.sways[target] = true,
+                    MisfitCause::AntennaPlace
+                    | MisfitCause::Lens
+                    | MisfitCause::Readout
+                    | MisfitCause::Late
+                    | MisfitCause::MarkerSize(_)
+                    | MisfitCause::MarkerPlace(_)
+                    | MisfitCause::MarkerTurn(_)
+                        if !self.wrong.contains(&misfit.cause) =>
+                    {
+                        self.wrong.push(misfit.cause);
+                    }
+                    MisfitCause::Wanders => self.wanders = self.wanders.max(misfit.figure),
+                    _ => {}
+                },
                 EstimatorOutput::Reset { reason } => self.resets.push((t, reason.to_owned())),
                 _ => {}
             }

@@ -24,9 +24,9 @@ const STEP: f64 = 1e-5;
 /// Knots that are checked.
 const KNOTS: [usize; 2] = [20, 31];
 
-fn flown() -> (World, Site, Recording) {
-    let mut scenario = Scenario::named("two-vehicles").expect("a named scenario");
-    scenario.duration_s = 3.0;
+pub(crate) fn flown(name: &str, seconds: f64) -> (World, Site, Recording) {
+    let mut scenario = Scenario::named(name).expect("a named scenario");
+    scenario.duration_s = seconds;
     let declination_rad = scenario.declination_deg.to_radians();
     let world = Arc::new(World::new(scenario, 3));
     let site = Site { frame: *world.frame(), ground: Ground::Flat { down_m: 0.0 }, declination_rad };
@@ -77,13 +77,15 @@ fn moved(problem: &Problem<'_>, values: &Values, k: usize, column: usize, by: f6
 
 #[test]
 fn rows_are_the_derivatives_of_what_is_left_over() {
-    let (world, site, recording) = flown();
+    let (world, site, recording) = flown("two-vehicles", 3.0);
     let (rig, config) = (world.scenario().rig.clone(), EstimatorConfig::default());
     let recordings = [recording];
     let firsts = [filtered(&rig, &config, &site, &recordings[0])];
     let mut predictor = Predictor::new(&rig, &config, &site);
     let plan = planned(&predictor, &recordings, &firsts, rig.target.len(), 30.0);
-    let problem = stated(&rig, &config, &recordings, plan, &mut predictor, None);
+    let mut firsts = firsts;
+    firsts[0].sways[0] = true;
+    let problem = stated((&rig, &config, &site), &recordings, plan, &mut predictor, &firsts);
     let mut values = first_values(&problem, &firsts, &predictor, &rig, &site);
     let mut seed = 5u64;
     let mut random = move || {

@@ -1,9 +1,13 @@
 #![doc = include_str!("../README.md")]
 #![warn(missing_docs, clippy::unwrap_used, clippy::disallowed_methods)]
 
+mod beginnings;
 mod block;
+mod dense;
 mod initial;
 mod front;
+#[cfg(test)]
+mod gtsam_tests;
 #[cfg(test)]
 mod jacobians;
 mod covariance_pass;
@@ -14,13 +18,17 @@ mod plan;
 mod problem;
 mod recording;
 mod refine;
+mod roughness;
+#[cfg(test)]
+mod segments;
 mod solve;
+mod surveyed;
 mod result;
 mod unknowns;
 mod values;
 
 pub use block::Source;
-pub use recording::{OutsidePosition, Recording};
+pub use recording::{OutsidePosition, Recording, SurveyedMarker};
 pub use refine::{RefineError, refine};
 pub use result::{Constant, Outlier, Refined, Tally};
 pub use unknowns::ConstantKind;

@@ -14,6 +14,8 @@ use nalgebra::{Matrix3, Vector3};
 
 use windhover_base::geo::{skew, wrap_angle};
 
+use windhover_estimate::batch::{SWAY_COLUMNS, SWAY_TAU_S};
+
 use crate::block::{Block, Noise, Source};
 use crate::front::Shape;
 use crate::unknowns::{Place, knot};
@@ -27,8 +29,9 @@ const DRIVE: [f64; 4] = [f64::INFINITY, f64::INFINITY, 2.0, 0.4];
 const WIND_WALK: f64 = 0.1;
 /// Least variance of a step, m² or rad²: with a smaller one the absolute position is lost to rounding.
 const LEAST_VAR: f64 = 1e-13;
-/// Side slip of a target that does not move, m²/s.
-const STILL_Q: f64 = 1e-12;
+/// Walk of place and heading of a target that does not move, m²/s and rad²/s: with a smaller one the absolute place is lost to
+/// rounding.
+const STILL_Q: f64 = 1e-9;
 
 /// Constants of processes that are not fitted.
 #[derive(Clone, Copy, Debug)]
@@ -295,10 +298,26 @@ impl Link<'_> {
             *block.at(0, 3 * end + 2) = -0.5 * along;
         }
         block.right[0] = -across;
-        self.finish(block, &[self.processes.slip_q * self.h], Source::Known, take);
+        self.finish(block, &[self.processes.slip_q * self.h], Source::Slip(target), take);
     }
 
-    /// A target that does not move.
+    /// Sway of a target on its springs, with markers so high, m: each of its angles and heave reverts to zero.
+    pub(crate) fn sway(
+        &self,
+        target: usize,
+        height_m: f64,
+        block: &mut Block,
+        take: &mut dyn FnMut(Source, &Block),
+    ) {
+        let grown = 1.0 - (-2.0 * self.h / SWAY_TAU_S).exp();
+        let of_unit = sway_variances(height_m);
+        for (i, source) in sway_sources(target).into_iter().enumerate() {
+            let first = knot::target(target) + knot::SWAY + i;
+            self.reverting(first, &[grown * of_unit[i]], SWAY_TAU_S, source, block, take);
+        }
+    }
+
+    /// A target that does not move: its place and heading. Its speed and yaw rate are zero at every knot.
     fn still(
         &self,
         a: &[f64],
@@ -307,13 +326,13 @@ impl Link<'_> {
         block: &mut Block,
         take: &mut dyn FnMut(Source, &Block),
     ) {
-        for i in 0..knot::TARGET {
+        for i in 0..=knot::HEADING {
             block.begin(1);
             block.over([at[0] + i, at[1] + i]);
             (*block.at(0, 0), *block.at(0, 1)) = (-1.0, 1.0);
             let change = b[i] - a[i];
             block.right[0] = -if i == knot::HEADING { wrap_angle(change) } else { change };
-            self.finish(block, &[STILL_Q], Source::Known, take);
+            self.finish(block, &[STILL_Q * self.h], Source::Known, take);
         }
     }
 
@@ -331,6 +350,17 @@ impl Link<'_> {
             take(source, block);
         }
     }
+}
+
+/// Variances of roll, pitch (rad²) and heave (m²) that displace markers so high by 1 m², each.
+pub(crate) fn sway_variances(height_m: f64) -> [f64; SWAY_COLUMNS] {
+    let angle = height_m.powi(-2);
+    [angle, angle, 1.0]
+}
+
+/// Sources of roll, pitch and heave.
+pub(crate) const fn sway_sources(target: usize) -> [Source; SWAY_COLUMNS] {
+    [Source::Sway(target), Source::Sway(target), Source::Heave(target)]
 }
 
 /// A chain's state: its first element, and the others from a target's part.

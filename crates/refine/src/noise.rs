@@ -46,13 +46,31 @@ impl Components {
         Self { sums: vec![vec![Sum::default(); windows]; Source::count(targets)] }
     }
 
-    /// Adds a block that is not an outlier, whitened with this factor.
-    pub(crate) fn take(&mut self, source: Source, window: usize, figure: f64, block: &Block, back: &Back) {
+    /// Adds a block that has this weight in the solution, whitened with this factor.
+    pub(crate) fn take(
+        &mut self,
+        source: Source,
+        (window, figure, weight): (usize, f64, f64),
+        block: &Block,
+        back: &Back,
+    ) {
+        if source == Source::Known {
+            return;
+        }
         let width = block.columns.len();
         let taken: f64 =
             block.rows.chunks_exact(width).map(|row| back.product(&block.columns, row, row)).sum();
-        let (found, due) = (block.square(), (block.len() as f64 - taken).max(0.0));
+        // Of the solution: as the linear model has it from here.
+        let square = |(row, right): (&[f64], &f64)| (right - back.change(&block.columns, row)).powi(2);
+        let found = weight * block.rows.chunks_exact(width).zip(&block.right).map(square).sum::<f64>();
+        let due = (block.len() as f64 - taken).max(0.0);
         self.sums[source.index()][window].add(&Sum { found, due, absolute: found * figure }, 1.0);
+    }
+
+    /// Sum of squares and expected sum of some sources, over the whole flight.
+    pub(crate) fn sums_of(&self, sources: &[Source]) -> [f64; 2] {
+        let all = sources.iter().flat_map(|source| &self.sums[source.index()]);
+        all.fold([0.0; 2], |[found, due], sum| [found + sum.found, due + sum.due])
     }
 
     /// Updates the factors; returns the largest change (its logarithm).
@@ -106,7 +124,10 @@ fn fitted(targets: usize) -> impl Iterator<Item = Source> {
         S::Thrust,
         S::Vibration,
     ];
-    own.into_iter().chain((0..targets).flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t)]))
+    own.into_iter().chain(
+        (0..targets)
+            .flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t), S::Sway(t), S::Heave(t), S::Slip(t)]),
+    )
 }
 
 /// Limits of a factor; for measurements relative to the configured variance.
@@ -115,12 +136,20 @@ fn limits(source: Source) -> (f64, f64) {
         Source::GpsPosition | Source::GpsVelocity => (0.25, 25.0),
         Source::Heading => (0.25, 36.0),
         Source::Tilt => (0.25, 400.0),
-        Source::Marker(_) | Source::Feature => (0.01, 25.0),
+        // Vibration under a rolling shutter makes pixels of tenths.
+        Source::Marker(_) | Source::Feature => (0.01, 400.0),
         // Forces change within a step.
         Source::Vibration => (1e-5, 1.0),
+        // Over the configured one: of a vehicle that rolls nothing is given away.
+        Source::Slip(_) => (1.0, 1e4),
+        // Displacements of a millimetre to half a metre.
+        Source::Sway(_) | Source::Heave(_) => (1e-6, 0.25),
         _ => MOTION,
     }
 }
+
+/// Initial displacement of the markers of a target that sways, m.
+const SWAY_M: f64 = 0.02;
 
 /// Initial factors: intensities of jerk and its changes, variances of gusts and of the excess thrust.
 pub(crate) fn first(targets: usize, gust_mps2: f64, thrust_mps2: f64) -> Noise {
@@ -133,6 +162,7 @@ pub(crate) fn first(targets: usize, gust_mps2: f64, thrust_mps2: f64) -> Noise {
     for target in 0..targets {
         noise.set(Source::Drive(target), 6.0);
         noise.set(Source::Turn(target), 2.0);
+        [Source::Sway(target), Source::Heave(target)].iter().for_each(|s| noise.set(*s, SWAY_M.powi(2)));
     }
     noise
 }

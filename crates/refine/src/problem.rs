@@ -10,7 +10,8 @@ use crate::measure::{self, Instant, Lens, Rows};
 use crate::motion::{Link, Processes, Pushed};
 use crate::plan::Plan;
 use crate::recording::Recording;
-use crate::unknowns::{Place, Prior, constant, knot, rig_offsets};
+use crate::surveyed::ControlPoint;
+use crate::unknowns::{Place, Prior, constant, rig_offsets};
 use crate::values::{Knot, Values};
 
 /// The measurements and priors. Nothing here changes during the solution.
@@ -24,7 +25,11 @@ pub(crate) struct Problem<'a> {
     pub(crate) targets: usize,
     /// Whether each target moves.
     pub(crate) moves: Vec<bool>,
+    /// Height of the markers of each target that sways on its springs, m.
+    pub(crate) sways: Vec<Option<f64>>,
     pub(crate) processes: Processes,
+    /// Markers at known positions, of each recording.
+    pub(crate) control_points: Vec<Vec<ControlPoint>>,
     /// Landmarks that were found not to be on the ground.
     pub(crate) dropped: Vec<bool>,
     /// Variance of the tilt readings' slow error that is not estimated, rad²: of attitude about north and east.
@@ -32,9 +37,22 @@ pub(crate) struct Problem<'a> {
     /// Where the camera is configured to be in the body, m.
     pub(crate) camera_at: nalgebra::Vector3<f64>,
     pub(crate) gates: [f64; 9],
+    /// Knots of a segment, of which all eliminations are kept at once.
+    pub(crate) segment_len: usize,
 }
 
 impl Problem<'_> {
+    /// Number of segments.
+    pub(crate) fn segments(&self) -> usize {
+        self.plan.stops.len().div_ceil(self.segment_len)
+    }
+
+    /// Knots of a segment.
+    pub(crate) fn segment(&self, index: usize) -> std::ops::Range<usize> {
+        let first = index * self.segment_len;
+        first..(first + self.segment_len).min(self.plan.stops.len())
+    }
+
     /// A knot's state at a measurement's time, `dt` after it.
     fn instant<'b>(
         &'b self,
@@ -74,13 +92,6 @@ pub(crate) struct Pass<'a> {
     pushed: Vec<Pushed>,
     lens: Lens,
 }
-
-/// Weak knowledge of a trajectory's first knot, one sigma: position m, velocity m/s, attitude rad, rate rad/s, angular
-/// acceleration rad/s², wind m/s².
-const FIRST: [f64; 6] = [1e4, 100.0, 1.0, 2.0, 10.0, 1.5];
-/// The same for a target at the start of its estimation: place m, heading rad, speed m/s, yaw rate rad/s, acceleration
-/// m/s², yaw acceleration rad/s², jerk m/s³, yaw jerk rad/s³.
-const TAKEN_UP: [f64; knot::TARGET] = [1e4, 1e4, 10.0, 30.0, 5.0, 3.0, 3.0, 5.0, 5.0];
 
 impl<'a> Pass<'a> {
     pub(crate) fn new(problem: &'a Problem<'a>, predictor: Predictor) -> Self {
@@ -130,47 +141,6 @@ impl<'a> Pass<'a> {
         cost
     }
 
-    /// Adds the priors of a knot: where a trajectory begins, and for quantities that are not estimated there.
-    pub(crate) fn beginnings(&self, k: usize, values: &Values, noise: &Noise, front: &mut Front) -> f64 {
-        let (stop, state) = (&self.problem.plan.stops[k], &values.knots[k]);
-        let (at, p) = (self.problem.shape.knot_at(k), &self.problem.processes);
-        let mut cost = 0.0;
-        if stop.begins {
-            let vague = [knot::POSITION, knot::VELOCITY, knot::ATTITUDE];
-            for (first, sigma) in vague.into_iter().zip(FIRST) {
-                (0..3).for_each(|i| front.add_prior(at + first + i, sigma.powi(-2), 0.0));
-            }
-            let mut about_zero = |first: usize, sigmas: &[f64]| {
-                for (i, sigma) in sigmas.iter().enumerate() {
-                    let (information, value) = (sigma.powi(-2), state.x[first + i]);
-                    front.add_prior(at + first + i, information, -value);
-                    cost += value * value * information;
-                }
-            };
-            about_zero(knot::RATE, &[FIRST[3]; 3]);
-            about_zero(knot::SPIN, &[FIRST[4]; 3]);
-            about_zero(knot::GUST, &[noise.of(Source::Gust).sqrt(); 2]);
-            about_zero(knot::THRUST, &[noise.of(Source::Thrust).sqrt()]);
-            about_zero(knot::TILT_ERROR, &[p.tilt_error.0.sqrt(); 2]);
-            about_zero(knot::WIND, &[FIRST[5]; 2]);
-            about_zero(knot::GPS_BIAS, &p.gps_bias.0.map(f64::sqrt));
-        }
-        for target in 0..self.problem.targets {
-            let first = at + knot::target(target);
-            if !stop.held[target] {
-                (0..knot::TARGET).for_each(|i| front.add_prior(first + i, 1.0, 0.0));
-            } else if stop.taken_up[target] {
-                for (i, sigma) in TAKEN_UP.iter().enumerate() {
-                    let (information, value) = (sigma.powi(-2), values.knots[k].target(target)[i]);
-                    let pull = if i < 3 { 0.0 } else { value };
-                    front.add_prior(first + i, information, -pull);
-                    cost += pull * pull * information;
-                }
-            }
-        }
-        cost
-    }
-
     /// Passes on every block of knot `k`: its measurements, and the step to the next knot.
     pub(crate) fn blocks(
         &mut self,
@@ -181,6 +151,7 @@ impl<'a> Pass<'a> {
     ) {
         self.epochs(k, values, noise, take);
         self.positions(k, values, take);
+        self.surveyed(k, values, take);
         self.readings(k, values, noise, take);
         self.frame(k, values, noise, take);
         self.link(k, values, noise, take);
@@ -207,6 +178,9 @@ impl<'a> Pass<'a> {
         for target in 0..problem.targets {
             if stop.held[target] && next.held[target] && !next.taken_up[target] {
                 link.target(target, problem.moves[target], &mut self.block, &mut take);
+                if let Some(height_m) = problem.sways[target] {
+                    link.sway(target, height_m, &mut self.block, &mut take);
+                }
             }
         }
     }
@@ -240,6 +214,16 @@ impl<'a> Pass<'a> {
                     take(Origin::of(source), &self.block);
                 }
             }
+        }
+    }
+
+    /// Control points, where the estimation of their target begins: it does not move.
+    fn surveyed(&mut self, k: usize, values: &Values, take: &mut dyn FnMut(Origin, &Block)) {
+        let problem = self.problem;
+        let (stop, at) = (&problem.plan.stops[k], problem.shape.knot_at(k));
+        for point in problem.control_points[stop.flight].iter().filter(|p| stop.taken_up[p.target]) {
+            point.write(&values.knots[k], values, (problem.shape, at), &mut self.block);
+            take(Origin::of(Source::Outside), &self.block);
         }
     }
 

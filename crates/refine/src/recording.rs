@@ -1,7 +1,7 @@
 //! The measurements of a recorded flight, as values.
 
 use windhover_base::geo::Geodetic;
-use windhover_base::msg::{AttitudeSample, FrameObservations, GnssEpoch, Stamped};
+use windhover_base::msg::{AttitudeSample, FrameObservations, GnssEpoch, MarkerId, Stamped};
 use windhover_base::time::MonoTime;
 
 /// The measurements of one flight, each list in order of reception. Times of validity are corrected by the configured
@@ -16,6 +16,19 @@ pub struct Recording {
     pub frames: Vec<Stamped<FrameObservations>>,
     /// Positions of the antenna from a better source than the receiver on board.
     pub positions: Vec<OutsidePosition>,
+    /// Markers at rest whose positions are known.
+    pub surveyed: Vec<SurveyedMarker>,
+}
+
+/// A marker of a target that does not move, at a known position.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct SurveyedMarker {
+    /// The marker.
+    pub marker: MarkerId,
+    /// Its centre; its height is not used.
+    pub at: Geodetic,
+    /// One sigma north and east, m.
+    pub sigma_m: f64,
 }
 
 /// An external position of the antenna: from a base station's solution, or a better receiver.

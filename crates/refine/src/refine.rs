@@ -18,8 +18,10 @@ use crate::plan::Plan;
 use crate::problem::{Pass, Problem};
 use crate::recording::Recording;
 use crate::result::Refined;
-use crate::solve::{Unsolved, solve};
-use crate::unknowns::{knot, outside_places, places, priors};
+use crate::roughness::make_consistent;
+use crate::solve::{Unsolved, apply, solve};
+use crate::surveyed::control_points;
+use crate::unknowns::{constant, knot, outside_places, places, priors};
 use crate::values::{Knot, Values};
 
 /// Why a flight could not be refined.
@@ -60,14 +62,18 @@ const SETTLED: f64 = 0.1;
 /// is this for each knot.
 const CONVERGED: f64 = 0.05;
 const NEARLY: f64 = 2e-3;
+const ROUGHLY: f64 = 30.0;
 /// A ground feature with a larger share of detections outside the gate is dropped.
 const MOVING: f64 = 0.25;
+const MOST_MOVE: f64 = 0.6;
 /// Chi-square values that good measurements exceed once in a thousand, by number of components.
 const GATES: [f64; 9] = [f64::INFINITY, 10.83, 13.82, 16.27, 18.47, 20.52, 22.46, 24.32, 26.12];
 /// A flight in which a smaller share of knots has a target is blind.
 const BLIND: f64 = 0.2;
 /// The slow error of tilt readings where it is not estimated, rad.
 const HELD_TILT_ERROR: f64 = 1e-5;
+/// Knots of which all eliminations are kept at once: some 200 MB.
+const SEGMENT: usize = 5_000;
 /// Most outliers that are listed.
 const NAMED: usize = 200;
 /// Correlation time of the thrust beyond the weight, s.
@@ -95,7 +101,7 @@ pub fn refine(
     if plan.stops.is_empty() {
         return Err(why_not_started(recordings));
     }
-    let mut problem = stated(rig, estimator, recordings, plan, &mut predictor, felt);
+    let mut problem = stated((rig, estimator, site), recordings, plan, &mut predictor, &firsts);
     let mut values = first_values(&problem, &firsts, &predictor, rig, site);
     let mut noise = first_noise(problem.targets, estimator.side_force_mps2, estimator.thrust_mps2);
     let total = (problem.plan.stops.len() * (ROUNDS + 1) * 3) as f64;
@@ -109,18 +115,27 @@ pub fn refine(
     for round in 0.. {
         let looked = {
             let mut pass = Pass::new(&problem, predictor.clone());
-            let factors =
-                solve(&mut pass, &mut values, &noise, if last { CONVERGED } else { nearly }, &mut step)?;
-            look(&mut pass, &factors, &values, &noise, site, recordings)
+            // Between rounds one step is enough: the next noise moves the solution again.
+            let enough = [nearly, ROUGHLY * nearly, CONVERGED][usize::from(round > 0) + usize::from(last)];
+            let factors = solve(&mut pass, &mut values, &noise, enough, &mut step)?;
+            let mut looked = look(&mut pass, &factors, &values, &noise, site, recordings)?;
+            if !last {
+                apply(&mut pass, &factors, &mut values, &noise)?;
+            } else {
+                drop(factors);
+                let of = (site, recordings);
+                make_consistent(&mut pass, &values, &noise, &mut looked, of, &mut step)?;
+            }
+            looked
         };
         if last {
             let mut refined = looked.refined;
             refined.finish(&problem, &firsts, felt, looked.memory.inflation());
             return Ok(refined);
         }
-        let dropped = drop_movers(&mut problem, &looked);
+        let changed = drop_movers(&mut problem, &looked) + widen(&mut problem, &values);
         let moved = looked.components.fit(problem.targets, &mut noise);
-        last = round + 1 >= ROUNDS || (moved < SETTLED && dropped == 0);
+        last = round + 1 >= ROUNDS || (moved < SETTLED && changed == 0);
     }
     unreachable!("the loop ends by its rounds")
 }
@@ -151,27 +166,38 @@ pub(crate) fn planned(
 }
 
 pub(crate) fn stated<'a>(
-    rig: &Rig,
-    estimator: &EstimatorConfig,
+    (rig, estimator, site): (&Rig, &EstimatorConfig, &Site),
     recordings: &'a [Recording],
     plan: Plan,
     predictor: &mut Predictor,
-    felt: Option<FeltTilt>,
+    firsts: &[InitialValues],
 ) -> Problem<'a> {
     let targets = rig.target.len();
-    let share = match felt {
+    let share = match firsts.iter().find_map(|first| first.felt) {
         Some(FeltTilt::Share(share)) => Some(share),
         _ => None,
     };
+    let sways: Vec<bool> =
+        (0..targets).map(|target| firsts.iter().any(|first| first.sways[target])).collect();
+    sways.iter().enumerate().for_each(|(target, sways)| predictor.set_sways(target, *sways));
+    let wanders = firsts.iter().map(|first| first.wanders).fold(1.0, f64::max);
     let seen = plan.stops.iter().filter(|stop| stop.held.contains(&true)).count();
     let blind = (seen as f64) < BLIND * plan.stops.len() as f64;
-    let priors = priors(rig, predictor, share, blind);
+    let mut priors = priors(rig, predictor, share, blind);
+    for prior in &mut priors {
+        firsts.iter().for_each(|first| prior.widen_by(&first.wrong));
+    }
     let reading = predictor.tilt_error();
-    let places = places(predictor, targets, &priors);
+    let control_points = control_points(rig, predictor, &site.frame, recordings, &priors);
+    let places = places(predictor, &sways, &priors);
+    let heights = sways.iter().enumerate().map(|(t, sways)| sways.then(|| predictor.markers_height_m(t)));
+    let sways = heights.collect();
     let best_fix = recordings.iter().flat_map(|r| &r.epochs).map(|e| e.value.fix).max();
+    let (vars, tau_s) = predictor.gps_bias(best_fix.unwrap_or(FixKind::ThreeD));
     let shape = Shape { knot: knot::target(targets), landmarks: plan.places, constants: priors.len() };
     Problem {
         recordings,
+        control_points,
         dropped: vec![false; plan.landmarks],
         plan,
         shape,
@@ -179,18 +205,20 @@ pub(crate) fn stated<'a>(
         places,
         priors,
         targets,
+        sways,
         moves: (0..targets).map(|target| predictor.moves(target)).collect(),
         processes: Processes {
             gust_tau_s: estimator.force_tau_s,
             thrust_tau_s: THRUST_TAU_S,
             // Motion must not explain the reading's slow error either: it is considered, not estimated.
             tilt_error: if blind { (HELD_TILT_ERROR.powi(2), reading.1) } else { reading },
-            gps_bias: predictor.gps_bias(best_fix.unwrap_or(FixKind::ThreeD)),
+            gps_bias: (vars.map(|var| var * wanders.powi(2)), tau_s),
             slip_q: predictor.slip_q(),
         },
         considered_tilt_var: if blind { reading.0 } else { 0.0 },
         camera_at: rig.camera.mount.position(),
         gates: GATES,
+        segment_len: SEGMENT,
     }
 }
 
@@ -265,6 +293,12 @@ fn place_landmarks(problem: &Problem<'_>, rig: &Rig, site: &Site, values: &mut V
 
 /// Drops landmarks that were too often outside the gate; returns how many.
 fn drop_movers(problem: &mut Problem<'_>, looked: &PassResult) -> usize {
+    let [seen, outside] =
+        looked.landmarks.iter().fold([0; 2], |[all, out], (seen, outside)| [all + seen, out + outside]);
+    // Where everything moves, it is the noise that is not known yet.
+    if outside as f64 > MOST_MOVE * seen as f64 {
+        return 0;
+    }
     let mut more = 0;
     for (dropped, (seen, outside)) in problem.dropped.iter_mut().zip(&looked.landmarks) {
         let moves = *outside as f64 > MOVING * *seen as f64;
@@ -272,6 +306,17 @@ fn drop_movers(problem: &mut Problem<'_>, looked: &PassResult) -> usize {
         *dropped |= moves;
     }
     more
+}
+
+/// Widens the priors of constants that turned out to be configured wrongly; returns how many.
+///
+/// A camera that is late makes fixes and readings early, both by as much.
+fn widen(problem: &mut Problem<'_>, values: &Values) -> usize {
+    let priors = problem.priors.iter_mut().zip(&values.constants);
+    let widened: usize = priors.map(|(prior, value)| usize::from(prior.widen(*value))).sum();
+    let camera = &mut problem.priors[constant::CAMERA_DELAY];
+    let early = [constant::GPS_DELAY, constant::COMPASS_DELAY].map(|delay| -values.constants[delay]);
+    widened + usize::from(camera.widen(camera.mean + early[0].min(early[1]).max(0.0)))
 }
 
 impl Refined {
@@ -284,7 +329,7 @@ impl Refined {
     ) {
         for (constant, prior) in self.constants.iter_mut().zip(&problem.priors) {
             if prior.is_estimated() {
-                constant.sigma = (constant.sigma * inflation.sqrt()).min(constant.prior_sigma);
+                constant.sigma = (constant.sigma * inflation.sqrt()).min(prior.sigma);
             }
         }
         self.outliers.sort_by(|a, b| b.ratio.total_cmp(&a.ratio));

@@ -1,7 +1,10 @@
 //! The values with the best fit: Gauss–Newton steps, damped (Marquardt 1963) where the model is too nonlinear.
 
+use std::borrow::Cow;
+
 use crate::block::{Block, Loss, Noise};
-use crate::front::{Back, Eliminated, Front, Singular};
+use crate::dense::Singular;
+use crate::front::{Back, Eliminated, Front};
 use crate::problem::{Origin, Pass};
 use crate::values::Values;
 
@@ -9,7 +12,7 @@ use crate::values::Values;
 const STEPS: usize = 25;
 const RAISED: (f64, f64, f64) = (1e-4, 10.0, 1e6);
 /// Prior information about a landmark, 1/m².
-const LANDMARK: f64 = 1e-8;
+pub(crate) const LANDMARK: f64 = 1e-8;
 
 /// The kind of eliminated unknowns.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -19,15 +22,51 @@ pub(crate) enum EliminatedKind {
     Constants,
 }
 
+/// An elimination.
+pub(crate) type Step = (EliminatedKind, Eliminated);
+
 /// The factorised normal equations at some values.
+///
+/// Of a long flight only the last segment is kept, and of each earlier one the front at its begin: a backward pass
+/// eliminates it once more. So memory hardly grows with the length.
 pub(crate) struct Factors {
-    pub(crate) steps: Vec<(EliminatedKind, Eliminated)>,
+    /// Eliminations of the last segment, and of the constants.
+    last: Vec<Step>,
+    /// The front at the begin of every segment.
+    begins: Vec<Front>,
+    raised: f64,
     pub(crate) cost: f64,
+    gain: f64,
 }
 
 impl Factors {
-    fn gain(&self) -> f64 {
-        self.steps.iter().map(|(_, e)| e.gain()).sum()
+    /// By how much the sum of squares is reduced by the solution.
+    pub(crate) fn gain(&self) -> f64 {
+        self.gain
+    }
+
+    /// Number of segments.
+    pub(crate) fn segments(&self) -> usize {
+        self.begins.len()
+    }
+
+    /// The eliminations of a segment, at the same values.
+    pub(crate) fn segment(
+        &self,
+        index: usize,
+        pass: &mut Pass<'_>,
+        values: &Values,
+        noise: &Noise,
+    ) -> Result<Cow<'_, [Step]>, Unsolved> {
+        if index + 1 == self.segments() {
+            return Ok(Cow::Borrowed(&self.last));
+        }
+        let mut front = self.begins[index].clone();
+        let mut steps = Vec::new();
+        for k in pass.problem.segment(index) {
+            eliminate_knot(pass, (k, values, noise), self.raised, &mut front, &mut steps)?;
+        }
+        Ok(Cow::Owned(steps))
     }
 }
 
@@ -56,34 +95,60 @@ pub(crate) fn factorise(
     watch: Watch<'_>,
 ) -> Result<Factors, Unsolved> {
     let problem = pass.problem;
-    let (shape, gates) = (problem.shape, problem.gates);
+    let shape = problem.shape;
     pass.begin(values);
     let mut front = Front::new(shape);
-    let mut cost = pass.constants(values, &mut front);
-    let mut steps = Vec::with_capacity(values.knots.len() + values.landmarks.len() + 1);
-    for (k, stop) in problem.plan.stops.iter().enumerate() {
-        cost += pass.beginnings(k, values, noise, &mut front);
-        pass.blocks(k, values, noise, &mut |origin: Origin, block: &Block| {
-            let square = block.square();
-            let loss = match origin.source.is_measured() {
-                true => Loss::of(square, gates[block.len()]),
-                false => Loss { weight: 1.0, cost: square },
-            };
-            cost += loss.cost;
-            front.add(&block.columns, &block.rows, &block.right, loss.weight);
-        });
-        steps.push((EliminatedKind::Knot(k), front.eliminate(shape.knot_at(k), shape.knot, raised)?));
-        for (place, landmark) in &stop.closes {
-            let first = shape.landmark_at(*place);
-            (0..2).for_each(|i| front.hold(first + i, LANDMARK));
-            steps.push((EliminatedKind::Landmark(*landmark), front.eliminate(first, 2, raised)?));
+    let mut factors = Factors {
+        cost: pass.constants(values, &mut front),
+        last: Vec::new(),
+        begins: Vec::new(),
+        raised,
+        gain: 0.0,
+    };
+    for index in 0..problem.segments() {
+        factors.begins.push(front.clone());
+        factors.last.clear();
+        for k in problem.segment(index) {
+            factors.cost += eliminate_knot(pass, (k, values, noise), raised, &mut front, &mut factors.last)?;
+            if !watch(k) {
+                return Err(Unsolved::Stopped);
+            }
         }
-        if !watch(k) {
-            return Err(Unsolved::Stopped);
-        }
+        factors.gain += factors.last.iter().map(|(_, e)| e.gain()).sum::<f64>();
     }
-    steps.push((EliminatedKind::Constants, front.eliminate(shape.constants_at(), shape.constants, raised)?));
-    Ok(Factors { steps, cost })
+    let constants = front.eliminate(shape.constants_at(), shape.constants, raised)?;
+    factors.gain += constants.gain();
+    factors.last.push((EliminatedKind::Constants, constants));
+    Ok(factors)
+}
+
+/// Adds everything of a knot, eliminates it and the landmarks that were seen last there; returns its cost.
+fn eliminate_knot(
+    pass: &mut Pass<'_>,
+    (k, values, noise): (usize, &Values, &Noise),
+    raised: f64,
+    front: &mut Front,
+    steps: &mut Vec<Step>,
+) -> Result<f64, Unsolved> {
+    let problem = pass.problem;
+    let (shape, gates) = (problem.shape, problem.gates);
+    let mut cost = pass.beginnings(k, values, noise, front);
+    pass.blocks(k, values, noise, &mut |origin: Origin, block: &Block| {
+        let square = block.square();
+        let loss = match origin.source.is_measured() {
+            true => Loss::of(square, gates[block.len()]),
+            false => Loss { weight: 1.0, cost: square },
+        };
+        cost += loss.cost;
+        front.add(&block.columns, &block.rows, &block.right, loss.weight);
+    });
+    steps.push((EliminatedKind::Knot(k), front.eliminate(shape.knot_at(k), shape.knot, raised)?));
+    for (place, landmark) in &problem.plan.stops[k].closes {
+        let first = shape.landmark_at(*place);
+        (0..2).for_each(|i| front.hold(first + i, LANDMARK));
+        steps.push((EliminatedKind::Landmark(*landmark), front.eliminate(first, 2, raised)?));
+    }
+    Ok(cost)
 }
 
 /// Changes the values until they fit best: until a step's expected reduction of the sum of squares is below `enough`.
@@ -113,18 +178,28 @@ pub(crate) fn solve(
         }
         raised = if raised > RAISED.0 { raised / RAISED.1 } else { 0.0 };
         best = Some((values.clone(), factors.cost));
-        apply(pass, &factors, values);
+        apply(pass, &factors, values, noise)?;
     }
     unreachable!("the loop ends by its steps")
 }
 
 /// Changes the values by the solution.
-fn apply(pass: &Pass<'_>, factors: &Factors, values: &mut Values) {
+pub(crate) fn apply(
+    pass: &mut Pass<'_>,
+    factors: &Factors,
+    values: &mut Values,
+    noise: &Noise,
+) -> Result<(), Unsolved> {
     let mut back = Back::new(pass.problem.shape);
-    for (what, e) in factors.steps.iter().rev() {
-        back.solve(e);
-        values.step(*what, &back.x[e.range()]);
+    // Segments that are eliminated once more have links to knots that were changed already.
+    let before = values.clone();
+    for index in (0..factors.segments()).rev() {
+        for (what, e) in factors.segment(index, pass, &before, noise)?.iter().rev() {
+            back.solve(e);
+            values.step(*what, &back.x[e.range()]);
+        }
     }
+    Ok(())
 }
 
 impl Values {

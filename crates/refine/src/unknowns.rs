@@ -2,8 +2,9 @@
 
 use nalgebra::Vector3;
 
+use windhover_base::msg::MisfitCause;
 use windhover_base::settings::Rig;
-use windhover_estimate::batch::{Predictor, RigOffsets, TAG_COLUMNS, TARGET_COLUMNS, columns};
+use windhover_estimate::batch::{Predictor, RigOffsets, SWAY_COLUMNS, TAG_COLUMNS, TARGET_COLUMNS, columns};
 
 /// Unknowns of a knot: the helicopter, its slow errors, then each target.
 pub(crate) mod knot {
@@ -30,8 +31,11 @@ pub(crate) mod knot {
     /// The first target's.
     pub(crate) const TARGETS: usize = 25;
 
-    /// Length of a target's part: north, east, heading, speed, yaw rate, acceleration, yaw acceleration, jerk, yaw jerk.
-    pub(crate) const TARGET: usize = 9;
+    /// Length of a target's part: north, east, heading, speed, yaw rate, acceleration, yaw acceleration, jerk, yaw jerk,
+    /// sway (roll, pitch, heave).
+    pub(crate) const TARGET: usize = 12;
+    /// Length of the part that all targets have: the others are zero where the target does not sway.
+    pub(crate) const RIGID: usize = 9;
     pub(crate) const HEADING: usize = 2;
     pub(crate) const SPEED: usize = 3;
     pub(crate) const YAW_RATE: usize = 4;
@@ -39,6 +43,7 @@ pub(crate) mod knot {
     pub(crate) const YAW_ACCELERATION: usize = 6;
     pub(crate) const JERK: usize = 7;
     pub(crate) const YAW_JERK: usize = 8;
+    pub(crate) const SWAY: usize = 9;
 
     /// Where a target's part begins.
     pub(crate) const fn target(i: usize) -> usize {
@@ -77,6 +82,8 @@ pub enum ConstantKind {
     AntennaAt(usize),
     /// Logarithm of the focal length over that configured.
     Focal,
+    /// A distortion term of the lens relative to its configuration: k1, k2, p1, p2; of a fisheye its four.
+    Lens(usize),
     /// Of a tag: logarithm of its size over that configured; place forward, right; turn.
     Tag {
         /// Index of the target.
@@ -86,6 +93,13 @@ pub enum ConstantKind {
         /// Which of the four.
         part: usize,
     },
+}
+
+impl ConstantKind {
+    /// Whether its expected value is from the configuration.
+    const fn is_configured(self) -> bool {
+        !matches!(self, Self::Trim(_) | Self::Drag | Self::TiltShare)
+    }
 }
 
 /// Places of the constants.
@@ -104,7 +118,8 @@ pub(crate) mod constant {
     pub(crate) const CAMERA_AT: usize = 18;
     pub(crate) const ANTENNA_AT: usize = 21;
     pub(crate) const FOCAL: usize = 24;
-    pub(crate) const TAGS: usize = 25;
+    pub(crate) const LENS: usize = 25;
+    pub(crate) const TAGS: usize = 29;
 }
 
 /// The prior of a constant.
@@ -114,6 +129,8 @@ pub(crate) struct Prior {
     pub(crate) mean: f64,
     /// One sigma; zero where it is known.
     pub(crate) sigma: f64,
+    /// One sigma of a careful configuration; `sigma` is larger where it turned out to be wrong.
+    pub(crate) careful: f64,
     /// Whether it is fixed: the flight must not change it.
     pub(crate) held: bool,
 }
@@ -123,7 +140,43 @@ impl Prior {
     pub(crate) fn is_estimated(&self) -> bool {
         self.sigma > 0.0 && !self.held
     }
+
+    /// Whether a value is so far from the expected one that the configuration is wrong: widens it then.
+    pub(crate) fn widen(&mut self, value: f64) -> bool {
+        let beyond = self.is_estimated()
+            && self.sigma == self.careful
+            && self.kind.is_configured()
+            && (value - self.mean).abs() > BEYOND * self.sigma;
+        if beyond {
+            self.sigma *= OTHERWISE;
+        }
+        beyond
+    }
+
+    /// Widens it where the filter found that it is configured wrongly.
+    pub(crate) fn widen_by(&mut self, wrong: &[MisfitCause]) {
+        use ConstantKind as Kind;
+        let is_it = |cause: &MisfitCause| match (*cause, self.kind) {
+            (MisfitCause::AntennaPlace, Kind::AntennaAt(_))
+            | (MisfitCause::Lens, Kind::Lens(_))
+            | (MisfitCause::Readout, Kind::Readout)
+            | (MisfitCause::Late, Kind::CameraDelay) => true,
+            (
+                MisfitCause::MarkerSize(p) | MisfitCause::MarkerPlace(p) | MisfitCause::MarkerTurn(p),
+                Kind::Tag { target, .. },
+            ) => p.target == target,
+            _ => false,
+        };
+        if self.sigma == self.careful && wrong.iter().any(is_it) {
+            self.sigma *= OTHERWISE;
+        }
+    }
 }
+
+/// Sigmas of a careful configuration beyond which it is wrong.
+const BEYOND: f64 = 2.5;
+/// How much less a wrong configuration says than a careful one.
+const OTHERWISE: f64 = 10.0;
 
 /// Trim: a tail rotor makes a helicopter hang by some degrees.
 const TRIM: f64 = 0.06;
@@ -136,7 +189,7 @@ const SHARE: f64 = 0.15;
 /// Iron of a compass that was calibrated once: one cycle and two, rad.
 const IRON: [f64; 2] = [0.026, 0.009];
 /// Delays in addition to the configured ones, s.
-const COMPASS_DELAY: f64 = 0.01;
+const COMPASS_DELAY: f64 = 0.03;
 const CAMERA_DELAY: f64 = 0.005;
 const READOUT: f64 = 0.01;
 /// Mount measured with a protractor, rad; places with a ruler, m.
@@ -145,6 +198,8 @@ const CAMERA_AT: f64 = 0.02;
 const ANTENNA_AT: f64 = 0.1;
 /// Focal length of a calibrated lens after refocusing: share.
 const FOCAL: f64 = 0.005;
+/// Distortion of a calibrated lens: k1, k2, p1, p2.
+const LENS: [f64; 4] = [0.02, 0.02, 0.0005, 0.0005];
 /// A tag as printed and glued on: share of its size, m, m, rad.
 const TAG: [f64; TAG_COLUMNS] = [0.005, 0.01, 0.01, 0.0175];
 
@@ -154,7 +209,7 @@ const TAG: [f64; TAG_COLUMNS] = [0.005, 0.01, 0.01, 0.0175];
 /// with tilt, so any other free constant absorbs the errors of the motion model.
 pub(crate) fn priors(rig: &Rig, predictor: &Predictor, share: Option<f64>, blind: bool) -> Vec<Prior> {
     use ConstantKind as Kind;
-    let prior = |kind, sigma| Prior { kind, mean: 0.0, sigma, held: false };
+    let prior = |kind, sigma| Prior { kind, mean: 0.0, sigma, careful: sigma, held: false };
     let gps_delay = rig.gps.latency_sigma_ms * 1e-3;
     let mut all = vec![
         prior(Kind::Trim(0), TRIM),
@@ -174,6 +229,7 @@ pub(crate) fn priors(rig: &Rig, predictor: &Predictor, share: Option<f64>, blind
     all.extend((0..3).map(|i| prior(Kind::CameraAt(i), CAMERA_AT)));
     all.extend((0..3).map(|i| prior(Kind::AntennaAt(i), ANTENNA_AT)));
     all.push(prior(Kind::Focal, FOCAL));
+    all.extend((0..4).map(|i| prior(Kind::Lens(i), LENS[i])));
     let mut last = None;
     for (target, marker) in predictor.tags() {
         // Place and yaw of a target's first tag define the target's frame.
@@ -219,7 +275,7 @@ pub(crate) fn outside_places(places: &[Place]) -> Vec<Place> {
 }
 
 /// The place of each column.
-pub(crate) fn places(predictor: &Predictor, targets: usize, priors: &[Prior]) -> Vec<Place> {
+pub(crate) fn places(predictor: &Predictor, sways: &[bool], priors: &[Prior]) -> Vec<Place> {
     let mut places = vec![Place::Nowhere; predictor.len()];
     let of_knot = [
         (columns::POSITION, knot::POSITION),
@@ -239,6 +295,7 @@ pub(crate) fn places(predictor: &Predictor, targets: usize, priors: &[Prior]) ->
         (columns::TILT_BIAS, constant::TILT_BIAS),
         (columns::GPS_DELAY, constant::GPS_DELAY),
         (columns::DRAG, constant::DRAG),
+        (columns::LENS, constant::LENS),
     ];
     for (range, first) in of_knot {
         range.enumerate().for_each(|(i, column)| places[column] = Place::Knot(first + i));
@@ -246,10 +303,14 @@ pub(crate) fn places(predictor: &Predictor, targets: usize, priors: &[Prior]) ->
     for (range, first) in of_flight {
         range.enumerate().for_each(|(i, column)| places[column] = Place::Constant(first + i));
     }
-    for target in 0..targets {
+    for (target, sways) in sways.iter().enumerate() {
         let range = predictor.target_columns(target);
         debug_assert_eq!(range.len(), TARGET_COLUMNS);
         range.enumerate().for_each(|(i, column)| places[column] = Place::Knot(knot::target(target) + i));
+        let range = predictor.sway_columns(target);
+        debug_assert_eq!(range.len(), SWAY_COLUMNS);
+        let first = knot::target(target) + knot::SWAY;
+        range.enumerate().filter(|_| *sways).for_each(|(i, column)| places[column] = Place::Knot(first + i));
     }
     predictor.feature_columns().enumerate().for_each(|(i, column)| places[column] = Place::Landmark(i));
     for tag in 0..predictor.tags().len() {

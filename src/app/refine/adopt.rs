@@ -99,11 +99,19 @@ fn camera(found: &Found<'_>, config: &Config) -> String {
 }
 
 fn intrinsics(found: &Found<'_>, config: &Config) -> String {
-    let Some(focal) = found.settled(ConstantKind::Focal) else { return String::new() };
-    let (factor, lens) = (focal.value.exp(), &config.camera.intrinsics);
-    let mut text = String::new();
-    for (name, configured) in [("fx", lens.fx), ("fy", lens.fy)] {
-        let _ = writeln!(text, "{name} = {:.3}    # ± {:.3}", configured * factor, configured * focal.sigma);
+    let (mut text, lens) = (String::new(), &config.camera.intrinsics);
+    if let Some(focal) = found.settled(ConstantKind::Focal) {
+        let factor = focal.value.exp();
+        for (name, configured) in [("fx", lens.fx), ("fy", lens.fy)] {
+            let _ =
+                writeln!(text, "{name} = {:.3}    # ± {:.3}", configured * factor, configured * focal.sigma);
+        }
+    }
+    if (0..4).any(|i| found.settled(ConstantKind::Lens(i)).is_some()) {
+        let mut terms = lens.distortion;
+        (0..4).for_each(|i| terms[i] += found.value(ConstantKind::Lens(i)));
+        let terms: Vec<String> = terms.iter().map(|term| format!("{term:.5}")).collect();
+        let _ = writeln!(text, "distortion = [{}]", terms.join(", "));
     }
     text
 }

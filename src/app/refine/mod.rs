@@ -20,8 +20,10 @@ use crate::io::mcap_read::ReadError;
 use crate::io::mcap_write::WriteError;
 use crate::pipeline::{PipelineSettings, site_of};
 use windhover_base::geo::{Geodetic, LocalFrame};
+use windhover_base::msg::MarkerId;
+use windhover_base::settings::TargetModel;
 use windhover_estimate::Site;
-use windhover_refine::{Recording, Refined, refine};
+use windhover_refine::{Recording, Refined, SurveyedMarker, refine};
 
 /// Why a flight was not refined.
 #[derive(Debug, thiserror::Error)]
@@ -52,6 +54,12 @@ pub enum RefineFlightError {
         /// The reason.
         source: windhover_refine::RefineError,
     },
+    /// A surveyed marker is not one of the configuration at rest.
+    #[error("surveyed marker {id}: no target with model = \"static\" has a tag of this number")]
+    Surveyed {
+        /// Its number.
+        id: u32,
+    },
     /// External positions could not be read.
     #[error(transparent)]
     Outside(#[from] outside::OutsideError),
@@ -80,14 +88,15 @@ pub fn beside(flight: &Path) -> PathBuf {
 }
 
 /// Refines flights over the same markers together: each has its own path, and they share the constants. The
-/// configuration is that of the first flight. `positions` are external positions of the antenna. `watch` gets the
-/// completed share, and returns whether to continue.
+/// configuration is that of the first flight. `positions` are external positions of the antenna, `surveyed` the numbers of
+/// tags at rest with their positions and sigmas (m). `watch` gets the completed share, and returns whether to continue.
 ///
 /// # Errors
 /// Why the flights cannot be refined; nothing is written here.
 pub fn refine_flights(
     paths: &[PathBuf],
     positions: Option<&Path>,
+    surveyed: &[(u32, Geodetic, f64)],
     watch: &mut dyn FnMut(f64) -> bool,
 ) -> Result<Vec<RefinedFlight>, RefineFlightError> {
     let Some(first) = paths.first() else { return Ok(Vec::new()) };
@@ -103,6 +112,11 @@ pub fn refine_flights(
     if let Some(positions) = positions {
         outside::add_positions(positions, &mut recordings)?;
     }
+    for (id, at, sigma_m) in surveyed {
+        let marker = marker_at_rest(&config, *id).ok_or(RefineFlightError::Surveyed { id: *id })?;
+        let surveyed = SurveyedMarker { marker, at: *at, sigma_m: *sigma_m };
+        recordings.iter_mut().for_each(|recording| recording.surveyed.push(surveyed));
+    }
     let refined = refine(&config.rig(), &config.filter(), &site, &recordings, watch)
         .map_err(|source| RefineFlightError::Refine { path: first.clone(), source })?;
     let done = flights.into_iter().enumerate().map(|(index, flight)| {
@@ -111,6 +125,13 @@ pub fn refine_flights(
         RefinedFlight { flight, config: config.clone(), refined, remarks }
     });
     Ok(done.collect())
+}
+
+/// The tag of this number on a target that does not move.
+fn marker_at_rest(config: &Config, id: u32) -> Option<MarkerId> {
+    let targets = config.target.iter().filter(|target| target.model == TargetModel::Static);
+    let tag = targets.flat_map(|target| &target.marker).find(|marker| marker.id == Some(id))?;
+    Some(MarkerId::Tag { family: tag.family.unwrap_or_default(), id })
 }
 
 /// The part of the common result that belongs to one flight, in the frame of its own datum.

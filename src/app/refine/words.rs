@@ -19,6 +19,7 @@ pub struct ConstantWords {
 
 const AXES: [&str; 3] = ["forward", "right", "down"];
 const TURNS: [&str; 3] = ["roll", "pitch", "yaw"];
+const LENS: [&str; 4] = ["k1", "k2", "p1", "p2"];
 const IRON: [&str; 4] = ["iron_sine", "iron_cosine", "iron_sine_2", "iron_cosine_2"];
 
 /// Name and unit of a constant.
@@ -41,6 +42,7 @@ pub fn constant_words(kind: ConstantKind, targets: &[TargetConfig]) -> ConstantW
         Kind::CameraAt(i) => (format!("camera_{}", AXES[i]), metre),
         Kind::AntennaAt(i) => (format!("antenna_{}", AXES[i]), metre),
         Kind::Focal => ("focal_length".into(), percent),
+        Kind::Lens(i) => (format!("lens_{}", LENS[i]), ("", 1.0)),
         Kind::Tag { target, marker, part } => {
             let what = ["size", "forward", "right", "turn"][part];
             (format!("{}_{what}", marker_name(targets, target, marker)), [percent, metre, metre, deg][part])
@@ -76,6 +78,9 @@ pub fn source_name(source: Source, targets: &[TargetConfig]) -> String {
         Source::Vibration => "vibration".into(),
         Source::Drive(target) => format!("{}/drive", of(target)),
         Source::Turn(target) => format!("{}/turn", of(target)),
+        Source::Sway(target) => format!("{}/sway", of(target)),
+        Source::Slip(target) => format!("{}/slip", of(target)),
+        Source::Heave(target) => format!("{}/heave", of(target)),
         Source::Outside => "position_from_outside".into(),
         Source::Known => "known".into(),
     }

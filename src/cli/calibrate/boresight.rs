@@ -2,13 +2,13 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::str::FromStr;
 
 use serde_json::json;
 
 use crate::app::flight::Flight;
 use crate::app::{config_file, declination, recording};
 use crate::cli::out::outln;
+use crate::cli::surveyed::SurveyedArgs;
 use crate::cli::{CliError, CliResult};
 use crate::config::Config;
 use windhover_base::geo::Geodetic;
@@ -33,38 +33,11 @@ pub(super) struct Args {
     /// Configuration; the one attached to the first flight where absent
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// A marker whose position is known: ID:LAT,LON,HEIGHT (degrees, metres above the ellipsoid)
-    #[arg(long, value_name = "ID:LAT,LON,HEIGHT")]
-    surveyed: Vec<Surveyed>,
-    /// One-sigma of surveyed positions, metres
-    #[arg(long, value_name = "METRES", default_value_t = 0.02)]
-    survey_sigma_m: f64,
+    #[command(flatten)]
+    surveyed: SurveyedArgs,
     /// One JSON object on standard output
     #[arg(long)]
     json: bool,
-}
-
-/// A surveyed marker.
-#[derive(Clone, Copy, Debug)]
-struct Surveyed {
-    id: u32,
-    at: Geodetic,
-}
-
-impl FromStr for Surveyed {
-    type Err = String;
-    fn from_str(text: &str) -> Result<Self, String> {
-        let (id, place) = text.split_once(':').ok_or("write it as ID:LAT,LON,HEIGHT")?;
-        let id = id.parse().map_err(|_| format!("{id:?} is not the number of a tag"))?;
-        let figures: Vec<f64> = place
-            .split(',')
-            .map(|f| f.trim().parse().map_err(|_| format!("{f:?} is not a number")))
-            .collect::<Result<_, _>>()?;
-        match figures[..] {
-            [lat_deg, lon_deg, height_m] => Ok(Self { id, at: Geodetic { lat_deg, lon_deg, height_m } }),
-            _ => Err("write it as ID:LAT,LON,HEIGHT".into()),
-        }
-    }
 }
 
 pub(super) fn run(args: &Args) -> CliResult {
@@ -102,9 +75,8 @@ fn surveyed_markers(args: &Args, config: &Config) -> BTreeMap<MarkerId, (Geodeti
         let markers = config.target.iter().flat_map(|t| &t.marker);
         markers.filter(|m| m.id == Some(id)).find_map(|m| m.family).unwrap_or_default()
     };
-    let entry =
-        |s: &Surveyed| (MarkerId::Tag { family: family_of(s.id), id: s.id }, (s.at, args.survey_sigma_m));
-    args.surveyed.iter().map(entry).collect()
+    let entry = |(id, at, sigma_m)| (MarkerId::Tag { family: family_of(id), id }, (at, sigma_m));
+    args.surveyed.tags().into_iter().map(entry).collect()
 }
 
 fn as_json(found: &Boresight) -> serde_json::Value {

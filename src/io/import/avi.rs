@@ -96,8 +96,9 @@ impl Reader {
             } else if &code == b"idx1" || size > FRAME_MAX {
                 return Ok(None);
             } else if is_video && size > 0 {
-                let mut data = vec![0; size as usize];
-                if self.input.read_exact(&mut data).is_err() {
+                // Grows with the bytes that are there, not to the length that is stated.
+                let mut data = Vec::new();
+                if self.input.by_ref().take(u64::from(size)).read_to_end(&mut data)? < size as usize {
                     return Ok(None);
                 }
                 if size & 1 == 1 {
@@ -106,7 +107,7 @@ impl Reader {
                 return Ok(Some(self.frame(data)));
             } else {
                 // An empty chunk repeats the frame before: a dropped frame, for which time passes.
-                self.index += u32::from(is_video);
+                self.index = self.index.saturating_add(u32::from(is_video));
                 skip(&mut self.input, size)?;
             }
         }
@@ -115,15 +116,38 @@ impl Reader {
 
     fn frame(&mut self, data: Vec<u8>) -> FramePayload {
         let index = self.index;
-        self.index += 1;
+        self.index = self.index.saturating_add(1);
         FramePayload {
             index,
-            t_exposure: self.start + Span::from_ns(self.period.ns() * i64::from(index)),
+            t_exposure: self.start + Span::from_ns(self.period.ns().saturating_mul(i64::from(index))),
             encoding: FrameEncoding::Jpeg,
             width: 0,
             height: 0,
             stride: 0,
             data: Arc::from(data),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write as _;
+
+    use super::*;
+
+    #[test]
+    fn a_length_and_a_period_that_cannot_be_end_the_video() {
+        let mut file = tempfile::NamedTempFile::new().expect("a scratch file");
+        let longest = FRAME_MAX.to_le_bytes();
+        let frame = [b"00dc", &4u32.to_le_bytes()[..], &[0xff, 0xd8, 0xff, 0xd9]].concat();
+        let cut = [b"00dc", &longest[..], &[0xff, 0xd8]].concat();
+        file.write_all(&[frame, cut].concat()).expect("written");
+        let input = BufReader::new(File::open(file.path()).expect("opened"));
+        let period = Span::from_ns(i64::from(u32::MAX) * 1_000);
+        let path = file.path().to_owned();
+        let mut reader = Reader { input, path, period, start: MonoTime::default(), index: u32::MAX };
+        let far = reader.next_frame().expect("a frame").expect("sound");
+        assert_eq!((far.t_exposure, far.index), (MonoTime::from_ns(i64::MAX), u32::MAX));
+        assert!(reader.next_frame().is_none());
     }
 }

@@ -104,6 +104,16 @@ impl<R: BufRead> Reader<R> {
         frame.transpose()
     }
 
+    /// The luma of a frame; `None` where the file ends in it. Memory grows with the bytes that are there, not to the size that
+    /// the header states.
+    fn luma(&mut self) -> std::io::Result<Option<Vec<u8>>> {
+        let (size, chroma) = ((self.header.width * self.header.height) as u64, self.header.chroma as u64);
+        let mut luma = Vec::new();
+        let read = self.input.by_ref().take(size).read_to_end(&mut luma)? as u64;
+        let skipped = std::io::copy(&mut self.input.by_ref().take(chroma), &mut std::io::sink())?;
+        Ok((read == size && skipped == chroma).then_some(luma))
+    }
+
     /// A frame cut off at the end of the file ends the video.
     fn read_frame(&mut self) -> Result<Option<FramePayload>, ImportError> {
         let line = read_line(&mut self.input).map_err(|e| ImportError::io(&self.path, e))?;
@@ -114,15 +124,11 @@ impl<R: BufRead> Reader<R> {
             let reason = format!("is damaged after frame {}: no FRAME marker follows", self.index);
             return Err(ImportError::video(&self.path, reason));
         }
-        let Header { width, height, rate_hz, chroma } = self.header;
-        let mut luma = vec![0; width * height];
-        let mut rest = vec![0; chroma];
-        if self.input.read_exact(&mut luma).and_then(|()| self.input.read_exact(&mut rest)).is_err() {
-            return Ok(None);
-        }
+        let Header { width, height, rate_hz, .. } = self.header;
+        let Some(luma) = self.luma().map_err(|e| ImportError::io(&self.path, e))? else { return Ok(None) };
         let t = self.start + Span::from_s(f64::from(self.index) / rate_hz);
         let frame = grey(self.index, t, width as u32, height as u32, luma);
-        self.index += 1;
+        self.index = self.index.saturating_add(1);
         Ok(Some(frame))
     }
 }

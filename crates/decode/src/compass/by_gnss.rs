@@ -12,29 +12,35 @@
 //! Two antennas give the heading and one tilt of the line between them: a tilt is used only where the device provides
 //! both angles. Sources: the vendors' manuals.
 
-use super::fields::{heading, tilt};
+use super::fields::{heading, optional, tilt};
 use super::pashr;
 use super::reading::CompassReading;
-use crate::counts::Refusal;
+use crate::counts::{DecodeCounts, Refusal};
 use crate::sentence::Sentence;
 
 /// The reading of such a sentence; `None` for other sentences.
-pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
+pub(super) fn read(
+    sentence: &Sentence<'_>,
+    counts: &mut DecodeCounts,
+) -> Result<Option<CompassReading>, Refusal> {
     let told = (sentence.address(), sentence.field(1));
     let (heading_at, pitch_at, roll_at, quality_at) = match told {
         ("PTNL", "AVR") => (3, 5, 7, Some(10)),
         ("PSAT", "HPR") => (3, 4, 5, None),
         ("PSSN", "HRP") => (4, 6, 5, Some(11)),
         ("PRDID", _) => (3, 1, 2, None),
-        ("PASHR", _) => return pashr::read(sentence),
+        ("PASHR", _) => return pashr::read(sentence, counts),
         _ if sentence.formatter() == Some("HPR") => (2, 0, 0, Some(5)),
         _ => return Ok(None),
     };
     if sentence.fields() < heading_at.max(pitch_at) {
         return Err(Refusal::Malformed);
     }
-    let angle = |at: usize| if at == 0 { Ok(None) } else { tilt(sentence.field(at)) };
-    let (pitch_deg, roll_deg) = (angle(pitch_at)?, angle(roll_at)?);
+    let mut angle = |name, at: usize| {
+        if at == 0 { None } else { optional(counts, name, tilt(sentence.field(at))) }
+    };
+    let (pitch_deg, roll_deg) =
+        (angle("pitch between antennas", pitch_at), angle("roll between antennas", roll_at));
     let mut reading = CompassReading {
         heading_deg: heading_of(sentence.field(heading_at))?,
         heading_is_true: true,

@@ -1,7 +1,7 @@
 //! Field types of several formats: ranges of angles, status letters.
 
 use super::reading::CompassReading;
-use crate::counts::Refusal;
+use crate::counts::{DecodeCounts, Refusal};
 use crate::sentence::number;
 
 /// A heading, degrees.
@@ -12,6 +12,18 @@ pub(super) fn heading(text: &str) -> Result<Option<f64>, Refusal> {
 /// Pitch or roll, degrees: which of them has the full range depends on the device's convention.
 pub(super) fn tilt(text: &str) -> Result<Option<f64>, Refusal> {
     number(text, -180.0, 180.0)
+}
+
+/// A field that does not decide about its sentence: where it is impossible, it is left out and counted by its name.
+pub(super) fn optional<T>(
+    counts: &mut DecodeCounts,
+    name: &'static str,
+    read: Result<Option<T>, Refusal>,
+) -> Option<T> {
+    read.unwrap_or_else(|_| {
+        counts.leave_out(name);
+        None
+    })
 }
 
 /// Status letters of Honeywell and True North: N normal, M and O warnings; L, P and all others (C calibration, V

@@ -12,7 +12,7 @@ fn said(format: CompassFormat, body: &str) -> Result<Option<CompassReading>, Ref
     match reader(format) {
         Reader::Sentences(read)
         | Reader::SentencesOrBare(read, _)
-        | Reader::Receiver { sentence: read, .. } => read(&sentence),
+        | Reader::Receiver { sentence: read, .. } => read(&sentence, &mut DecodeCounts::default()),
         Reader::Packets | Reader::Records(_) => panic!("these are not sentences"),
     }
 }
@@ -95,6 +95,33 @@ fn nmea_headings_and_transducers() {
     let tilt = reading(CompassFormat::Nmea, "HCXDR,A,-1.5,D,PITCH,A,2.5,D,ROLL,G,367,,MAGX");
     assert_eq!(tilt, (None, Some(-1.5), Some(2.5), false, true));
     assert_eq!(said(CompassFormat::Nmea, "GPRMC,1,2"), Ok(None));
+}
+
+#[test]
+fn a_field_that_does_not_decide_is_left_out_alone() {
+    use CompassFormat::{Nmea, Os5000, Tcm2, Vectornav};
+    for (format, body, field) in [
+        (Nmea, "HCHDG,98.3,0.5,,12.6,W", "HDG deviation"),
+        (Nmea, "HCHDG,98.3,999.9,E,,", "HDG deviation"),
+        (Nmea, "HCHDG,98.3,x,E,,", "HDG deviation"),
+        (Nmea, "PRDID,999,1.5,98.3", "pitch between antennas"),
+        (Nmea, "PTNL,AVR,181059.6,98.3,Yaw,1.0,Tilt,x,Roll,60.191,3,2.5,6", "roll between antennas"),
+        (Nmea, "PASHR,204132.000,98.3,T,-999.9,-00.79,-00.84,0.151,0.075,0.555,1,0", "PASHR roll"),
+        (Tcm2, "C98.3P28.4R-12.4T9999999999", "a value beside heading, pitch and roll"),
+        (Os5000, "C98.3P0.2R-18.3T--5", "a value beside heading, pitch and roll"),
+        (Vectornav, "VNYMR,98.3,1.0,2.0,0,0,0,0,0,-9.8,nan,0,0", "rates"),
+        (Vectornav, "VNYMR,98.3,1.0,2.0,0,0,0,5000,0,-9.8,0,0,0", "forces"),
+    ] {
+        let (out, counts) = readings(format, format!("{}\r\n", framed(body)).as_bytes());
+        let [read] = &out[..] else { panic!("{body}: {counts}") };
+        assert_eq!(read.reading.heading_deg, Some(98.3), "{body}");
+        assert_eq!(counts.left_out().collect::<Vec<_>>(), [(field, 1)], "{body}");
+    }
+    let (out, counts) = readings(Nmea, format!("{}\r\n", framed("HCHDG,98.3,0.0,,,")).as_bytes());
+    assert_eq!((out[0].reading.heading_deg, counts.left_out().count()), (Some(98.3), 0), "nothing is lost");
+    let (out, counts) =
+        readings(Nmea, format!("{}\r\n", framed("YXXDR,A,999,D,PTCH,A,2.5,D,ROLL")).as_bytes());
+    assert_eq!((out[0].reading.roll_deg, counts.left_out().next()), (Some(2.5), Some(("XDR pitch", 1))));
 }
 
 fn readings(format: CompassFormat, bytes: &[u8]) -> (Vec<ReceivedAttitude>, DecodeCounts) {

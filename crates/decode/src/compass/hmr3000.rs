@@ -3,14 +3,17 @@
 use super::fields::{heading, honour_alarms, tilt};
 use super::nmea;
 use super::reading::CompassReading;
-use crate::counts::Refusal;
+use crate::counts::{DecodeCounts, Refusal};
 use crate::sentence::Sentence;
 
 /// The reading of a sentence; `None` where it has no attitude.
-pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
+pub(super) fn read(
+    sentence: &Sentence<'_>,
+    counts: &mut DecodeCounts,
+) -> Result<Option<CompassReading>, Refusal> {
     match sentence.address() {
         "PTNTHPR" => hmr3000(sentence).map(Some),
-        _ => nmea::read(sentence),
+        _ => nmea::read(sentence, counts),
     }
 }
 

@@ -37,8 +37,8 @@ use crate::ubx::{Piece, Splitter, relative_heading};
 use assembler::ReadingAssembler;
 use records::{RecordForm, RecordFramer};
 
-/// Reads a sentence with a valid checksum.
-type ReadSentence = fn(&Sentence<'_>) -> Result<Option<CompassReading>, Refusal>;
+/// Reads a sentence with a valid checksum; counts the fields that it leaves out.
+type ReadSentence = fn(&Sentence<'_>, &mut DecodeCounts) -> Result<Option<CompassReading>, Refusal>;
 /// Reads a line without `$`.
 type ReadLine = fn(&[u8]) -> Result<Option<CompassReading>, Refusal>;
 
@@ -196,7 +196,7 @@ impl TextInput {
                 Ok(sentence) => sentence,
                 Err(why) => return counts.refuse(why),
             };
-            match read(&sentence) {
+            match read(&sentence, counts) {
                 Ok(Some(reading)) if is_part(&sentence) => {
                     assembler.part(reading, &sentence, line.span, counts, out);
                 }

@@ -4,15 +4,18 @@ use super::fields::{heading, tilt};
 use super::nmea;
 use super::reading::CompassReading;
 use super::tagged::{is_tagged, tagged};
-use crate::counts::Refusal;
+use crate::counts::{DecodeCounts, Refusal};
 use crate::sentence::{Sentence, number};
 
 /// The reading of a sentence; `None` where it has no attitude.
-pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
+pub(super) fn read(
+    sentence: &Sentence<'_>,
+    counts: &mut DecodeCounts,
+) -> Result<Option<CompassReading>, Refusal> {
     match sentence.address() {
         "OHPR" => heading_pitch_roll(sentence).map(Some),
-        address if is_tagged(address) => tagged(sentence.body),
-        _ => nmea::read(sentence),
+        address if is_tagged(address) => tagged(sentence.body, counts),
+        _ => nmea::read(sentence, counts),
     }
 }
 

@@ -3,16 +3,19 @@
 use super::fields::honour_alarms;
 use super::nmea;
 use super::reading::CompassReading;
-use crate::counts::Refusal;
+use crate::counts::{DecodeCounts, Refusal};
 use crate::sentence::Sentence;
 
 /// The reading of a sentence; `None` where it has no attitude.
-pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
+pub(super) fn read(
+    sentence: &Sentence<'_>,
+    counts: &mut DecodeCounts,
+) -> Result<Option<CompassReading>, Refusal> {
     match sentence.address() {
         "PTNTHTM" => revolution(sentence).map(Some),
         // The XDR has raw counts, and otherwise only values of PTNTHM's sentence.
         address if address.ends_with("XDR") => Ok(None),
-        _ => nmea::read(sentence),
+        _ => nmea::read(sentence, counts),
     }
 }
 

@@ -1,8 +1,8 @@
 //! Words of tagged numbers, `C328.3P28.4R-12.4`, as PNI TCM2 and OceanServer OS5000 send them.
 
-use super::fields::{heading, tilt};
+use super::fields::{heading, optional, tilt};
 use super::reading::CompassReading;
-use crate::counts::Refusal;
+use crate::counts::{DecodeCounts, Refusal};
 use crate::sentence::number;
 
 /// `C328.3P28.4…`: a `C` that is directly followed by a number or another tag.
@@ -25,7 +25,7 @@ const TCM2_DISTORTION: u16 = 0x001;
 
 /// PNI TCM2 and OceanServer: letters, then a number, for each item; any item may be absent. Items other than heading C,
 /// pitch P, roll R and error word E are checked and ignored.
-pub(super) fn tagged(body: &str) -> Result<Option<CompassReading>, Refusal> {
+pub(super) fn tagged(body: &str, counts: &mut DecodeCounts) -> Result<Option<CompassReading>, Refusal> {
     let mut reading = CompassReading::default();
     let mut errors = 0u16;
     let mut rest = body;
@@ -48,7 +48,7 @@ pub(super) fn tagged(body: &str) -> Result<Option<CompassReading>, Refusal> {
             "R" => reading.roll_deg = tilt(value)?,
             "E" => errors = u16::from_str_radix(value, 16).map_err(|_| Refusal::Malformed)?,
             _ => {
-                number(value, -1e6, 1e6)?;
+                optional(counts, "a value beside heading, pitch and roll", number(value, -1e6, 1e6));
             }
         }
         rest = &rest[tag.len() + value.len()..];

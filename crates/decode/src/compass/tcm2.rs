@@ -3,10 +3,13 @@
 use super::nmea;
 use super::reading::CompassReading;
 use super::tagged::{is_tagged, tagged};
-use crate::counts::Refusal;
+use crate::counts::{DecodeCounts, Refusal};
 use crate::sentence::Sentence;
 
 /// The reading of a sentence; `None` where it has no attitude.
-pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
-    if is_tagged(sentence.address()) { tagged(sentence.body) } else { nmea::read(sentence) }
+pub(super) fn read(
+    sentence: &Sentence<'_>,
+    counts: &mut DecodeCounts,
+) -> Result<Option<CompassReading>, Refusal> {
+    if is_tagged(sentence.address()) { tagged(sentence.body, counts) } else { nmea::read(sentence, counts) }
 }

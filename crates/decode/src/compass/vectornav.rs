@@ -4,10 +4,10 @@
 
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
-use super::fields::tilt;
+use super::fields::{optional, tilt};
 use super::nmea;
 use super::reading::CompassReading;
-use crate::counts::Refusal;
+use crate::counts::{DecodeCounts, Refusal};
 use crate::sentence::Sentence;
 use windhover_base::msg::InertialSample;
 
@@ -20,20 +20,27 @@ const UNIT_OFF: f64 = 0.01;
 const INS_MODES: std::ops::RangeInclusive<u16> = 1..=2;
 
 /// The reading of a sentence; `None` where it has no attitude.
-pub(super) fn read(sentence: &Sentence<'_>) -> Result<Option<CompassReading>, Refusal> {
+pub(super) fn read(
+    sentence: &Sentence<'_>,
+    counts: &mut DecodeCounts,
+) -> Result<Option<CompassReading>, Refusal> {
     match sentence.address() {
         "VNYPR" | "VNYBA" | "VNYIA" => angles(sentence, 1).map(Some),
-        "VNYMR" => Ok(Some(CompassReading { inertial: inertial_at(sentence, 7)?, ..angles(sentence, 1)? })),
+        "VNYMR" => {
+            Ok(Some(CompassReading { inertial: inertial_at(sentence, 7, counts), ..angles(sentence, 1)? }))
+        }
         "VNQTN" => quaternion(sentence).map(Some),
-        "VNQMR" => Ok(Some(CompassReading { inertial: inertial_at(sentence, 8)?, ..quaternion(sentence)? })),
+        "VNQMR" => {
+            Ok(Some(CompassReading { inertial: inertial_at(sentence, 8, counts), ..quaternion(sentence)? }))
+        }
         "VNINS" => inertial(sentence).map(Some),
         address if address.starts_with("VN") => Ok(None),
-        _ => nmea::read(sentence),
+        _ => nmea::read(sentence, counts),
     }
 }
 
 /// Specific force, m/s², and rates, rad/s, in the device's axes forward, right, down. `None` where they are absent.
-fn inertial_at(sentence: &Sentence<'_>, first: usize) -> Result<Option<InertialSample>, Refusal> {
+fn inertial_at(sentence: &Sentence<'_>, first: usize, counts: &mut DecodeCounts) -> Option<InertialSample> {
     let three = |at: usize, most: f64| {
         let axis = |index| sentence.number(at + index, -most, most);
         Ok::<_, Refusal>(match (axis(0)?, axis(1)?, axis(2)?) {
@@ -41,8 +48,9 @@ fn inertial_at(sentence: &Sentence<'_>, first: usize) -> Result<Option<InertialS
             _ => None,
         })
     };
-    let (force_mps2, rate_rps) = (three(first, FORCE_MAX)?, three(first + 3, RATE_MAX)?);
-    Ok((force_mps2.is_some() || rate_rps.is_some()).then_some(InertialSample { rate_rps, force_mps2 }))
+    let force_mps2 = optional(counts, "forces", three(first, FORCE_MAX));
+    let rate_rps = optional(counts, "rates", three(first + 3, RATE_MAX));
+    (force_mps2.is_some() || rate_rps.is_some()).then_some(InertialSample { rate_rps, force_mps2 })
 }
 
 fn angles(sentence: &Sentence<'_>, first: usize) -> Result<CompassReading, Refusal> {

@@ -42,7 +42,16 @@ impl Aid for FeaturePixel {
         let noise = noise + slack * slack.transpose();
         z.begin(2);
         let moment = Moment::of(&state.own, models, &view, &Vector3::zeros(), &self.px);
-        CameraColumns::touch(z).set_point(z, 0, &self.px, &state.own, &view, &moment, &noise, &bent);
+        CameraColumns::touch(z, state).set_point(
+            z,
+            0,
+            &self.px,
+            (state, models),
+            &view,
+            &moment,
+            &noise,
+            &bent,
+        );
         let north = view.d_point * Vector3::new(1.0, 0.0, slope_n);
         let east = view.d_point * Vector3::new(0.0, 1.0, slope_e);
         z.block(state.layout().feature(self.slot), &Matrix2::from_columns(&[north, east]));

@@ -1,4 +1,5 @@
-//! GPS velocity: `z = v + R (ω × l) − a τ`, with the antenna at l, the acceleration a (`force.rs`) and the delay τ.
+//! GPS velocity: `z = v + R (ω × l) − a τ`, with the antenna at l, the acceleration a (`force.rs`) and the delay τ, the sum
+//! of that of positions and of what velocity is older still.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -34,7 +35,7 @@ impl Aid for GpsVelocity {
 
     fn linearise(&self, state: &State, models: &Models, z: &mut Measurement) -> Result<(), Disposition> {
         let own = &state.own;
-        let tau = own.gps_delay_s;
+        let tau = own.velocity_age_s();
         let force = Force::of(own);
         let acceleration = force.acceleration();
         let antenna = own.antenna(&models.antenna_at);
@@ -51,6 +52,7 @@ impl Aid for GpsVelocity {
         z.block(own::WIND, &(D_WIND * -tau));
         z.block(own::TRIM, &(force.d_trim * -tau));
         z.block(own::GPS_DELAY, &-acceleration);
+        z.block(own::VELOCITY_DELAY, &-acceleration);
         z.block(own::DRAG, &(force.d_drag * -tau));
         for i in 0..z.m {
             z.residual[i] = self.ned_mps[i] - expected[i];

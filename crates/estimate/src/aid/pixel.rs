@@ -4,12 +4,13 @@ use nalgebra::{Matrix2, Matrix2x3, Matrix2x4, Matrix3, Vector2, Vector3};
 
 use windhover_base::geo::skew;
 
-use crate::blocks::{TARGET, own};
+use crate::blocks::{SHAKE, TARGET, own};
 use crate::lens::d_lens;
 use crate::matrix::Grid;
 use crate::measurement::{Columns, Measurement};
 use crate::models::Models;
 use crate::own::Own;
+use crate::state::State;
 
 /// A point of the world in the image, with its derivatives.
 pub(crate) struct PointView {
@@ -79,7 +80,7 @@ impl Moment {
     ) -> Self {
         let share = px.y / (models.image_px.1 - 1.0) - 0.5;
         let flow = view.d_point * (velocity - own.velocity) + view.d_attitude * (own.rotation() * own.rate);
-        Self { after_s: share * (models.readout_s + own.readout_s), share, flow }
+        Self { after_s: share * own.whole_readout_s(models.readout_s), share, flow }
     }
 }
 
@@ -92,11 +93,12 @@ pub(crate) struct CameraColumns {
     rate: Columns<3>,
     lens: Columns<4>,
     readout: Columns<1>,
+    shake: Option<Columns<SHAKE>>,
 }
 
 impl CameraColumns {
     /// Adds them to a measurement.
-    pub(crate) fn touch(z: &mut Measurement) -> Self {
+    pub(crate) fn touch(z: &mut Measurement, state: &State) -> Self {
         Self {
             position: z.touch(own::POSITION),
             velocity: z.touch(own::VELOCITY),
@@ -104,6 +106,7 @@ impl CameraColumns {
             rate: z.touch(own::RATE),
             lens: z.touch(own::LENS),
             readout: z.touch(own::READOUT),
+            shake: state.shake.is_open().then(|| z.touch(state.layout().shake())),
         }
     }
 
@@ -114,13 +117,21 @@ impl CameraColumns {
         z: &mut Measurement,
         i: usize,
         px: &Vector2<f64>,
-        own: &Own,
+        (state, models): (&State, &Models),
         view: &PointView,
         moment: &Moment,
         noise: &Matrix2<f64>,
         curvature: &Matrix2<f64>,
     ) {
-        let residual = px - view.px - moment.flow * moment.after_s;
+        let own = &state.own;
+        let mut residual = px - view.px - moment.flow * moment.after_s;
+        let mut noise = *noise;
+        if let Some(columns) = self.shake {
+            let displaced = state.shake.displaced(models, px, moment.share);
+            residual -= displaced.by_px;
+            noise += displaced.noise_px2;
+            z.set(2 * i, columns, &displaced.derivative);
+        }
         let after_s = moment.after_s;
         z.set(2 * i, self.position, &-view.d_point);
         z.set(2 * i, self.velocity, &(view.d_point * -after_s));

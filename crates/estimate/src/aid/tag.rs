@@ -70,7 +70,7 @@ pub(super) fn linearise_points<'a>(
     let curvature = Curvature::of(&state.cov, &state.own, models);
     let factor = state.learnt.marker_factor[target];
     z.begin(2 * seen.len());
-    let camera = CameraColumns::touch(z);
+    let camera = CameraColumns::touch(z, state);
     let vehicle = z.touch(state.layout().target(target).all());
     let fit = fit.map(|block| z.touch(block.all()));
     let body = &state.targets[target].sway;
@@ -87,7 +87,7 @@ pub(super) fn linearise_points<'a>(
         let [north, east, turn] = derivatives;
         let ahead = north * c + east * s;
         let moment = Moment::of(&state.own, models, &view, &(ahead * speed + turn * yaw_rate), px);
-        camera.set_point(z, i, px, &state.own, &view, &moment, &(known * factor), &bent);
+        camera.set_point(z, i, px, (state, models), &view, &moment, &(known * factor), &bent);
         let later = moment.after_s;
         let sideways = (east * c - north * s) * (speed * later);
         let by = [north, east, turn + sideways, ahead * later, turn * later];

@@ -11,9 +11,10 @@ use windhover_base::settings::{AttitudeConfig, EstimatorConfig, ImuConfig, Rig};
 use windhover_base::time::MonoTime;
 
 use crate::Site;
-use crate::blocks::{Block, own};
+use crate::blocks::{Block, SHAKE, own};
 use crate::core::Core;
 use crate::own::GRAVITY;
+use crate::shake::Shake;
 use crate::state::State;
 use crate::sway::Sway;
 use crate::track::{Evidence, Life};
@@ -144,6 +145,7 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
     own.tilt_gain = 0.6 + within(0.5);
     own.tilt_bias = Vector2::new(within(0.02), within(0.02));
     own.gps_delay_s = within(most::DELAY_S);
+    own.velocity_delay_s = within(most::DELAY_S);
     own.drag_per_s = 0.2 + within(0.2);
     own.compass_delay_s = within(most::COMPASS_DELAY_S);
     own.lens = Vector4::new(within(0.1), within(0.1), within(0.005), within(0.005));
@@ -167,6 +169,10 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
         target.sway = Sway::presumed();
         target.sway.mean = [within(0.05), within(0.05), within(0.05)];
     }
+    state.shake = Shake::presumed(&core.models);
+    state.begin_shake(0.02);
+    state.renew(state.layout().shake(), &[0.0; SHAKE]);
+    state.shake.mean = std::array::from_fn(|_| within(0.003));
     core
 }
 
@@ -221,5 +227,6 @@ pub(crate) fn difference(to: &State, from: &State) -> Vec<f64> {
     for i in 0..layout.targets {
         put(layout.sway(i).range(), &less(&to.targets[i].sway.mean, &from.targets[i].sway.mean));
     }
+    put(layout.shake().range(), &less(&to.shake.mean, &from.shake.mean));
     dx
 }

@@ -11,7 +11,7 @@ use windhover_base::settings::{EstimatorConfig, ImuConfig, TiltKind};
 use windhover_estimate::Estimator;
 use windhover_simulate::{HelicopterPath, Scenario, World};
 
-use super::filter::{Flight, Heard, fly};
+use super::filter::{Flight, Input, fly};
 use super::misfit::{Mover, with_movers};
 
 /// A minute around a circle in wind with gusts, 2.4 m/s² of acceleration; the compass reads a share of the tilt.
@@ -27,18 +27,18 @@ fn circling(seed: u64, kind: TiltKind, share: f64) -> Flight {
 /// Estimates of the filter without sightings in its frames.
 fn blind(flight: &Flight) -> Vec<EstimatorOutput> {
     let (mut filter, mut out) = (flight.filter(), Vec::new());
-    for heard in &flight.heard {
-        without_sight(heard).give(&mut filter, &mut out);
+    for input in &flight.inputs {
+        without_sight(input).give(&mut filter, &mut out);
     }
     out
 }
 
-fn without_sight(heard: &Heard) -> Heard {
-    let mut heard = heard.clone();
-    if let Heard::Frame(frame) = &mut heard {
+fn without_sight(input: &Input) -> Input {
+    let mut input = input.clone();
+    if let Input::Frame(frame) = &mut input {
         frame.value = FrameObservations { frame: frame.value.frame, ..FrameObservations::default() };
     }
-    heard
+    input
 }
 
 /// Slope of estimated tilt over the true one, and mean square of tilt error over the stated variance, for each axis,
@@ -112,8 +112,8 @@ fn rates_and_forces_that_vibrate_do_not_hurt() {
     rig.imu = Some(ImuConfig::default());
     let mut filter = Estimator::new(&rig, &EstimatorConfig::default(), &flight.site);
     let (mut out, mut imu_s) = (Vec::new(), 0.0);
-    for heard in &flight.heard {
-        while imu_s < flight.world.seconds(heard.t_recv()) {
+    for input in &flight.inputs {
+        while imu_s < flight.world.seconds(input.t_recv()) {
             let t = flight.world.time(imu_s);
             let truth = flight.world.ownship(t);
             let shaken = 2.0 * (150.0 * imu_s).sin() + (6.0 * imu_s).sin();
@@ -125,7 +125,7 @@ fn rates_and_forces_that_vibrate_do_not_hurt() {
             filter.inertial(&Stamped { t_valid: t, t_recv: t, seq: 0, value }, &mut out);
             imu_s += 0.01;
         }
-        without_sight(heard).give(&mut filter, &mut out);
+        without_sight(input).give(&mut filter, &mut out);
     }
     // Then they are fused, and tilt is as good and as honest as without.
     let fused = out.iter().filter(
@@ -154,8 +154,8 @@ fn features_on_a_parked_vehicle_do_not_bend_own_motion() {
         };
         let mut flight = with_movers(hovering, roof, true);
         let without = blind(&flight);
-        for heard in &mut flight.heard {
-            if let Heard::Frame(frame) = heard {
+        for input in &mut flight.inputs {
+            if let Input::Frame(frame) = input {
                 frame.value.markers.clear();
             }
         }

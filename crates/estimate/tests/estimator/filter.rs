@@ -16,13 +16,13 @@ use windhover_simulate::{Sample, Scenario, SensorSuite, World};
 /// One measurement as the pipeline hands it over.
 #[derive(Clone)]
 #[expect(clippy::large_enum_variant, reason = "a value at a time, handed on")]
-pub(super) enum Heard {
+pub(super) enum Input {
     Gnss(Stamped<GnssEpoch>),
     Attitude(Stamped<AttitudeSample>),
     Frame(Stamped<FrameObservations>),
 }
 
-impl Heard {
+impl Input {
     pub(super) fn t_recv(&self) -> MonoTime {
         match self {
             Self::Gnss(s) => s.t_recv,
@@ -59,7 +59,7 @@ impl Heard {
 pub(super) struct Flight {
     pub(super) world: Arc<World>,
     pub(super) site: Site,
-    pub(super) heard: Vec<Heard>,
+    pub(super) inputs: Vec<Input>,
 }
 
 pub(super) fn fly(name: &str, seconds: f64, seed: u64, change: impl FnOnce(&mut Scenario)) -> Flight {
@@ -70,12 +70,12 @@ pub(super) fn fly(name: &str, seconds: f64, seed: u64, change: impl FnOnce(&mut 
     let world = Arc::new(World::new(scenario, seed));
     let site = Site { frame: *world.frame(), ground: Ground::Flat { down_m: 0.0 }, declination_rad };
     let mut suite = SensorSuite::new(Arc::clone(&world));
-    let mut heard = Vec::new();
+    let mut inputs = Vec::new();
     while let Some(sample) = suite.next() {
-        heard.push(match sample {
-            Sample::Gnss { stamped, .. } => Heard::Gnss(stamped),
-            Sample::Attitude { stamped, .. } => Heard::Attitude(stamped),
-            Sample::Frame { truth, seq } => Heard::Frame(Stamped {
+        inputs.push(match sample {
+            Sample::Gnss { stamped, .. } => Input::Gnss(stamped),
+            Sample::Attitude { stamped, .. } => Input::Attitude(stamped),
+            Sample::Frame { truth, seq } => Input::Frame(Stamped {
                 t_valid: truth.t_stamp,
                 t_recv: truth.t_recv,
                 seq,
@@ -83,7 +83,7 @@ pub(super) fn fly(name: &str, seconds: f64, seed: u64, change: impl FnOnce(&mut 
             }),
         });
     }
-    Flight { world, site, heard }
+    Flight { world, site, inputs }
 }
 
 impl Flight {
@@ -107,8 +107,8 @@ impl Flight {
 
     fn through(&self, mut filter: Estimator) -> Vec<EstimatorOutput> {
         let mut out = Vec::new();
-        for heard in &self.heard {
-            heard.give(&mut filter, &mut out);
+        for input in &self.inputs {
+            input.give(&mut filter, &mut out);
         }
         filter.finish(&mut out);
         out
@@ -171,24 +171,24 @@ fn following_is_accurate_honest_and_smoothing_helps() {
 fn the_order_of_arrival_does_not_matter() {
     let flight = fly("follow", 8.0, 5, |_| {});
     let end = flight.world.time(9.5);
-    let last = Heard::Frame(Stamped {
+    let last = Input::Frame(Stamped {
         t_valid: end,
         t_recv: end,
         seq: u64::MAX,
         value: FrameObservations { frame: 9_999, ..FrameObservations::default() },
     });
-    let after = |heard: &[Heard]| -> Ownship {
+    let after = |inputs: &[Input]| -> Ownship {
         let (mut filter, mut out) = (flight.filter(), Vec::new());
-        heard.iter().chain([&last]).for_each(|h| h.give(&mut filter, &mut out));
+        inputs.iter().chain([&last]).for_each(|h| h.give(&mut filter, &mut out));
         let told =
             out.iter().rev().find_map(|o| if let EstimatorOutput::Ownship(s) = o { Some(*s) } else { None });
         told.expect("a frame tells the helicopter's state")
     };
     // From the same start: everything in order of validity and received at once, compared with the order of arrival.
-    let mut in_order = flight.heard.clone();
-    in_order[60..].sort_by_key(Heard::t_valid);
+    let mut in_order = flight.inputs.clone();
+    in_order[60..].sort_by_key(Input::t_valid);
     in_order[60..].iter_mut().for_each(|h| h.set_t_recv(h.t_valid() + Span::from_ms(350.0)));
-    let (a, b) = (after(&flight.heard), after(&in_order));
+    let (a, b) = (after(&flight.inputs), after(&in_order));
     assert!((a.position_ned_m - b.position_ned_m).norm() < 1e-6, "{a:?} {b:?}");
     assert!(a.ned_from_body.angle_to(&b.ned_from_body) < 1e-7);
 }
@@ -197,7 +197,7 @@ fn the_order_of_arrival_does_not_matter() {
 fn too_old_and_too_new_are_refused_and_told() {
     let flight = fly("follow", 5.0, 6, |_| {});
     let (mut filter, mut out) = (flight.filter(), Vec::new());
-    flight.heard.iter().for_each(|h| h.give(&mut filter, &mut out));
+    flight.inputs.iter().for_each(|h| h.give(&mut filter, &mut out));
     let now = flight.world.time(5.0);
     let dispositions = |out: &[EstimatorOutput]| -> Vec<Disposition> {
         out.iter()
@@ -216,7 +216,7 @@ fn too_old_and_too_new_are_refused_and_told() {
 #[test]
 fn a_vehicle_seen_before_there_is_a_fix_waits() {
     let flight = fly("follow", 3.0, 7, |_| {});
-    let frames: Vec<_> = flight.heard.iter().filter(|h| matches!(h, Heard::Frame(_))).collect();
+    let frames: Vec<_> = flight.inputs.iter().filter(|h| matches!(h, Input::Frame(_))).collect();
     let (mut filter, mut out) = (flight.filter(), Vec::new());
     frames.iter().for_each(|h| h.give(&mut filter, &mut out));
     let told = estimates(&out);
@@ -287,14 +287,15 @@ fn every_kind_of_target_is_tracked() {
 fn gps_latency_is_learnt_from_motion() {
     let flight = fly("late-gps", 60.0, 3, |_| {});
     let (mut filter, mut out) = (flight.filter(), Vec::new());
-    flight.heard.iter().for_each(|h| h.give(&mut filter, &mut out));
+    flight.inputs.iter().for_each(|h| h.give(&mut filter, &mut out));
     assert!((filter.gps_delay_s() - 0.1).abs() < 0.025, "{}", filter.gps_delay_s());
 }
 
 #[test]
 fn one_wrong_compass_reading_does_not_start_the_filter() {
     let mut flight = fly("follow", 10.0, 9, |_| {});
-    let first = flight.heard.iter_mut().find_map(|h| if let Heard::Attitude(a) = h { Some(a) } else { None });
+    let first =
+        flight.inputs.iter_mut().find_map(|h| if let Input::Attitude(a) = h { Some(a) } else { None });
     let first = first.expect("a reading");
     first.value.heading = first.value.heading.map(|h| h + 3.0);
     let s = score(&estimates(&flight.outputs()), &flight.world, 3.0);
@@ -304,12 +305,12 @@ fn one_wrong_compass_reading_does_not_start_the_filter() {
 #[test]
 fn absurd_numbers_pass_without_harm() {
     let mut flight = fly("follow", 15.0, 10, |_| {});
-    for (i, heard) in flight.heard.iter_mut().enumerate().filter(|(i, _)| i % 37 == 5) {
+    for (i, input) in flight.inputs.iter_mut().enumerate().filter(|(i, _)| i % 37 == 5) {
         let value = [f64::NAN, f64::INFINITY, 1e300, -1e300, 1e9][i % 5];
-        match heard {
-            Heard::Gnss(g) => (g.value.lat_deg, g.value.alt_msl_m) = (Some(value), Some(value)),
-            Heard::Attitude(a) => a.value.heading = Some(value),
-            Heard::Frame(f) => {
+        match input {
+            Input::Gnss(g) => (g.value.lat_deg, g.value.alt_msl_m) = (Some(value), Some(value)),
+            Input::Attitude(a) => a.value.heading = Some(value),
+            Input::Frame(f) => {
                 for marker in &mut f.value.markers {
                     marker.corners_px = Some([Vector2::new(value, value); 4]);
                     marker.center_px = Vector2::new(value, 3.0);
@@ -335,15 +336,15 @@ fn absurd_numbers_pass_without_harm() {
 /// in height.
 fn with_jumps(flight: &Flight, jumps: &[(f64, f64)]) -> Vec<EstimatorOutput> {
     let (mut filter, mut out) = (flight.filter(), Vec::new());
-    for heard in &flight.heard {
-        let mut heard = heard.clone();
-        if let Heard::Gnss(g) = &mut heard {
+    for input in &flight.inputs {
+        let mut input = input.clone();
+        if let Input::Gnss(g) = &mut input {
             let t_s = flight.world.seconds(g.t_valid);
             let north_m = jumps.iter().rev().find(|(from_s, _)| t_s >= *from_s).map_or(0.0, |j| j.1);
             g.value.alt_msl_m = g.value.alt_msl_m.map(|alt| alt + north_m);
             g.value.lat_deg = g.value.lat_deg.map(|lat| lat + (north_m / METRES_A_RADIAN).to_degrees());
         }
-        heard.give(&mut filter, &mut out);
+        input.give(&mut filter, &mut out);
     }
     out
 }
@@ -432,11 +433,11 @@ fn the_papers_estimator_is_exact_without_noise() {
     });
     let (mut paper, mut out) =
         (PaperEstimator::new(flight.rig(), &EstimatorConfig::default(), &flight.site), Vec::new());
-    for heard in &flight.heard {
-        match heard {
-            Heard::Gnss(g) => paper.gnss(g, &mut out),
-            Heard::Attitude(a) => paper.attitude(a, &mut out),
-            Heard::Frame(f) => paper.frame(f, &mut out),
+    for input in &flight.inputs {
+        match input {
+            Input::Gnss(g) => paper.gnss(g, &mut out),
+            Input::Attitude(a) => paper.attitude(a, &mut out),
+            Input::Frame(f) => paper.frame(f, &mut out),
         }
     }
     assert!(out.len() > 40);

@@ -4,6 +4,8 @@ mod blind;
 mod filter;
 mod ground;
 mod honesty;
+mod matrix;
 mod misfit;
 mod ownship;
 mod time;
+mod vibration;

@@ -4,30 +4,30 @@ use windhover_base::msg::{FrameObservations, Ownship, Stamped};
 use windhover_base::time::{MonoTime, Span};
 use windhover_estimate::EstimatorOutput;
 
-use super::filter::{Flight, Heard, fly};
+use super::filter::{Flight, Input, fly};
 
 const TENTH: i64 = 100_000_000;
 
 /// What was received, without the camera's frames.
-fn without_frames(flight: &Flight) -> Vec<Heard> {
-    flight.heard.iter().filter(|heard| !matches!(heard, Heard::Frame(_))).cloned().collect()
+fn without_frames(flight: &Flight) -> Vec<Input> {
+    flight.inputs.iter().filter(|input| !matches!(input, Input::Frame(_))).cloned().collect()
 }
 
 /// The filter's output at every tenth of a second between frames, and its other output.
-fn told(flight: &Flight, heard: &[Heard], silence: Span) -> (Vec<Ownship>, Vec<EstimatorOutput>) {
+fn told(flight: &Flight, inputs: &[Input], silence: Span) -> (Vec<Ownship>, Vec<EstimatorOutput>) {
     let (mut filter, mut own, mut out) = (flight.filter(), Vec::new(), Vec::new());
-    let mut next = heard[0].t_recv().ns() / TENTH + 1;
+    let mut next = inputs[0].t_recv().ns() / TENTH + 1;
     let mut until = |t: MonoTime, filter: &mut windhover_estimate::Estimator| {
         while next * TENTH <= t.ns() {
             own.extend(filter.ownship(MonoTime::from_ns(next * TENTH)));
             next += 1;
         }
     };
-    for one in heard {
+    for one in inputs {
         until(one.t_recv(), &mut filter);
         one.give(&mut filter, &mut out);
     }
-    let last = heard[heard.len() - 1].t_recv();
+    let last = inputs[inputs.len() - 1].t_recv();
     until(last + silence, &mut filter);
     (own, out)
 }
@@ -55,9 +55,9 @@ fn it_goes_on_without_frames() {
 #[test]
 fn asking_for_it_changes_nothing_else() {
     let flight = fly("follow", 6.0, 4, |_| {});
-    let (own, with) = told(&flight, &flight.heard, Span::ZERO);
+    let (own, with) = told(&flight, &flight.inputs, Span::ZERO);
     let (mut filter, mut without) = (flight.filter(), Vec::new());
-    flight.heard.iter().for_each(|heard| heard.give(&mut filter, &mut without));
+    flight.inputs.iter().for_each(|input| input.give(&mut filter, &mut without));
     assert!(!own.is_empty());
     assert_eq!(format!("{with:?}"), format!("{without:?}"));
 }
@@ -66,8 +66,8 @@ fn asking_for_it_changes_nothing_else() {
 fn at_a_frame_it_is_that_frames() {
     let flight = fly("follow", 4.0, 5, |_| {});
     let (mut filter, mut out) = (flight.filter(), Vec::new());
-    flight.heard.iter().for_each(|heard| heard.give(&mut filter, &mut out));
-    let t = flight.heard[flight.heard.len() - 1].t_recv();
+    flight.inputs.iter().for_each(|input| input.give(&mut filter, &mut out));
+    let t = flight.inputs[flight.inputs.len() - 1].t_recv();
     let value = FrameObservations { frame: 77, ..FrameObservations::default() };
     filter.frame(&Stamped { t_valid: t, t_recv: t, seq: u64::MAX, value }, &mut out);
     let of_frame = out.iter().rev().find_map(|o| match o {
@@ -82,9 +82,9 @@ fn at_a_frame_it_is_that_frames() {
 #[test]
 fn in_a_silence_it_grows_vague_and_ends() {
     let flight = fly("follow", 5.0, 6, |_| {});
-    let heard = without_frames(&flight);
-    let (own, _) = told(&flight, &heard, Span::from_s(30.0));
-    let last = heard[heard.len() - 1].t_valid();
+    let inputs = without_frames(&flight);
+    let (own, _) = told(&flight, &inputs, Span::from_s(30.0));
+    let last = inputs[inputs.len() - 1].t_valid();
     let after: Vec<&Ownship> = own.iter().filter(|own| own.t_valid > last).collect();
     let (first, latest) = (after[0], after[after.len() - 1]);
     assert!(latest.position_sigma_m().norm() > 2.0 * first.position_sigma_m().norm(), "{first:?} {latest:?}");
@@ -100,8 +100,8 @@ fn in_a_silence_it_grows_vague_and_ends() {
 fn a_frame_that_is_not_taken_shows_what_is_known_of_its_time_and_nothing_later() {
     let flight = fly("follow", 12.0, 6, |_| {});
     let (mut filter, mut out) = (flight.filter(), Vec::new());
-    flight.heard.iter().for_each(|heard| heard.give(&mut filter, &mut out));
-    let last = flight.heard[flight.heard.len() - 1].t_recv();
+    flight.inputs.iter().for_each(|input| input.give(&mut filter, &mut out));
+    let last = flight.inputs[flight.inputs.len() - 1].t_recv();
     // Stamped after its arrival by far more than clocks differ, and long before everything that is kept.
     for off in [Span::from_s(1000.0), Span::from_s(0.5), Span::from_s(-3600.0)] {
         let t_valid = last + off;

@@ -1,8 +1,9 @@
 //! Incomplete recordings: each is refined as far as possible, or refused with a reason.
 
+use windhover_base::msg::{MarkerId, TagFamily};
 use windhover_base::settings::EstimatorConfig;
 use windhover_base::time::Span;
-use windhover_refine::{OutsidePosition, Recording, RefineError, Refined, refine};
+use windhover_refine::{OutsidePosition, Recording, RefineError, Refined, SurveyedMarker, refine};
 
 use crate::flown::{Flown, fly};
 
@@ -104,6 +105,27 @@ fn with_positions_from_outside_the_place_is_theirs() {
     assert!(off.norm() < 0.3, "off by {off}");
     let sigma = state.covariance.expect("told")[(0, 0)].sqrt();
     assert!(sigma < 0.3, "{sigma}");
+}
+
+/// With a surveyed marker the receiver's error is removed likewise.
+#[test]
+fn over_a_surveyed_marker_the_place_is_known() {
+    let flown = fly("static-survey", 8.0, 7, |_| {});
+    let (mut recording, rig) = (flown.recording.clone(), &flown.world.scenario().rig);
+    let vehicle = flown.world.vehicle(0, flown.world.time(0.0));
+    let place = nalgebra::Vector3::new(vehicle.north_m, vehicle.east_m, 0.0);
+    let id = rig.target[0].marker[0].id.expect("a tag");
+    recording.surveyed.push(SurveyedMarker {
+        marker: MarkerId::Tag { family: TagFamily::default(), id },
+        at: flown.site.frame.geodetic(&place),
+        sigma_m: 0.02,
+    });
+    let refined = of(&flown, &[recording]).expect("a flight");
+    let (_, own) = refined.own[refined.own.len() / 2];
+    let truth = flown.world.ownship(own.t_valid);
+    let off = (own.position_ned_m - truth.position_ned_m).xy();
+    let sigma = own.position_sigma_m().xy();
+    assert!(off.norm() < 3.0 * sigma.norm() && sigma.norm() < 0.5, "off by {off} ± {sigma}");
 }
 
 #[test]

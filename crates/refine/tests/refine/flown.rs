@@ -89,6 +89,8 @@ pub(super) struct Score {
     /// Sums of squares of heading (rad), speed, yaw rate, each over its variance too.
     pub(super) squares: [f64; 3],
     pub(super) normalised: [f64; 3],
+    /// Sums of the variances.
+    pub(super) variances: [f64; 3],
     pub(super) nees: f64,
     pub(super) position: f64,
 }
@@ -112,6 +114,7 @@ impl Score {
             score.frames += 1.0;
             for i in 0..3 {
                 score.squares[i] += errors[i] * errors[i];
+                score.variances[i] += three[(i, i)];
                 score.normalised[i] += errors[i] * errors[i] / three[(i, i)];
             }
             score.nees += three.try_inverse().map_or(f64::NAN, |inverse| errors.dot(&(inverse * errors)));
@@ -127,6 +130,11 @@ impl Score {
         (self.squares[i] / self.frames).sqrt()
     }
 
+    /// Root of the mean variance: for the models linearised at the solution, the batch Cramér–Rao bound.
+    pub(super) fn bound(&self, i: usize) -> f64 {
+        (self.variances[i] / self.frames).sqrt()
+    }
+
     pub(super) fn add(&mut self, other: &Self) {
         self.frames += other.frames;
         self.nees += other.nees;
@@ -134,6 +142,23 @@ impl Score {
         for i in 0..3 {
             self.squares[i] += other.squares[i];
             self.normalised[i] += other.normalised[i];
+            self.variances[i] += other.variances[i];
         }
+    }
+}
+
+impl std::fmt::Display for Score {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(
+            f,
+            "heading {:.3} deg, speed {:.4} m/s, yaw rate {:.4} rad/s; normalised {:.2?}, of all three {:.2}, of position \
+             {:.2}",
+            self.rms(0).to_degrees(),
+            self.rms(1),
+            self.rms(2),
+            self.normalised.map(|n| n / self.frames),
+            self.nees / self.frames,
+            self.position / self.frames
+        )
     }
 }

@@ -1,7 +1,9 @@
 //! Refinement of simulated flights against their truth.
 
 mod bad_input;
+mod consistency;
 mod flown;
+mod misfits;
 
 use flown::{Score, fly};
 
@@ -69,16 +71,7 @@ fn proof_of_errors_and_sigmas() {
             refined.add(&Score::of(told.targets.iter().map(|(_, e)| e), &flown.world));
         }
         for (what, s) in [("filter", &filter), ("refined", &refined)] {
-            println!(
-                "{name}, {features} features, {what}: heading {:.3} deg, speed {:.4} m/s, yaw rate {:.4} rad/s; \
-                 normalised {:.2?}, of all three {:.2}, of position {:.2}",
-                s.rms(0).to_degrees(),
-                s.rms(1),
-                s.rms(2),
-                s.normalised.map(|n| n / s.frames),
-                s.nees / s.frames,
-                s.position / s.frames
-            );
+            println!("{name}, {features} features, {what}: {s}");
         }
         assert!(refined.rms(1) < 0.4 * filter.rms(1) && refined.rms(2) < 0.4 * filter.rms(2), "{name}");
         assert!((1.2..=4.5).contains(&(refined.nees / refined.frames)), "{name}");
