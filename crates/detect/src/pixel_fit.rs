@@ -8,7 +8,7 @@ use nalgebra::{Cholesky, Const, Matrix3, SMatrix, SVector};
 use super::edge_points::LANES;
 use super::equations::Information;
 use super::family::Family;
-use super::pixel_model::{BLUR, DARK, GROUND, NarrowState, Pixels, RANGE, Shown, UNKNOWNS};
+use super::pixel_model::{BLUR, DARK, GROUND, LENS, NarrowState, Pixels, RANGE, Shown, UNKNOWNS};
 use super::pixel_patterns::Patterns;
 use super::pixel_sums::{Accumulate, Pulls, Sums};
 use super::simd::Simd;
@@ -54,7 +54,7 @@ const MOST_STEPS: usize = 8;
 const FARTHEST: f64 = 0.5;
 
 /// Share of the errors, in blocks, that the fit absorbs for each parameter.
-const TAKEN_UP: f64 = 0.3;
+const TAKEN_UP: f64 = 0.4;
 
 /// Fewest pixels.
 const LEAST_PIXELS: usize = 5 * UNKNOWNS;
@@ -105,19 +105,19 @@ impl PixelFit {
         }
     }
 
-    /// Moves a model, of which the homography counts, to where the pixels show the tag; its parameters' covariance.
-    /// `None` where the pixels are not those of the tag in one light. `blurs` are the sigmas from which the search begins,
+    /// Moves a model to where the pixels show the tag; its parameters' covariance. `None` where the pixels are not those of
+    /// the tag in one light. `blurs` are the sigmas from which the search begins, `held` those of the lens's parameters,
     /// `noise` that of a pixel, grey levels.
     pub fn fit(
         &mut self,
         image: ImageView<'_>,
-        (start, blurs): (&Model, [f64; 2]),
+        (start, blurs, held): (&Model, [f64; 2], &[f64]),
         (family, id): (&Family, u32),
         noise: f64,
     ) -> Option<(Model, Information)> {
         self.patterns.place(family, id);
         let cells = start.pitches(family.width);
-        let mut state = State { model: start.without_lens(), rest: [0.0; UNKNOWNS - BLUR] };
+        let mut state = State { model: start.without_shifts(), rest: [0.0; UNKNOWNS - BLUR] };
         for k in 0..2 {
             state.rest[k] = blurs[k].clamp(0.5, WIDEST_BLUR * cells[k]);
         }
@@ -126,7 +126,7 @@ impl PixelFit {
         let mut spread = 0.1 * state.range();
         for step in 0..MOST_STEPS {
             self.accumulate(&state, spread)?;
-            let solved = self.solve(&state, spread)?;
+            let solved = self.solve(&state, held, spread)?;
             spread = self.sums.sizes.spread();
             let before = state.model;
             state.take(&solved.step);
@@ -219,7 +219,7 @@ impl PixelFit {
         Some(())
     }
 
-    fn solve(&self, state: &State, spread: f64) -> Option<Solved> {
+    fn solve(&self, state: &State, held: &[f64], spread: f64) -> Option<Solved> {
         let (mut information, mut right) = (self.sums.matrix(), self.sums.right());
         let range = state.range().abs().max(1.0);
         let mut holds = Row::zeros();
@@ -229,6 +229,9 @@ impl PixelFit {
             right[k] -= holds[k] * from;
         };
         let rest = |k: usize| state.rest[k - BLUR];
+        for (k, sigma) in (LENS..BLUR).zip(held) {
+            hold(k, state.model.theta[k], *sigma);
+        }
         for k in BLUR..BLUR + 2 {
             hold(k, rest(k) - FOCUS, FOCUS_SIGMA);
         }
@@ -242,7 +245,7 @@ impl PixelFit {
         step.iter().all(|s| s.is_finite()).then_some(Solved { step, information, holds })
     }
 
-    /// Covariance of the homography, as `refine.rs` has it of all parameters; `None` where the residuals show that the
+    /// Covariance of what moves the tag's points, as `refine.rs` has it of all parameters; `None` where the residuals show that the
     /// pixels are not those of the tag.
     fn covariance(&mut self, state: &State, solved: &Solved, spread: f64, noise: f64) -> Option<Information> {
         let narrow = state.narrow()?;
@@ -298,6 +301,7 @@ impl State {
         let theta = |k: usize| if k < BLUR { t[k] } else { self.rest[k - BLUR] };
         Some(NarrowState {
             theta: std::array::from_fn(|k| theta(k) as f32),
+            sides: self.model.sides().map(|a| [a.x as f32, a.y as f32]),
             back: std::array::from_fn(|k| back[(k / 3, k % 3)] as f32),
         })
     }

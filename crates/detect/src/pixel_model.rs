@@ -9,10 +9,13 @@
 
 use super::edge_points::{LANES, Lanes};
 use super::pixel_patterns::Patterns;
+use super::quad::Point;
 
-/// Parameters: the homography's eight, two sigmas of the blur and their covariance, the light of black, by how much
-/// white is lighter, and the ground's light over black. Each constant is a group's first index.
-pub(super) const BLUR: usize = 8;
+/// Parameters: the homography's eight and the lens's five, as in `tag_model.rs`, two sigmas of the blur and their covariance,
+/// the light of black, by how much white is lighter, and the ground's light over black. Each constant is a group's first
+/// index.
+pub(super) const LENS: usize = 8;
+pub(super) const BLUR: usize = LENS + 5;
 pub(super) const DARK: usize = BLUR + 3;
 pub(super) const RANGE: usize = DARK + 3;
 pub(super) const GROUND: usize = RANGE + 3;
@@ -50,21 +53,54 @@ impl Pixels {
     }
 }
 
-/// The parameters, and the homography's inverse, row by row.
+/// The parameters, the tag's half sides over their mean length, and the homography's inverse, row by row.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct NarrowState {
     pub theta: [f32; UNKNOWNS],
+    pub sides: [Point; 2],
     pub back: [f32; 9],
 }
 
 impl NarrowState {
-    /// ξ and η at a pixel.
+    /// ξ and η at a pixel, without the lens.
     #[inline(always)]
     pub fn tag_point(&self, u: f32, v: f32) -> [f32; 2] {
         let m = &self.back;
         let z = 1.0 / (m[6] * u + m[7] * v + m[8]);
         [(m[0] * u + m[1] * v + m[2]) * z, (m[3] * u + m[4] * v + m[5]) * z]
     }
+
+    /// By what the lens's parameters are multiplied at a tag point: bow, barrel along u and v, twist.
+    #[inline(always)]
+    fn bends(&self, [xi, eta]: [f32; 2]) -> Bends {
+        let [a, b] = self.sides;
+        let q = [xi * a[0] + eta * b[0], xi * a[1] + eta * b[1]];
+        let bow = q[0] * q[0] + q[1] * q[1] - 2.0;
+        Bends {
+            bow,
+            barrel: [bow * q[0], bow * q[1]],
+            even: q[0] * q[0] - q[1] * q[1],
+            odd: 2.0 * q[0] * q[1],
+        }
+    }
+
+    /// By how much the lens moves what is at a tag point, pixels.
+    #[inline(always)]
+    fn bent(&self, at: [f32; 2]) -> [f32; 2] {
+        let (t, k) = (&self.theta[LENS..], self.bends(at));
+        [
+            t[0] * k.bow + t[2] * k.barrel[0] + t[3] * k.even - t[4] * k.odd,
+            t[1] * k.bow + t[2] * k.barrel[1] - t[3] * k.odd - t[4] * k.even,
+        ]
+    }
+}
+
+/// The lens's effects at a tag point, each for a parameter of one pixel.
+struct Bends {
+    bow: f32,
+    barrel: [f32; 2],
+    even: f32,
+    odd: f32,
 }
 
 /// What some pixels show, and from what it was computed.
@@ -75,6 +111,8 @@ pub(super) struct Shown {
     /// Seen less shown, grey levels.
     pub residual: Lanes,
     q: [Lanes; 2],
+    /// Where pixels would be without the lens.
+    at: [Lanes; 2],
     /// Cells from the border's corner, then from the corner of the cell in which a pixel lies.
     cell: [Lanes; 2],
     /// ∂x/∂u, ∂x/∂v, ∂y/∂u, ∂y/∂v, in cells a pixel.
@@ -93,6 +131,7 @@ impl Default for Shown {
             rows: [none; UNKNOWNS],
             residual: none,
             q: [none; 2],
+            at: [none; 2],
             cell: [none; 2],
             slope: [[none; 2]; 2],
             length: [none; 2],
@@ -127,6 +166,10 @@ impl Shown {
         let m = &state.back;
         for lane in 0..LANES {
             let (u, v) = (pixels.at[0][lane], pixels.at[1][lane]);
+            // The lens moves so little that it does not matter whether it is asked for here or beside.
+            let bent = state.bent(state.tag_point(u, v));
+            let (u, v) = (u - bent[0], v - bent[1]);
+            (self.at[0][lane], self.at[1][lane]) = (u, v);
             let z = 1.0 / (m[6] * u + m[7] * v + m[8]);
             let (xi, eta) = ((m[0] * u + m[1] * v + m[2]) * z, (m[3] * u + m[4] * v + m[5]) * z);
             (self.q[0][lane], self.q[1][lane]) = (xi, eta);
@@ -145,7 +188,7 @@ impl Shown {
     #[inline(always)]
     fn light(&mut self, state: &NarrowState, pixels: &Pixels) {
         let t = &state.theta;
-        let Self { rows, residual, q, slope, length, sums: [lit, ground], .. } = self;
+        let Self { rows, residual, q, at, slope, length, sums: [lit, ground], .. } = self;
         for lane in 0..LANES {
             let (xi, eta) = (q[0][lane], q[1][lane]);
             let dark = t[DARK] + t[DARK + 1] * xi + t[DARK + 2] * eta;
@@ -158,10 +201,15 @@ impl Shown {
             let by_v = -(slope[0][1][lane] * dx + slope[1][1][lane] * dy);
             let w = 1.0 / (t[6] * xi + t[7] * eta + 1.0);
             let (nu, nv) = (by_u * w, by_v * w);
-            let across = -(nu * pixels.at[0][lane] + nv * pixels.at[1][lane]);
+            let across = -(nu * at[0][lane] + nv * at[1][lane]);
             (rows[0][lane], rows[1][lane], rows[2][lane]) = (nu * xi, nu * eta, nu);
             (rows[3][lane], rows[4][lane], rows[5][lane]) = (nv * xi, nv * eta, nv);
             (rows[6][lane], rows[7][lane]) = (across * xi, across * eta);
+            let k = state.bends([xi, eta]);
+            (rows[LENS][lane], rows[LENS + 1][lane]) = (k.bow * by_u, k.bow * by_v);
+            rows[LENS + 2][lane] = k.barrel[0] * by_u + k.barrel[1] * by_v;
+            rows[LENS + 3][lane] = k.even * by_u - k.odd * by_v;
+            rows[LENS + 4][lane] = -k.odd * by_u - k.even * by_v;
             rows[BLUR][lane] = of(3) * length[0][lane];
             rows[BLUR + 1][lane] = of(4) * length[1][lane];
             rows[BLUR + 2][lane] = of(5) * both;

@@ -135,10 +135,9 @@ impl Refiner {
                 [FOCUS; 2]
             }
         };
-        let (model, covariance) = self.pixels.fit(image, (&model, blurs), (family, id), noise)?;
-        // A bow that is not fitted shifts corners by about a half of it. How far the corners have moved does not matter:
-        // what the pixels show is the tag.
-        model.result(&covariance, [0.0; 2], PIXELS_FLOOR_PX.hypot(0.5 * held[0]))
+        let (model, covariance) = self.pixels.fit(image, (&model, blurs, &held), (family, id), noise)?;
+        // How far the corners have moved does not matter: what the pixels show is the tag.
+        model.result(&covariance, [0.0; 2], PIXELS_FLOOR_PX)
     }
 
     /// Refines corners by the edges.

@@ -10,6 +10,9 @@ use super::quad::Quad;
 /// Where the corners are in ξ and η.
 const CORNERS: [(f64, f64); 4] = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
 
+/// The first parameter that moves edges and not the tag.
+const SHIFTS: usize = 13;
+
 /// A refined tag.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(super) struct Refined {
@@ -105,14 +108,19 @@ impl Model {
     /// How far blur moves the visible edges beside cells that are one wide towards the other cell, for edges crossed
     /// along ξ (0) or η (1), pixels.
     pub fn shift(&self, axis: usize) -> f64 {
-        self.theta[13 + axis]
+        self.theta[SHIFTS + axis]
     }
 
-    /// The homography alone.
-    pub fn without_lens(&self) -> Self {
+    /// The same without shifts of edges.
+    pub fn without_shifts(&self) -> Self {
         let mut model = *self;
-        model.theta.rows_mut(8, PARAMETERS - 8).fill(0.0);
+        model.theta.rows_mut(SHIFTS, PARAMETERS - SHIFTS).fill(0.0);
         model
+    }
+
+    /// Half sides over the root mean square of their lengths.
+    pub fn sides(&self) -> [Vector2<f64>; 2] {
+        self.sides
     }
 
     /// The pixel of a tag point.
