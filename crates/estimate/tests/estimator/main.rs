@@ -6,6 +6,8 @@ mod ground;
 mod honesty;
 mod matrix;
 mod misfit;
+mod misfit_table;
 mod ownship;
+mod tags;
 mod time;
 mod vibration;
