@@ -54,7 +54,7 @@ const MOST_STEPS: usize = 8;
 const FARTHEST: f64 = 0.5;
 
 /// Share of the errors, in blocks, that the fit absorbs for each parameter.
-const TAKEN_UP: f64 = 0.4;
+const TAKEN_UP: f64 = 0.45;
 
 /// Fewest pixels.
 const LEAST_PIXELS: usize = 5 * UNKNOWNS;
