@@ -5,6 +5,7 @@ mod beginnings;
 mod block;
 mod dense;
 mod initial;
+mod frame;
 mod front;
 #[cfg(test)]
 mod gtsam_tests;
@@ -22,6 +23,7 @@ mod roughness;
 #[cfg(test)]
 mod segments;
 mod solve;
+mod stamped;
 mod surveyed;
 mod result;
 mod unknowns;

@@ -76,6 +76,8 @@ pub fn source_name(source: Source, targets: &[TargetConfig]) -> String {
         Source::Gust => "gust".into(),
         Source::Thrust => "thrust".into(),
         Source::Vibration => "vibration".into(),
+        Source::Shake => "camera_shake".into(),
+        Source::ShakeRoll => "camera_shake_roll".into(),
         Source::Drive(target) => format!("{}/drive", of(target)),
         Source::Turn(target) => format!("{}/turn", of(target)),
         Source::Sway(target) => format!("{}/sway", of(target)),
