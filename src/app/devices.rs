@@ -1,16 +1,17 @@
 //! Device tasks: reports of a device become events for the pipeline and log events for the operator.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use crate::config::{Config, Part};
 use crate::io::autopilot::{self, AutopilotAddress, AutopilotSettings, ToAutopilot};
-use crate::io::camera::{self, CameraSettings};
+use crate::io::camera::{self, CameraInputs, CameraSettings, ExposureSettings, TriggerCount};
 use crate::io::device::{Fault, NoteKind, Report, blocking};
 use crate::io::mavlink::signing_key;
 use crate::io::pps;
 use crate::io::serial::{self, SerialSettings, Setup};
+use crate::io::trigger_line;
 use windhover_base::msg::{EventBody, Source};
-use windhover_base::settings::{CompassFormat, GpsFormat, shares_line};
+use windhover_base::settings::{CameraConfig, CompassFormat, GpioLine, GpsFormat, shares_line};
 
 use super::context::TaskContext;
 use super::events::{self, OperatorEvent};
@@ -98,7 +99,7 @@ pub async fn autopilot(
 }
 
 /// Takes frames until a stop is requested.
-pub async fn camera(config: Arc<Config>, context: TaskContext, heartbeat: Heartbeat) {
+pub async fn camera(config: Arc<Config>, inputs: CameraInputs, context: TaskContext, heartbeat: Heartbeat) {
     let settings = CameraSettings {
         device: config.camera.device.clone(),
         width: config.camera.width,
@@ -109,7 +110,7 @@ pub async fn camera(config: Arc<Config>, context: TaskContext, heartbeat: Heartb
     let (clock, stop) = (context.clock, context.stop.clone());
     let device = DeviceReports { part: Part::Camera, source: Source::Camera, context, heartbeat };
     let reports = |report| device.take(report);
-    stop.run_until_cancelled(camera::run(&settings, clock, &reports)).await;
+    stop.run_until_cancelled(camera::run(&settings, &inputs, clock, &reports)).await;
 }
 
 /// Reads the receiver's pulse until a stop is requested. Without the pulse line only accuracy is lost, so readiness
@@ -118,6 +119,24 @@ pub async fn pulses(device: String, context: TaskContext, heartbeat: Heartbeat) 
     let reports = |report| plain(report, "pps", &heartbeat);
     let pulse = |t| context.events.put(t, EventBody::Pulse);
     context.stop.run_until_cancelled(pps::run(&device, context.clock, &reports, &pulse)).await;
+}
+
+/// Watches the line that triggers the camera until a stop is requested. Without it only the count of lost frames is
+/// missing, so readiness does not wait for it.
+pub async fn trigger(
+    line: GpioLine,
+    count: Arc<Mutex<TriggerCount>>,
+    context: TaskContext,
+    heartbeat: Heartbeat,
+) {
+    let reports = |report| plain(report, "trigger", &heartbeat);
+    let pulse = |t| count.lock().unwrap_or_else(PoisonError::into_inner).pulse(t);
+    context.stop.run_until_cancelled(trigger_line::run(&line, context.clock, &reports, &pulse)).await;
+}
+
+/// What is configured of the camera's exposure and gain.
+pub const fn exposure(camera: &CameraConfig) -> ExposureSettings {
+    ExposureSettings { exposure_us: camera.exposure_us, auto_max_us: camera.auto_max_us, gain: camera.gain }
 }
 
 /// Reports of a device that delivers neither bytes nor frames.

@@ -77,8 +77,14 @@ table! {
     CameraFrameDamaged: "camera_frame_damaged", WARN, every 5 s;
     /// The camera delivers another format than requested.
     CameraFormatDiffers: "camera_format_differs", WARN, every 0 s;
-    /// The driver counted frames that it did not deliver.
+    /// The driver, or the line that triggers the camera, counted frames that did not come.
     CameraFramesMissed: "camera_frames_missed", WARN, every 5 s;
+    /// Exposure and gain of the camera were set; the message has them.
+    CameraExposureSet: "camera_exposure_set", INFO, every 0 s;
+    /// The camera cannot have the exposure or gain that is configured.
+    CameraExposureNotSet: "camera_exposure_not_set", WARN, every 0 s;
+    /// Frames arrive, and no pulses on the line that triggers the camera.
+    CameraTriggerSilent: "camera_trigger_silent", WARN, every 30 s;
     /// A receiver accepted its configuration.
     ReceiverConfigured: "receiver_configured", INFO, every 0 s;
     /// A receiver refused or ignored its configuration.
@@ -255,6 +261,9 @@ impl From<NoteKind> for OperatorEvent {
             NoteKind::FrameDamaged => Self::CameraFrameDamaged,
             NoteKind::FormatDiffers => Self::CameraFormatDiffers,
             NoteKind::FramesMissed => Self::CameraFramesMissed,
+            NoteKind::ExposureSet => Self::CameraExposureSet,
+            NoteKind::ExposureNotSet => Self::CameraExposureNotSet,
+            NoteKind::TriggerSilent => Self::CameraTriggerSilent,
             NoteKind::Configured => Self::ReceiverConfigured,
             NoteKind::NotConfigured => Self::ReceiverNotConfigured,
             NoteKind::Autopilot => Self::AutopilotNote,

@@ -60,10 +60,13 @@ impl Reloading {
 }
 
 /// Keys that can change in flight. A table's name stands for all its keys.
-const CHANGEABLE: [&str; 9] = [
+const CHANGEABLE: [&str; 12] = [
     "log.level",
     "daemon.answer_within_s",
     "daemon.optional",
+    "camera.exposure_us",
+    "camera.auto_max_us",
+    "camera.gain",
     "power.low_voltage_v",
     "power.on_mains_off",
     "power.hot_c",
@@ -108,6 +111,9 @@ pub fn merged(running: &Config, read: &Config) -> Config {
     merged.log.level = read.log.level;
     merged.daemon.answer_within_s = read.daemon.answer_within_s;
     merged.daemon.optional.clone_from(&read.daemon.optional);
+    merged.camera.exposure_us = read.camera.exposure_us;
+    merged.camera.auto_max_us = read.camera.auto_max_us;
+    merged.camera.gain = read.camera.gain;
     merged.power.low_voltage_v = read.power.low_voltage_v;
     merged.power.on_mains_off = read.power.on_mains_off;
     merged.power.hot_c = read.power.hot_c;
@@ -159,8 +165,14 @@ mod tests {
         read.gps.baud = 4800;
         read.target[0].marker[1].id = Some(7);
         read.power.low_voltage_v = Some(10.5);
+        read.camera.exposure_us = Some(800.0);
         let told = differences(&running, &read);
-        assert_eq!(told.now, ["log.level: \"info\" → \"debug\"", "power.low_voltage_v: unset → 10.5"]);
+        let now = [
+            "camera.exposure_us: unset → 800.0",
+            "log.level: \"info\" → \"debug\"",
+            "power.low_voltage_v: unset → 10.5",
+        ];
+        assert_eq!(told.now, now);
         assert_eq!(told.restart, ["gps.baud: 38400 → 4800", "target[0].marker[1].id: 1 → 7"]);
         let merged = merged(&running, &read);
         assert!(differences(&merged, &read).now.is_empty());

@@ -147,8 +147,9 @@ async fn fly(
     log: &Log,
 ) -> Result<String, RunError> {
     let config = loaded.config.clone();
-    let Graph { context, status, orders, power, mut tasks } = topology::start(loaded, clock)?;
-    let mut watch = Watch::new(config, context.clone(), log.clone(), (status.clone(), orders, power));
+    let Graph { context, status, orders, power, exposure, mut tasks } = topology::start(loaded, clock)?;
+    let mut watch =
+        Watch::new(config, context.clone(), log.clone(), (status.clone(), orders, power, exposure));
     let mut round = tokio::time::interval(ROUND);
     round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     let (why, result) = loop {

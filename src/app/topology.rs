@@ -16,6 +16,7 @@
 //! | gps, compass | their line's descriptor | reopens the device, with pauses of ¼ s to 5 s |
 //! | autopilot | its line or socket, frames for it, a second's timer | the same |
 //! | pps | the pulse device's descriptor | the same |
+//! | trigger | the descriptor of the GPIO line that triggers the camera | the same |
 //! | camera | the V4L2 queue's descriptor, or the thread that plays a recording | the same |
 //! | power | the GPIO line's descriptor, a second's timer | the same |
 //! | store | notices of the store, the pipeline's end, power failure | reopens the card; the daemon continues without
@@ -58,11 +59,13 @@
 //! answer. A panic in any task ends the process, and the service manager restarts it. A stop is a cancellation token:
 //! the device tasks are dropped where they wait, the pipeline handles the queued events, the store closes the flight.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use crate::io::autopilot::ToAutopilot;
+use crate::io::camera::{CameraInputs, ExposureSettings, TriggerCount};
 use crate::io::clock::HostClock;
 use windhover_base::settings::shares_line;
 
@@ -95,6 +98,8 @@ pub const PIPELINE: TaskRule = TaskRule { name: "pipeline", restart: Restart::En
 pub const STORE: TaskRule = TaskRule { name: "store", restart: Restart::Retries };
 /// The receiver's pulse, where one is configured.
 pub const PPS: TaskRule = TaskRule { name: "pps", restart: Restart::Retries };
+/// The line that triggers the camera, where one is configured.
+pub const TRIGGER: TaskRule = TaskRule { name: "trigger", restart: Restart::Retries };
 /// Supply, temperature, and the line that signals a power failure.
 pub const POWER: TaskRule = TaskRule { name: "power", restart: Restart::Retries };
 /// The connection to the autopilot, where one is configured.
@@ -118,6 +123,8 @@ pub struct Graph {
     pub orders: StoreOrders,
     /// The power task's readings.
     pub power: PowerView,
+    /// Requests to the camera about its exposure.
+    pub exposure: watch::Sender<ExposureSettings>,
     /// The tasks.
     pub tasks: Supervisor,
 }
@@ -186,6 +193,14 @@ pub fn start(loaded: Loaded, clock: HostClock) -> std::io::Result<Graph> {
     if let Some(address) = config.daemon.metrics {
         tasks.spawn(METRICS, |heartbeat| metrics_task::run(address, metrics, context.clone(), heartbeat));
     }
-    tasks.spawn(CAMERA, |heartbeat| devices::camera(Arc::clone(&config), context.clone(), heartbeat));
-    Ok(Graph { context, status, orders, power, tasks })
+    let (exposure, wanted) = watch::channel(devices::exposure(&config.camera));
+    let mut inputs = CameraInputs { exposure: wanted, trigger: None };
+    if let Some(line) = config.camera.trigger_line.clone() {
+        let count = Arc::<Mutex<TriggerCount>>::default();
+        inputs.trigger = Some(Arc::clone(&count));
+        tasks.spawn(TRIGGER, |heartbeat| devices::trigger(line, count, context.clone(), heartbeat));
+    }
+    let camera = |heartbeat| devices::camera(Arc::clone(&config), inputs, context.clone(), heartbeat);
+    tasks.spawn(CAMERA, camera);
+    Ok(Graph { context, status, orders, power, exposure, tasks })
 }

@@ -2,8 +2,11 @@
 
 use std::collections::BTreeSet;
 
+use tokio::sync::watch;
+
 use super::config_file::ConfigFileError;
 use super::context::TaskContext;
+use super::devices;
 use super::events::OperatorEvent;
 use super::flight_store::StoreOrders;
 use super::log::Log;
@@ -13,6 +16,7 @@ use super::reload;
 use super::status::SharedStatus;
 use super::supervise::Supervisor;
 use crate::config::{Config, PowerConfig};
+use crate::io::camera::ExposureSettings;
 use crate::io::clock::HostClock;
 use crate::io::notify::ServiceManager;
 use crate::io::power::{PowerState, PowerWatch};
@@ -26,6 +30,7 @@ pub(super) struct Watch {
     status: SharedStatus,
     orders: StoreOrders,
     power: PowerView,
+    exposure: watch::Sender<ExposureSettings>,
     log: Log,
     ready: bool,
     missing: String,
@@ -54,7 +59,12 @@ impl Watch {
         config: Config,
         context: TaskContext,
         log: Log,
-        (status, orders, power): (SharedStatus, StoreOrders, PowerView),
+        (status, orders, power, exposure): (
+            SharedStatus,
+            StoreOrders,
+            PowerView,
+            watch::Sender<ExposureSettings>,
+        ),
     ) -> Self {
         Self {
             context,
@@ -62,6 +72,7 @@ impl Watch {
             status,
             orders,
             power,
+            exposure,
             ready: false,
             missing: String::new(),
             silent: BTreeSet::new(),
@@ -226,6 +237,8 @@ impl Watch {
                 self.log.set_level(self.config.log.level);
                 self.power_watch = power_watch(&self.config.power);
                 self.power.settings.send_replace(self.config.power.clone());
+                let exposure = devices::exposure(&self.config.camera);
+                self.exposure.send_if_modified(|now| std::mem::replace(now, exposure) != exposure);
             }
         }
         if self.ready {

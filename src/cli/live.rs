@@ -67,11 +67,12 @@ pub(super) fn run(scenario: Scenario, live: &Live<'_>) -> CliResult {
     daemon.map_or(Ok(()), stop)?;
     let score = score.map_err(CliError::failed)?;
     note!(
-        "follow error {:.2} m rms, {:.2} m most; tilt {:.1} deg rms, {:.1} deg most; velocity error in the messages {:.3} m/s rms ({} messages)",
+        "follow error {:.2} m rms, {:.2} m most; tilt {:.1} deg rms, {:.1} deg most; messages {:.0} ms late, their velocity wrong by {:.3} m/s rms ({} messages)",
         score.follow_rms_m,
         score.follow_max_m,
         score.tilt_rms_deg,
         score.tilt_max_deg,
+        score.lag_ms,
         score.velocity_rms_mps,
         score.told
     );

@@ -1,6 +1,5 @@
 //! Checks of a configuration beyond its syntax.
 
-use windhover_base::geo::LensModel;
 use windhover_base::settings::{
     AttitudeConfig, AutopilotUse, GpsFormat, GroundConfig, ImuConfig, MarkerConfig, MarkerKind, TargetConfig,
     TargetModel, shares_line,
@@ -318,36 +317,6 @@ impl Config {
             refuse("autopilot.system_id", "is the system id of the first target, mavlink.system_id")?;
         }
         Ok(())
-    }
-
-    fn check_camera(&self) -> Result<(), ConfigError> {
-        let camera = &self.camera;
-        within("camera.width", f64::from(camera.width), 16.0, 16_384.0)?;
-        within("camera.height", f64::from(camera.height), 16.0, 16_384.0)?;
-        within("camera.fps", camera.fps, 0.1, 1_000.0)?;
-        within("camera.exposure_offset_ms", camera.exposure_offset_ms, -1_000.0, 1_000.0)?;
-        within("camera.readout_ms", camera.readout_ms, -200.0, 200.0)?;
-        within("camera.intrinsics.fx", camera.intrinsics.fx, 1.0, 1e6)?;
-        within("camera.intrinsics.fy", camera.intrinsics.fy, 1.0, 1e6)?;
-        within("camera.intrinsics.cx", camera.intrinsics.cx, -1e5, 1e5)?;
-        within("camera.intrinsics.cy", camera.intrinsics.cy, -1e5, 1e5)?;
-        within("camera.intrinsics.skew", camera.intrinsics.skew, -1.0, 1.0)?;
-        let terms = match camera.intrinsics.model {
-            LensModel::Brown => ["k1", "k2", "p1", "p2", "k3"],
-            LensModel::Fisheye => ["k1", "k2", "k3", "k4", "the fifth"],
-        };
-        if camera.intrinsics.model == LensModel::Fisheye && camera.intrinsics.distortion[4] != 0.0 {
-            refuse("camera.intrinsics.distortion", "a fisheye has four terms: k1, k2, k3, k4".to_owned())?;
-        }
-        for (term, value) in terms.iter().zip(camera.intrinsics.distortion) {
-            within(format!("camera.intrinsics.distortion ({term})"), value, -100.0, 100.0)?;
-        }
-        for (axis, value) in camera.mount.position_m.iter().enumerate() {
-            within(format!("camera.mount.position_m[{axis}]"), *value, -20.0, 20.0)?;
-        }
-        within("camera.mount.yaw_deg", camera.mount.yaw_deg, -180.0, 180.0)?;
-        within("camera.mount.pitch_deg", camera.mount.pitch_deg, -90.0, 90.0)?;
-        within("camera.mount.roll_deg", camera.mount.roll_deg, -180.0, 180.0)
     }
 
     fn check_daemon(&self) -> Result<(), ConfigError> {

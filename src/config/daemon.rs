@@ -4,6 +4,8 @@ use std::net::SocketAddr;
 
 use serde::{Deserialize, Serialize};
 
+use windhover_base::settings::GpioLine;
+
 /// `[daemon]`
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -79,24 +81,11 @@ pub struct PowerConfig {
     pub going_file: Option<String>,
     /// A GPIO line that signals a power failure at once, by its chip's character device.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub going_line: Option<GoingLine>,
+    pub going_line: Option<GpioLine>,
     /// Temperature above which the health line is a warning, degrees Celsius.
     pub hot_c: f64,
     /// Where sysfs is.
     pub sysfs: String,
-}
-
-/// A GPIO line.
-#[derive(Clone, PartialEq, Eq, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct GoingLine {
-    /// Its chip, for example `/dev/gpiochip0`.
-    pub chip: String,
-    /// Its number on the chip, as `gpioinfo` shows it.
-    pub line: u32,
-    /// Whether a low level signals a power failure.
-    #[serde(default)]
-    pub active_low: bool,
 }
 
 impl Default for PowerConfig {

@@ -3,6 +3,7 @@
 //! This is core: text in, values or errors out. Reading the file and reporting errors is `app`'s. Angles are degrees
 //! here, as people write them; each section converts where it is used.
 
+mod camera;
 mod check;
 mod daemon;
 mod link;
@@ -11,7 +12,7 @@ mod store;
 mod video;
 
 pub use check::ConfigError;
-pub use daemon::{DaemonConfig, GoingLine, Part, PowerConfig};
+pub use daemon::{DaemonConfig, Part, PowerConfig};
 pub use link::{AUTOPILOT, LandingFrame, LinkConfig, MavlinkConfig, MavlinkMessage};
 pub use log::{LogConfig, LogFormat, LogLevel};
 pub use store::{FramePolicy, StoreConfig};

@@ -103,8 +103,14 @@ pub enum NoteKind {
     FrameDamaged,
     /// The device delivers another format than requested, which is supported.
     FormatDiffers,
-    /// The driver counted frames that it did not deliver.
+    /// The driver, or the line that triggers the camera, counted frames that did not come.
     FramesMissed,
+    /// Exposure or gain were set as configured.
+    ExposureSet,
+    /// Exposure or gain could not be set as configured.
+    ExposureNotSet,
+    /// Frames arrive, and no pulses of the trigger.
+    TriggerSilent,
     /// A receiver accepted its configuration.
     Configured,
     /// A receiver refused or ignored its configuration.

@@ -25,5 +25,6 @@ pub mod segment_files;
 pub mod serial;
 pub mod store;
 pub mod terrain;
+pub mod trigger_line;
 pub mod mavlink;
 pub mod video;

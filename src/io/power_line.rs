@@ -10,7 +10,7 @@ use tokio::io::Interest;
 use super::device::{
     Backoff, Fault, FaultKind, OwnsDescriptor, Report, Reports, blocking, register, wait_for,
 };
-use crate::config::GoingLine;
+use windhover_base::settings::GpioLine;
 
 /// Reading period for a line whose controller raises no interrupts.
 const READING: Duration = Duration::from_secs(1);
@@ -27,7 +27,7 @@ enum Requested {
 unsafe impl OwnsDescriptor for Request {}
 
 /// Watches the line without end; `active` gets its level whenever it may have changed, and `false` where it is lost.
-pub async fn run(line: &GoingLine, reports: Reports<'_>, active: &(dyn Fn(bool) + Sync)) -> Infallible {
+pub async fn run(line: &GpioLine, reports: Reports<'_>, active: &(dyn Fn(bool) + Sync)) -> Infallible {
     let mut backoff = Backoff::new();
     loop {
         let asked = line.clone();
@@ -48,7 +48,7 @@ pub async fn run(line: &GoingLine, reports: Reports<'_>, active: &(dyn Fn(bool) 
 }
 
 async fn watch(
-    line: &GoingLine,
+    line: &GpioLine,
     requested: Requested,
     reports: Reports<'_>,
     active: &(dyn Fn(bool) + Sync),
@@ -80,7 +80,7 @@ async fn watch(
     }
 }
 
-fn request(line: &GoingLine) -> Result<Requested, Fault> {
+fn request(line: &GpioLine) -> Result<Requested, Fault> {
     // The library has one error for all causes; the system call distinguishes a missing chip from a forbidden one.
     std::fs::File::open(&line.chip).map_err(|error| Fault::from_io(&line.chip, &error))?;
     let mut builder = Request::builder();
@@ -94,9 +94,8 @@ fn request(line: &GoingLine) -> Result<Requested, Fault> {
     builder.request().map(Requested::Level).map_err(|error| fault(line, &error))
 }
 
-fn fault(line: &GoingLine, error: &gpiocdev::Error) -> Fault {
-    let device = format!("{} line {}", line.chip, line.line);
-    Fault::new(FaultKind::Unsuitable, &device, error.to_string())
+fn fault(line: &GpioLine, error: &gpiocdev::Error) -> Fault {
+    Fault::new(FaultKind::Unsuitable, &line.to_string(), error.to_string())
 }
 
 #[cfg(test)]
@@ -104,7 +103,7 @@ mod tests {
     use super::*;
 
     fn kind(chip: &str) -> Option<FaultKind> {
-        let line = GoingLine { chip: chip.into(), line: 3, active_low: true };
+        let line = GpioLine { chip: chip.into(), line: 3, active_low: true };
         request(&line).err().map(|fault| fault.kind)
     }
 

@@ -120,6 +120,43 @@ fn a_dead_camera_ends_what_is_told() {
     assert_eq!(told(6.1, 9.0), 0);
 }
 
+/// An autopilot that restarts in flight, on a line that it shares with another helicopter's, half a kilometre away.
+#[test]
+fn an_autopilot_that_restarts_is_followed_and_another_one_changes_nothing() {
+    let settings = LoopSettings {
+        reboots_s: Some(7.0),
+        another_m: Some(Vector3::new(300.0, -400.0, 30.0)),
+        threads: 2,
+        ..LoopSettings::default()
+    };
+    let moments = fly(quick(11.0), 7, listening, settings);
+    let score = scored("restarted", &moments, 6.0);
+    assert!(score.told >= 48 && score.follow_rms_m < 0.4 && score.velocity_rms_mps < 0.15, "{score:?}");
+    // Within two seconds its new clock is known by an exchange.
+    let off = |m: &Moment| Some((m.told?.stamp.s() - (m.t_s - 7.0)).abs());
+    let worst = moments.iter().filter(|m| m.t_s > 9.0).filter_map(off).fold(0.0, f64::max);
+    assert!(worst <= 1e-3, "stamps are off by {worst} s");
+}
+
+/// Over ground without features only receiver and compass show that it is the vehicle that moves.
+#[test]
+fn a_vehicle_that_drives_off_over_bare_ground_is_followed() {
+    let mut scenario = quick(16.0);
+    scenario.vehicles[0].speed = SpeedPlan::FromRest { rest_s: 10.0, speed_mps: 1.5 };
+    let bare = |config: &mut Config| config.detector.ground_features = 0;
+    let moments = fly(scenario, 8, bare, LoopSettings { threads: 2, ..LoopSettings::default() });
+    let wrong = |m: &Moment| Some((m.told?.velocity_mps.norm() - m.vehicle.speed_mps.abs()).abs());
+    let worst = |from_s: f64, to_s: f64| {
+        let within = moments.iter().filter(|m| (from_s..to_s).contains(&m.t_s));
+        within.filter_map(wrong).fold(0.0, f64::max)
+    };
+    let score = scored("driven off", &moments, 6.0);
+    // The velocity follows with a delay of a second, and is less exact while the helicopter tilts to catch up.
+    assert!(worst(8.0, 10.0) < 0.15, "{} m/s at rest", worst(8.0, 10.0));
+    assert!(worst(11.5, 16.0) < 0.7, "{} m/s after a second and a half", worst(11.5, 16.0));
+    assert!(score.follow_max_m < 1.5, "{score:?}");
+}
+
 /// Tags covered for 8 s and for 40 s.
 #[test]
 #[ignore = "a minute"]

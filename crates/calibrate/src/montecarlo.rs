@@ -294,6 +294,10 @@ mod tests {
             pixel_format: PixelFormat::Grey,
             exposure_offset_ms: 0.0,
             readout_ms: 0.0,
+            exposure_us: None,
+            auto_max_us: None,
+            gain: None,
+            trigger_line: None,
             intrinsics,
             mount: CameraMount::default(),
         };

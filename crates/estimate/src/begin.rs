@@ -103,18 +103,19 @@ impl Core {
     /// Fuses what a new prior was guessed from: the first marker as it is, the others through the gate, since one that
     /// was found elsewhere than it is would bend the helicopter's attitude to make the two agree.
     fn fuse_first(&mut self, index: usize, markers: &[MarkerDetection]) {
-        let mut gated = false;
+        let mut first = None;
         for detection in markers {
             if let Some((target, marker)) = self.models.find(detection.marker)
                 && target == index
             {
-                if gated {
+                if let Some(first) = first {
+                    self.judge_size(index, first, detection);
                     let inside = self.fuse_marker(index, marker, detection, true);
                     self.judge_tag(index, marker, inside);
                 } else {
                     self.fuse_first_marker(index, marker, detection);
                 }
-                gated = true;
+                first = first.or(Some(detection));
             }
         }
     }

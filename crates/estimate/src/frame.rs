@@ -58,13 +58,18 @@ impl Core {
     fn fuse_seen(&mut self, index: usize, markers: &[MarkerDetection]) {
         let before = self.before_fusion(index);
         let mut accepted = false;
+        let mut first = None;
         for detection in markers {
             if let Some((target, marker)) = self.models.find(detection.marker)
                 && target == index
             {
                 let beside = accepted;
+                if let Some(first) = first {
+                    self.judge_size(index, first, detection);
+                }
                 let inside = self.fuse_marker(index, marker, detection, beside);
                 accepted |= inside;
+                first = first.or(inside.then_some(detection));
                 // Where none of them is inside it is the vehicle that is elsewhere.
                 if beside {
                     self.judge_tag(index, marker, inside);

@@ -39,6 +39,7 @@ mod resume;
 mod senses;
 mod shape;
 mod shutter;
+mod size_test;
 mod slip;
 mod sources;
 mod spin;

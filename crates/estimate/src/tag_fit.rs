@@ -20,6 +20,7 @@ use super::core::Core;
 use super::matrix::Shear;
 use super::measurement::Measurement;
 use super::models::Marker;
+use super::size_test::SizeTest;
 use super::state::State;
 use super::update::Outcome;
 
@@ -45,6 +46,9 @@ pub(crate) struct TagFit {
     contradicted: u32,
     /// Whether it was opened by itself, and with all others along scale and turn.
     open: bool,
+    /// Its size beside that of the first tag of its frame, and whether it alone was opened by that.
+    pub(crate) size: SizeTest,
+    size_open: bool,
     scale_open: bool,
     turn_open: bool,
 }
@@ -53,6 +57,11 @@ impl TagFit {
     /// Whether size, place and turn of its own are open.
     pub(crate) fn is_open(&self) -> bool {
         self.open
+    }
+
+    /// Whether it is thought to be otherwise than configured.
+    pub(crate) fn differs(&self) -> bool {
+        self.open || self.size_open
     }
 }
 
@@ -136,6 +145,24 @@ impl Core {
         self.open_turn(target);
     }
 
+    /// Opens the sizes of two tags that contradict each other. By the first of them everything else is scaled: if it is the
+    /// wrong one, all of this is larger but the vehicle. Where the tags lie on it tells which.
+    pub(crate) fn open_sizes(&mut self, target: usize, first: usize, second: usize) {
+        let size = |slot: usize| self.state.layout().tag(slot).all().part::<1>(0);
+        let (of_first, of_second) = (size(first), size(second));
+        let mut along = std::mem::take(&mut self.along);
+        if self.scale_direction(target, &mut along).is_some() {
+            for marker in self.models.targets[target].markers.iter().filter_map(|marker| marker.fit) {
+                along[self.state.layout().tag(marker).all().range()].fill(0.0);
+            }
+            along[of_first.column(0)] = 1.0;
+            self.state.add_direction(&along, OTHERWISE[0]);
+            self.state.cov.add_diagonal(of_second, &[OTHERWISE[0] * OTHERWISE[0]]);
+            [first, second].iter().for_each(|slot| self.state.tags[*slot].size_open = true);
+        }
+        self.along = along;
+    }
+
     /// A velocity of the receiver was compared with what is seen.
     pub(crate) fn judge_scale(&mut self, outcome: &Outcome) {
         let velocity = self.state.own.velocity;
@@ -163,7 +190,7 @@ impl Core {
             self.state.add_direction(&along, SCALE_SIGMA);
             slots().for_each(|slot| self.state.tags[slot].scale_open = true);
             let size = |slot: usize| self.state.layout().tag(slot).all().column(0);
-            let reference = slots().min_by_key(|slot| self.state.tags[*slot].open);
+            let reference = slots().min_by_key(|slot| self.state.tags[*slot].differs());
             self.state.scale = self.state.scale.or(reference.map(|slot| Scale { column: size(slot), share }));
         }
         self.along = along;
@@ -234,8 +261,12 @@ impl Core {
             model.markers.iter().enumerate().map(move |(marker, m)| (target, marker, m))
         });
         all.filter_map(|(target, marker, model)| {
-            let opened = model.fit.is_some_and(|slot| self.state.tags[slot].open);
+            let opened = model.fit.is_some_and(|slot| self.state.tags[slot].differs());
             let (against, reference) = opened.then(|| self.reference(target, marker)).flatten()?;
+            // Of two whose sizes alone were opened only one may be wrong.
+            if self.doubt(model) < self.doubt(reference) {
+                return None;
+            }
             let pair = MarkerPair { target, marker, against };
             Some(self.state.apart(model, reference).map(move |(k, figure)| match k {
                 0 => (FusionSource::Marker, MisfitCause::MarkerSize(pair), figure.exp()),
@@ -246,11 +277,20 @@ impl Core {
         .flatten()
     }
 
-    /// Another tag of the vehicle to measure against: one that was not opened by itself, if there is one.
+    /// Another tag of the vehicle to measure against: the one that is most likely as configured.
     fn reference(&self, target: usize, marker: usize) -> Option<(usize, &Marker)> {
-        let open = |m: &Marker| m.fit.is_none_or(|slot| self.state.tags[slot].open);
         let others = self.models.targets[target].markers.iter().enumerate();
-        others.filter(|(i, m)| *i != marker && m.fit.is_some()).min_by_key(|(_, m)| open(m))
+        let fitted = others.filter(|(i, m)| *i != marker && m.fit.is_some());
+        fitted.min_by(|(_, a), (_, b)| self.doubt(a).total_cmp(&self.doubt(b)))
+    }
+
+    /// How much speaks against a tag being as configured; less where its size alone was opened, with another one's.
+    fn doubt(&self, marker: &Marker) -> f64 {
+        match marker.fit.map(|slot| &self.state.tags[slot]) {
+            Some(tag) if tag.open => 1.0,
+            Some(tag) if tag.size_open => tag.mean[0].abs().min(0.5),
+            _ => 0.0,
+        }
     }
 }
 

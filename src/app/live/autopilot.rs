@@ -9,8 +9,10 @@ use windhover_base::time::{MonoTime, Span};
 use windhover_decode::{MavlinkFrame, MavlinkFrames};
 use windhover_simulate::{FollowTarget, World};
 
-/// System and component id.
-const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
+/// System id of the helicopter's autopilot.
+pub(super) const AUTOPILOT_SYSTEM: u8 = 1;
+/// Component id.
+const COMPONENT: u8 = 1;
 /// How long before the flight it was started.
 const STARTED_BEFORE: Span = Span::from_ns(100_000_000_000);
 /// Standard gravity, m/s².
@@ -19,16 +21,26 @@ const GRAVITY: f64 = 9.806_65;
 /// An autopilot on board of a simulated flight.
 #[derive(Clone, Debug)]
 pub struct SimulatedAutopilot {
+    /// System id.
+    system: u8,
     /// Error of its receiver, north, east, down, metres.
     receiver_m: Vector3<f64>,
+    /// From this time of the flight on its clock counts from there again.
+    reboots: Option<Span>,
     sequence: u8,
     steps: u64,
 }
 
 impl SimulatedAutopilot {
-    /// An autopilot whose receiver has this error.
-    pub fn new(receiver_m: Vector3<f64>) -> Self {
-        Self { receiver_m, sequence: 0, steps: 0 }
+    /// An autopilot of this system whose receiver has this error.
+    pub fn new(system: u8, receiver_m: Vector3<f64>) -> Self {
+        Self { system, receiver_m, reboots: None, sequence: 0, steps: 0 }
+    }
+
+    /// The same, which restarts at this time of the flight, seconds.
+    #[must_use]
+    pub fn rebooting(self, at_s: Option<f64>) -> Self {
+        Self { reboots: at_s.map(Span::from_s), ..self }
     }
 
     /// The helicopter's position in its estimate, north, east, down of the world's origin, metres; velocity, m/s.
@@ -38,8 +50,12 @@ impl SimulatedAutopilot {
     }
 
     /// Time since its start.
-    fn boot(world: &World, t: MonoTime) -> Span {
-        (t - world.time(0.0)) + STARTED_BEFORE
+    fn boot(&self, world: &World, t: MonoTime) -> Span {
+        let flown = t - world.time(0.0);
+        match self.reboots {
+            Some(reboots) if flown >= reboots => flown - reboots,
+            _ => flown + STARTED_BEFORE,
+        }
     }
 
     /// What it sends in a step of [`World::STEP`] that ends at `t`: attitude at 25 Hz, rates and forces at 50 Hz, its
@@ -48,7 +64,7 @@ impl SimulatedAutopilot {
         let step = self.steps;
         self.steps += 1;
         let due = |every_ms: u64| step.is_multiple_of(every_ms / 5);
-        let boot = Self::boot(world, t);
+        let boot = self.boot(world, t);
         let time_boot_ms = (boot.ns() / 1_000_000) as u32;
         let own = world.ownship(t);
         let rates = own.body_rate_radps;
@@ -99,7 +115,7 @@ impl SimulatedAutopilot {
         let place = world.frame().geodetic(&position);
         let v = velocity.map(|x| (x * 100.0).round() as i16);
         MavMessage::GLOBAL_POSITION_INT(GLOBAL_POSITION_INT_DATA {
-            time_boot_ms: (Self::boot(world, t).ns() / 1_000_000) as u32,
+            time_boot_ms: (self.boot(world, t).ns() / 1_000_000) as u32,
             lat: (place.lat_deg * 1e7).round() as i32,
             lon: (place.lon_deg * 1e7).round() as i32,
             alt: ((place.height_m - world.scenario().geoid_m) * 1e3).round() as i32,
@@ -117,7 +133,7 @@ impl SimulatedAutopilot {
         let place = world.frame().geodetic(&position);
         let course = velocity.y.atan2(velocity.x).to_degrees().rem_euclid(360.0);
         MavMessage::GPS_RAW_INT(GPS_RAW_INT_DATA {
-            time_usec: (Self::boot(world, t).ns() / 1_000) as u64,
+            time_usec: (self.boot(world, t).ns() / 1_000) as u64,
             fix_type: GpsFixType::GPS_FIX_TYPE_3D_FIX,
             lat: (place.lat_deg * 1e7).round() as i32,
             lon: (place.lon_deg * 1e7).round() as i32,
@@ -139,7 +155,7 @@ impl SimulatedAutopilot {
         if let MavMessage::TIMESYNC(sync) = &frame.message
             && sync.tc1 == 0
         {
-            let tc1 = Self::boot(world, t).ns();
+            let tc1 = self.boot(world, t).ns();
             self.put(
                 &MavMessage::TIMESYNC(TIMESYNC_DATA { tc1, ts1: sync.ts1, ..TIMESYNC_DATA::DEFAULT }),
                 out,
@@ -148,7 +164,8 @@ impl SimulatedAutopilot {
     }
 
     fn put(&mut self, message: &MavMessage, out: &mut Vec<u8>) {
-        out.extend(packet::encode(self.sequence, AUTOPILOT, message, None));
+        let sender = Sender { system: self.system, component: COMPONENT };
+        out.extend(packet::encode(self.sequence, sender, message, None));
         self.sequence = self.sequence.wrapping_add(1);
     }
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use nalgebra::Vector3;
 
-use super::autopilot::{SimulatedAutopilot, follow_target};
+use super::autopilot::{AUTOPILOT_SYSTEM, SimulatedAutopilot, follow_target};
 use crate::config::Config;
 use crate::io::mavlink::MavlinkEncoder;
 use crate::io::mavlink::companion::Companion;
@@ -31,6 +31,10 @@ pub struct LoopSettings {
     pub truth: bool,
     /// No frame comes after this time, seconds.
     pub camera_dies_s: Option<f64>,
+    /// The autopilot restarts at this time, seconds.
+    pub reboots_s: Option<f64>,
+    /// On the same line is the autopilot of another helicopter, this far away: north, east, down, metres.
+    pub another_m: Option<Vector3<f64>>,
     /// Threads that render.
     pub threads: usize,
 }
@@ -55,6 +59,7 @@ pub struct ClosedLoop {
     encoder: MavlinkEncoder,
     companion: Companion,
     autopilot: SimulatedAutopilot,
+    another: Option<SimulatedAutopilot>,
     follower: Follower,
     settings: LoopSettings,
     heard: bool,
@@ -95,7 +100,9 @@ impl ClosedLoop {
                 None,
             ),
             companion: Companion::new(None, true),
-            autopilot: SimulatedAutopilot::new(settings.receiver_m),
+            autopilot: SimulatedAutopilot::new(AUTOPILOT_SYSTEM, settings.receiver_m)
+                .rebooting(settings.reboots_s),
+            another: settings.another_m.map(|away_m| SimulatedAutopilot::new(AUTOPILOT_SYSTEM + 1, away_m)),
             follower: Follower::new(tuning),
             settings,
             heard: config.autopilot.is_some(),
@@ -138,6 +145,9 @@ impl ClosedLoop {
     fn hear_autopilot(&mut self, world: &World, t: MonoTime, events: &mut Vec<Event>) {
         let mut bytes = Vec::new();
         self.autopilot.says(world, t, &mut bytes);
+        if let Some(another) = &mut self.another {
+            another.says(world, t, &mut bytes);
+        }
         if t >= self.next_second {
             self.next_second += Span::from_s(1.0);
             let mut asked = Vec::new();

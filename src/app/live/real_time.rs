@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use nalgebra::Vector3;
 
-use super::autopilot::{SimulatedAutopilot, follow_target};
+use super::autopilot::{AUTOPILOT_SYSTEM, SimulatedAutopilot, follow_target};
 use super::devices::{FrameRenderer, FrameSocket, PtyLine};
 use super::score::Score;
 use super::{Moment, closed_loop::LoopSettings};
@@ -137,7 +137,7 @@ impl LiveFlight {
             FrameRenderer::open(drawing, frames, clock, settings.threads.max(1)).map_err(io(&socket))?;
         Ok(Self {
             flight: ClosedFlight::new(Arc::clone(&world), settings.lateness, 0),
-            autopilot: SimulatedAutopilot::new(settings.receiver_m),
+            autopilot: SimulatedAutopilot::new(AUTOPILOT_SYSTEM, settings.receiver_m),
             world,
             clock,
             flown,

@@ -22,6 +22,9 @@ pub struct Score {
     /// Correlation of that error with the helicopter's own acceleration through its tilt; the larger of north and east
     /// by size.
     pub correlation: f64,
+    /// By how much the positions in the messages are late, ms: their error regressed on the vehicle's velocity, both
+    /// less their means.
+    pub lag_ms: f64,
     /// Highest speed of the helicopter, m/s.
     pub speed_max_mps: f64,
     /// Number of messages.
@@ -59,10 +62,28 @@ impl Score {
                 .map(|axis| correlation(errors.iter().map(|e| e[axis]), tilts.iter().map(|t| t[axis])))
                 .into_iter()
                 .fold(0.0, |a: f64, b| if b.abs() > a.abs() { b } else { a }),
+            lag_ms: -1e3
+                * slope(moments.iter().filter_map(|m| {
+                    let (s, c) = m.vehicle.heading_rad.sin_cos();
+                    let error = m.told?.position_m.xy() - m.vehicle.origin().xy();
+                    Some((error, Vector2::new(c, s) * m.vehicle.speed_mps))
+                })),
             speed_max_mps: most(&|m| m.own.velocity_ned_mps.norm()),
             told,
         }
     }
+}
+
+/// Slope of the first on the second, both less their means; 0 where the second is constant.
+fn slope(pairs: impl Iterator<Item = (Vector2<f64>, Vector2<f64>)> + Clone) -> f64 {
+    let n = pairs.clone().count().max(1) as f64;
+    let mean = pairs.clone().fold((Vector2::zeros(), Vector2::zeros()), |sum, (a, b)| (sum.0 + a, sum.1 + b));
+    let (mean_a, mean_b) = (mean.0 / n, mean.1 / n);
+    let (ab, bb) = pairs.fold((0.0, 0.0), |(ab, bb), (a, b)| {
+        let (a, b): (Vector2<f64>, Vector2<f64>) = (a - mean_a, b - mean_b);
+        (ab + a.dot(&b), bb + b.norm_squared())
+    });
+    if bb > 0.0 { ab / bb } else { 0.0 }
 }
 
 fn correlation(a: impl Iterator<Item = f64> + Clone, b: impl Iterator<Item = f64> + Clone) -> f64 {

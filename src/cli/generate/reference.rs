@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 
 /// Sources of all types in the configuration.
-const SOURCES: [&str; 16] = [
+const SOURCES: [&str; 17] = [
     include_str!("../../config/mod.rs"),
     include_str!("../../config/daemon.rs"),
     include_str!("../../config/link.rs"),
@@ -13,6 +13,7 @@ const SOURCES: [&str; 16] = [
     include_str!("../../config/store.rs"),
     include_str!("../../config/video.rs"),
     include_str!("../../../crates/base/src/settings/autopilot.rs"),
+    include_str!("../../../crates/base/src/settings/camera.rs"),
     include_str!("../../../crates/base/src/settings/estimator.rs"),
     include_str!("../../../crates/base/src/settings/framing.rs"),
     include_str!("../../../crates/base/src/settings/inertial.rs"),
@@ -117,7 +118,7 @@ fn shown_type(of_type: &str) -> String {
         "bool" => "true, false",
         "SocketAddr" => "address:port",
         "Framing" => "text",
-        "GoingLine" => "table",
+        "GpioLine" => "table",
         name if name.starts_with('[') => "numbers",
         name if name.starts_with(['u', 'i']) => "whole number",
         _ => "one of the values below",

@@ -224,4 +224,26 @@ mod tests {
         assert!(!second.heard(&of(1, &heartbeat()), at(0.0), &mut Vec::new()));
         assert!(second.heard(&of(2, &heartbeat()), at(0.1), &mut Vec::new()));
     }
+
+    #[test]
+    fn one_that_restarts_is_reported_and_asked_for_its_messages_again() {
+        let mut companion = Companion::new(None, true);
+        let time = |boot_ms| {
+            MavMessage::SYSTEM_TIME(SYSTEM_TIME_DATA { time_boot_ms: boot_ms, ..SYSTEM_TIME_DATA::DEFAULT })
+        };
+        let mut requests = Vec::new();
+        companion.heard(&of(3, &heartbeat()), at(0.0), &mut Vec::new());
+        for second in 0..20_u32 {
+            let s = f64::from(second);
+            // After ten seconds it counts from zero.
+            let boot_ms = 1_000 * if second < 10 { 500 + second } else { second - 10 };
+            companion.heard(&of(3, &time(boot_ms)), at(s), &mut Vec::new());
+            let mut said = Vec::new();
+            companion.every_second(at(s + 0.1), &mut said);
+            requests.push(said.len() > 2);
+        }
+        let asked: Vec<usize> = (0..20).filter(|second| requests[*second]).collect();
+        assert_eq!(asked, [0, 12], "at the start, and with the third message that shows it");
+        assert!(companion.notes().iter().any(|note| note.contains("restarted")));
+    }
 }

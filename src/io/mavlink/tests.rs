@@ -11,7 +11,8 @@ use super::*;
 use crate::config::{Config, MavlinkConfig, MavlinkMessage};
 use windhover_base::geo::Geodetic;
 use windhover_base::msg::{
-    AutopilotPosition, EstimatorOutput, Ownship, SensorReading, Stamped, TargetEstimate, TrackStatus,
+    AutopilotPosition, EstimatorOutput, GnssEpoch, Ownship, SensorReading, Stamped, TargetEstimate,
+    TrackStatus,
 };
 
 const START: MonoTime = MonoTime::from_ns(1_000_000_000);
@@ -345,4 +346,35 @@ fn a_ground_station_finds_a_camera_that_tracks() {
     assert!(messages.iter().any(|m| matches!(m, MavMessage::CAMERA_TRACKING_GEO_STATUS(geo)
         if geo.tracking_status == CameraTrackingStatusFlags::CAMERA_TRACKING_STATUS_FLAGS_ACTIVE
             && (geo.dist - (9.0_f32 + 7.5 * 7.5).sqrt()).abs() < 1e-3)));
+}
+
+#[test]
+fn signatures_never_go_back_when_the_receivers_time_does() {
+    let key = SigningKey([7; 32]);
+    let config = Config::parse(include_str!("../../../config/windhover.toml")).expect("valid");
+    let mut encoder = MavlinkEncoder::new(
+        &config.mavlink,
+        &config.target,
+        &config.ground,
+        &config.camera,
+        Some(key.clone()),
+    );
+    let mut stamps = Vec::new();
+    for (s, utc_s) in [(0.0, 1_700_000_000), (1.0, 1_700_003_601), (2.0, 1_700_000_002), (3.0, 1_699_000_000)]
+    {
+        let t = START + Span::from_s(s);
+        let value =
+            GnssEpoch { utc: Some(UtcTime::from_unix_ns(utc_s * 1_000_000_000)), ..GnssEpoch::default() };
+        encoder.output(&Output::Reading(SensorReading::Gnss(Stamped {
+            t_valid: t,
+            t_recv: t,
+            seq: 0,
+            value,
+        })));
+        let mut frames = Vec::new();
+        encoder.tell(t, &mut frames);
+        assert!(!frames.is_empty());
+        stamps.extend(frames.iter().map(|frame| packet::verify(frame, &key).expect("signed").2));
+    }
+    assert!(stamps.is_sorted_by(|a, b| a < b), "{stamps:?}");
 }

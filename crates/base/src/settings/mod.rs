@@ -4,8 +4,10 @@
 //! configuration is read.
 
 mod autopilot;
+mod camera;
 mod estimator;
 mod framing;
+mod gpio;
 mod inertial;
 mod montecarlo;
 mod rig;
@@ -13,13 +15,15 @@ mod sensors;
 mod target;
 
 pub use autopilot::{AutopilotConfig, AutopilotUse};
+pub use camera::{CameraConfig, CameraMount, PixelFormat};
 pub use estimator::{DetectorConfig, EstimatorConfig};
 pub use framing::{Framing, Parity};
+pub use gpio::GpioLine;
 pub use inertial::{AttitudeConfig, ImuConfig};
 pub use montecarlo::{Distribution, MonteCarloConfig};
 pub use rig::{Rig, shares_line};
 pub use sensors::{
-    CameraConfig, CameraMount, CompassConfig, CompassFormat, Datum, Declination, GpsConfig, GpsFormat,
-    GroundConfig, GroundSource, PixelFormat, TiltKind,
+    CompassConfig, CompassFormat, Datum, Declination, GpsConfig, GpsFormat, GroundConfig, GroundSource,
+    TiltKind,
 };
 pub use target::{Brightness, MarkerConfig, MarkerKind, TargetConfig, TargetModel};

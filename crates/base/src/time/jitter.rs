@@ -21,6 +21,8 @@ const TICK_NOISE_PART: f64 = 1.0 / 16.0;
 const NOISE_PARTS: [f64; 2] = [1.0 / 16.0, 0.2];
 /// Least normal noise, milliseconds: the time to stamp a read.
 const NOISE_MIN_MS: f64 = 0.1;
+/// Points whose densities are multiplied before a logarithm is taken.
+const PRODUCT: usize = 8;
 /// Share of arrivals that are independent of the jitter, and their density over a second.
 const WILD_PART: f64 = 0.01;
 const WILD_DENSITY: f64 = WILD_PART / 1_000.0;
@@ -29,12 +31,17 @@ const WILD_DENSITY: f64 = WILD_PART / 1_000.0;
 const WILD_EARLY: f64 = 1e-4;
 /// Prior log-odds of symmetric against one-sided jitter: operating systems and receivers are late, not early.
 const LOG_SYMMETRIC: f64 = -3.0;
-/// Most Newton steps; from the previous line two or three are enough.
+/// Most Newton steps; from the previous line one is enough.
 const STEPS_MAX: usize = 30;
+/// A step shorter than this share of the normal noise is the last one. A line through a hundred points is known to a
+/// tenth of that noise, and what is left after such a step is of the order of its square.
+const STEP_LAST: f64 = 0.05;
 /// Candidates whose log-weight is below the largest by more than this are rarely fitted.
 const LOG_WEIGHT_FAINT: f64 = -25.0;
-/// Period, in fits, with which all candidates are fitted.
-const FULL_EVERY: u32 = 16;
+/// They are fitted again after so many fits, and no more than these in one fit: all of them together would take a
+/// millisecond of one arrival's time.
+const FAINT_EVERY: u32 = 16;
+const FAINT_PER_FIT: usize = 3;
 
 /// Shape of the jitter, milliseconds.
 #[derive(Clone, Copy, Debug)]
@@ -45,6 +52,8 @@ struct Shape {
     tau: f64,
     /// Width of the uniform part, up to a tick; 0 for none.
     width: f64,
+    /// Factor of the density: 1/(σ√2π), exp(σ²/2τ²)/τ or 1/width.
+    scale: f64,
 }
 
 /// One candidate shape with its fitted line.
@@ -56,7 +65,8 @@ struct Candidate {
     /// Covariance of (value, slope): var, cov, var.
     covariance: [f64; 3],
     log_weight: f64,
-    fitted: bool,
+    /// Number of the fit in which it was fitted last; 0 for never.
+    fits: u32,
 }
 
 /// The fit over all candidate shapes.
@@ -67,6 +77,7 @@ pub(super) struct JitterFit {
     /// Density of outliers before the line.
     wild_early: f64,
     t_mean: f64,
+    /// Number of fits.
     fits: u32,
 }
 
@@ -82,17 +93,13 @@ impl JitterFit {
     }
 
     fn of_shapes(slope_sigma: f64, with_ticks: bool) -> Self {
-        let symmetric = SIZES_MS.iter().map(|&sigma| Shape { sigma, tau: 0.0, width: 0.0 });
+        let symmetric = SIZES_MS.iter().map(|&sigma| Shape::new(sigma, 0.0, 0.0));
         let one_sided = SIZES_MS.iter().flat_map(|&tau| {
-            NOISE_PARTS.iter().map(move |part| Shape {
-                sigma: (tau * part).max(NOISE_MIN_MS),
-                tau,
-                width: 0.0,
-            })
+            NOISE_PARTS.iter().map(move |part| Shape::new((tau * part).max(NOISE_MIN_MS), tau, 0.0))
         });
         let ticks = (0..if with_ticks { TICKS } else { 0 }).map(|n| {
             let width = (f64::from(n) * 0.5).exp2();
-            Shape { sigma: width * TICK_NOISE_PART, tau: 0.0, width }
+            Shape::new(width * TICK_NOISE_PART, 0.0, width)
         });
         let candidates = symmetric
             .chain(one_sided)
@@ -102,7 +109,7 @@ impl JitterFit {
                 line: (0.0, 0.0),
                 covariance: [0.0; 3],
                 log_weight: 0.0,
-                fitted: false,
+                fits: 0,
             })
             .collect();
         let wild_early = WILD_DENSITY * if with_ticks { WILD_EARLY } else { 1.0 };
@@ -119,18 +126,23 @@ impl JitterFit {
         let x_mean = points.iter().map(|p| p.1).sum::<f64>() / count;
         let moved = t_mean - self.t_mean;
         self.t_mean = t_mean;
-        let all = self.fits.is_multiple_of(FULL_EVERY);
         self.fits = self.fits.wrapping_add(1);
+        let mut faint = 0;
         for candidate in &mut self.candidates {
-            if candidate.fitted {
-                candidate.line.0 += candidate.line.1 * moved;
-                if !all && candidate.log_weight == f64::NEG_INFINITY {
-                    continue;
-                }
-            } else {
+            if candidate.fits == 0 {
                 candidate.line = (x_mean - candidate.shape.late(), 0.0);
+            } else {
+                candidate.line.0 += candidate.line.1 * moved;
+                if candidate.log_weight == f64::NEG_INFINITY {
+                    let due = self.fits.wrapping_sub(candidate.fits) >= FAINT_EVERY && faint < FAINT_PER_FIT;
+                    faint += usize::from(due);
+                    if !due {
+                        continue;
+                    }
+                }
             }
             candidate.maximise(points, t_mean, (self.slope_sigma, self.wild_early));
+            candidate.fits = self.fits;
         }
         let heaviest = self.candidates.iter().map(|c| c.log_weight).fold(f64::NEG_INFINITY, f64::max);
         for candidate in &mut self.candidates {
@@ -163,7 +175,7 @@ impl JitterFit {
 
     fn weighted(&self, of: impl Fn(&Candidate) -> f64) -> f64 {
         let (mut sum, mut weights) = (0.0, 0.0);
-        for candidate in self.candidates.iter().filter(|candidate| candidate.fitted) {
+        for candidate in self.candidates.iter().filter(|candidate| candidate.fits > 0) {
             let weight = candidate.log_weight.exp();
             sum += weight * of(candidate);
             weights += weight;
@@ -180,16 +192,30 @@ struct Quadratic {
     curvature: [f64; 3],
 }
 
+impl Quadratic {
+    /// To the maximum of this quadratic.
+    fn step(&self) -> (f64, f64) {
+        let [aa, ab, bb] = self.curvature;
+        let det = aa * bb - ab * ab;
+        let [ga, gb] = self.gradient;
+        ((bb * ga - ab * gb) / det, (aa * gb - ab * ga) / det)
+    }
+}
+
 impl Candidate {
     fn maximise(&mut self, points: &[Point], t_mean: f64, beliefs: (f64, f64)) {
         let reach = 4.0 * (self.shape.sigma + self.shape.late());
+        let half_s = 0.5 * (points[points.len() - 1].0 - points[0].0);
         let mut line = self.line;
         let mut here = self.quadratic(points, t_mean, beliefs, line);
         for _ in 0..STEPS_MAX {
-            let [aa, ab, bb] = here.curvature;
-            let det = aa * bb - ab * ab;
-            let [ga, gb] = here.gradient;
-            let mut step = ((bb * ga - ab * gb) / det, (aa * gb - ab * ga) / det);
+            let mut step = here.step();
+            if step.0.abs() + step.1.abs() * half_s < STEP_LAST * self.shape.sigma {
+                // So near to the maximum the function is its own quadratic.
+                line = (line.0 + step.0, line.1 + step.1);
+                here.log += 0.5 * (here.gradient[0] * step.0 + here.gradient[1] * step.1);
+                break;
+            }
             let long = (step.0.abs() / reach).max(1.0);
             step = (step.0 / long, step.1 / long);
             let mut better = None;
@@ -206,9 +232,6 @@ impl Candidate {
                 break;
             };
             (line, here) = (next, there);
-            if step.0.abs() < 1e-3 * self.shape.sigma {
-                break;
-            }
         }
         let [aa, ab, bb] = here.curvature;
         let det = aa * bb - ab * ab;
@@ -216,7 +239,6 @@ impl Candidate {
         self.covariance = [bb / det, -ab / det, aa / det];
         let belief = if self.shape.late() == 0.0 { LOG_SYMMETRIC } else { 0.0 };
         self.log_weight = here.log - 0.5 * det.ln() + belief;
-        self.fitted = true;
     }
 
     fn quadratic(
@@ -234,70 +256,87 @@ impl Candidate {
             // the edges of a tick).
             curvature: [if self.shape.width > 0.0 { self.shape.width.powi(-2) } else { 1e-9 }, 0.0, prior],
         };
-        for &(t, x) in points {
-            let dt = t - t_mean;
-            let off = x - line.0 - line.1 * dt;
-            let (log, slope, bend) = self.shape.log_density(off);
-            // In addition to the jitter, a few arrivals may be anywhere; the weight of a point is its probability of
-            // not being one of these.
-            let density = (1.0 - WILD_PART) * log.exp();
-            let mixed = density + if off < 0.0 { wild_early } else { WILD_DENSITY };
-            let trust = density / mixed;
-            let (slope, bend) = (trust * slope, trust * bend);
-            sum.log += mixed.ln();
-            sum.gradient[0] -= slope;
-            sum.gradient[1] -= slope * dt;
-            sum.curvature[0] -= bend;
-            sum.curvature[1] -= bend * dt;
-            sum.curvature[2] -= bend * dt * dt;
+        for some in points.chunks(PRODUCT) {
+            // One logarithm of a product for some points: each factor is at least the density of outliers.
+            let mut product = 1.0;
+            for &(t, x) in some {
+                let dt = t - t_mean;
+                let off = x - line.0 - line.1 * dt;
+                let (density, slope, bend) = self.shape.density(off);
+                // In addition to the jitter, a few arrivals may be anywhere; the weight of a point is its probability of
+                // not being one of these.
+                let density = (1.0 - WILD_PART) * density;
+                let mixed = density + if off < 0.0 { wild_early } else { WILD_DENSITY };
+                let trust = density / mixed;
+                let (slope, bend) = (trust * slope, trust * bend);
+                product *= mixed;
+                sum.gradient[0] -= slope;
+                sum.gradient[1] -= slope * dt;
+                sum.curvature[0] -= bend;
+                sum.curvature[1] -= bend * dt;
+                sum.curvature[2] -= bend * dt * dt;
+            }
+            sum.log += product.ln();
         }
         sum
     }
 }
 
 impl Shape {
+    fn new(sigma: f64, tau: f64, width: f64) -> Self {
+        let scale = if width > 0.0 {
+            1.0 / width
+        } else if tau > 0.0 {
+            (0.5 * (sigma / tau).powi(2)).exp() / tau
+        } else {
+            1.0 / (sigma * SQRT_2PI)
+        };
+        Self { sigma, tau, width, scale }
+    }
+
     /// Mean lateness.
     fn late(self) -> f64 {
         self.tau + 0.5 * self.width
     }
 
-    /// Log-density of the jitter `u` with its first and second derivative.
+    /// Density of the jitter `u`, with the first and second derivative of its logarithm.
     ///
-    /// One-sided: ln f = −ln τ + s²/2τ² − u/τ + ln Φ(z), z = u/s − s/τ.
-    /// Up to a tick: ln f = −ln w + ln Φ(z), z of the nearer edge, u/s or (w − u)/s.
-    fn log_density(self, u: f64) -> (f64, f64, f64) {
-        let Self { sigma, tau, width } = self;
+    /// One-sided: f = exp(s²/2τ² − u/τ) Φ(z) / τ, z = u/s − s/τ.
+    /// Up to a tick: f = Φ(z) / w, z of the nearer edge, u/s or (w − u)/s.
+    fn density(self, u: f64) -> (f64, f64, f64) {
+        let Self { sigma, tau, width, scale } = self;
         if width > 0.0 {
             let (inside, sign) = if u < 0.5 * width { (u, 1.0) } else { (width - u, -1.0) };
             let z = inside / sigma;
-            let (log_phi, mills) = log_normal_cdf(z);
-            return (log_phi - width.ln(), sign * mills / sigma, -mills * (z + mills) / (sigma * sigma));
+            let (phi, mills) = normal_cdf(z, 0.0);
+            return (scale * phi, sign * mills / sigma, -mills * (z + mills) / (sigma * sigma));
         }
         if tau == 0.0 {
             let z = u / sigma;
-            return (-0.5 * z * z - sigma.ln() - LN_SQRT_2PI, -z / sigma, -1.0 / (sigma * sigma));
+            return (scale * (-0.5 * z * z).exp(), -z / sigma, -1.0 / (sigma * sigma));
         }
         let z = u / sigma - sigma / tau;
-        let (log_phi, mills) = log_normal_cdf(z);
-        let log = -tau.ln() + 0.5 * (sigma / tau).powi(2) - u / tau + log_phi;
-        (log, mills / sigma - 1.0 / tau, -mills * (z + mills) / (sigma * sigma))
+        let (phi, mills) = normal_cdf(z, -u / tau);
+        (scale * phi, mills / sigma - 1.0 / tau, -mills * (z + mills) / (sigma * sigma))
     }
 }
 
-/// ln √(2π).
-const LN_SQRT_2PI: f64 = 0.918_938_533_204_672_7;
+/// √(2π).
+const SQRT_2PI: f64 = 2.506_628_274_631_000_5;
 
-/// ln Φ(z) and φ(z)/Φ(z) of the normal distribution, for any z.
-fn log_normal_cdf(z: f64) -> (f64, f64) {
+/// exp(e) Φ(z) and φ(z)/Φ(z) of the normal distribution, for any z. The exponent is added to that of Φ, whose product
+/// with exp(e) may be moderate where neither of the two is.
+fn normal_cdf(z: f64, e: f64) -> (f64, f64) {
     let scaled = scaled_erfc(z.abs() * std::f64::consts::FRAC_1_SQRT_2);
-    let gauss = (-0.5 * z * z).exp();
     if z < 0.0 {
         // Φ(z) = ½ exp(−z²/2) erfcx(−z/√2)
         let mills = (2.0 / std::f64::consts::PI).sqrt() / scaled;
-        return ((0.5 * scaled).ln() - 0.5 * z * z, mills);
+        return (0.5 * scaled * (e - 0.5 * z * z).exp(), mills);
     }
+    let gauss = (-0.5 * z * z).exp();
     let phi = 1.0 - 0.5 * gauss * scaled;
-    (phi.ln(), gauss * (-LN_SQRT_2PI).exp() / phi)
+    let raised = if e == 0.0 { 1.0 } else { e.exp() };
+    (raised * phi, gauss / (SQRT_2PI * phi))
 }
 
 /// exp(x²)·erfc(x) for x ≥ 0, to 1.2·10⁻⁷ of its value (Chebyshev fit, Numerical Recipes 6.2).
@@ -325,21 +364,20 @@ mod tests {
     #[test]
     fn normal_tail_is_accurate() {
         // Φ(0) = ½, Φ(1) = 0.841344746, ln Φ(−10) = −53.23128515
-        assert!((log_normal_cdf(0.0).0 - 0.5f64.ln()).abs() < 1e-6);
-        assert!((log_normal_cdf(1.0).0 - 0.841_344_746f64.ln()).abs() < 1e-6);
-        assert!((log_normal_cdf(-10.0).0 + 53.231_285_15).abs() < 1e-5);
-        assert!(log_normal_cdf(-1e4).0.is_finite() && log_normal_cdf(1e4).1 == 0.0);
+        assert!((normal_cdf(0.0, 0.0).0 - 0.5).abs() < 1e-6);
+        assert!((normal_cdf(1.0, 0.0).0 - 0.841_344_746).abs() < 1e-6);
+        assert!((normal_cdf(-10.0, 0.0).0.ln() + 53.231_285_15).abs() < 1e-5);
+        assert!((normal_cdf(-1e3, 5e5).0 - 3.989_42e-4).abs() < 1e-8, "φ(0)/1000");
+        assert!(normal_cdf(-1e4, 0.0).0 == 0.0 && normal_cdf(1e4, 0.0).1 == 0.0);
     }
 
     #[test]
     fn derivatives_agree_with_differences() {
-        let shape = |sigma, tau, width| Shape { sigma, tau, width };
-        for shape in [shape(2.0, 0.0, 0.0), shape(1.0, 8.0, 0.0), shape(1.0, 0.0, 16.0)] {
+        for shape in [Shape::new(2.0, 0.0, 0.0), Shape::new(1.0, 8.0, 0.0), Shape::new(1.0, 0.0, 16.0)] {
             for u in [-5.0, -0.5, 0.0, 1.0, 20.0] {
                 let h = 1e-3;
-                let (below, here, above) =
-                    (shape.log_density(u - h), shape.log_density(u), shape.log_density(u + h));
-                assert!(((above.0 - below.0) / (2.0 * h) - here.1).abs() < 1e-3, "{shape:?} {u}");
+                let (below, here, above) = (shape.density(u - h), shape.density(u), shape.density(u + h));
+                assert!(((above.0.ln() - below.0.ln()) / (2.0 * h) - here.1).abs() < 1e-3, "{shape:?} {u}");
                 assert!(((above.1 - below.1) / (2.0 * h) - here.2).abs() < 1e-3, "{shape:?} {u}");
                 assert!(here.2 <= 0.0, "concave");
             }

@@ -7,5 +7,6 @@ mod honesty;
 mod matrix;
 mod misfit;
 mod ownship;
+mod tags;
 mod time;
 mod vibration;
