@@ -12,7 +12,7 @@ use crate::front::Back;
 use crate::noise::Components;
 use crate::problem::{Origin, Pass, Problem};
 use crate::recording::Recording;
-use crate::result::{Constant, Outlier, Refined, Tally};
+use crate::result::{ClockDifference, Constant, Outlier, Refined, Tally};
 use crate::solve::{EliminatedKind, Factors, Unsolved};
 use crate::stamped::{own_covariance, target_covariance};
 use crate::unknowns::{Prior, constant, knot};
@@ -50,7 +50,10 @@ pub(crate) fn look(
         for (what, e) in factors.segment(index, pass, values, noise)?.iter().rev() {
             back.solve_with_covariance(e);
             match what {
-                EliminatedKind::Constants => looked.refined.constants = constants(problem, values, &back),
+                EliminatedKind::Constants => {
+                    looked.refined.constants = constants(problem, values, &back);
+                    looked.refined.clocks = clocks(problem, values, &back);
+                }
                 // Its frame's displacement is still closed.
                 EliminatedKind::Knot(k) if problem.is_displaced(*k) => {}
                 EliminatedKind::Landmark(_) => {}
@@ -183,6 +186,20 @@ fn constants(problem: &Problem<'_>, values: &Values, back: &Back) -> Vec<Constan
         Constant { kind: prior.kind, value: *value, sigma, prior: prior.mean, prior_sigma: prior.careful }
     };
     problem.priors.iter().zip(&values.constants).enumerate().map(constant).collect()
+}
+
+fn clocks(problem: &Problem<'_>, values: &Values, back: &Back) -> Vec<ClockDifference> {
+    let (camera, at) = (constant::CAMERA_DELAY, problem.shape.constants_at());
+    let others = [constant::COMPASS_DELAY, constant::GPS_DELAY];
+    let estimated = |i: &usize| problem.priors[*i].is_estimated() && problem.priors[camera].is_estimated();
+    let difference = |other: usize| {
+        let [a, b, ab] =
+            [(camera, camera), (other, other), (camera, other)].map(|(i, j)| back.covariance(at + i, at + j));
+        let late_s = values.constants[camera] - values.constants[other];
+        let sigma_s = (a + b - 2.0 * ab).max(0.0).sqrt();
+        ClockDifference { other: problem.priors[other].kind, late_s, sigma_s }
+    };
+    others.into_iter().filter(estimated).map(difference).collect()
 }
 
 fn ownship(

@@ -32,5 +32,5 @@ mod values;
 pub use block::Source;
 pub use recording::{OutsidePosition, Recording, SurveyedMarker};
 pub use refine::{RefineError, refine};
-pub use result::{Constant, Outlier, Refined, Tally};
+pub use result::{ClockDifference, Constant, Outlier, Refined, Tally};
 pub use unknowns::ConstantKind;

@@ -343,6 +343,7 @@ impl Refined {
         felt: Option<FeltTilt>,
         inflation: f64,
     ) {
+        self.clocks.iter_mut().for_each(|clock| clock.sigma_s *= inflation.sqrt());
         for (constant, prior) in self.constants.iter_mut().zip(&problem.priors) {
             if prior.is_estimated() {
                 constant.sigma = (constant.sigma * inflation.sqrt()).min(prior.sigma);

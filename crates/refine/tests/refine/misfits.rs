@@ -63,6 +63,8 @@ fn a_camera_that_is_late_leaves_absolute_time_unknown() {
     assert!(score.nees < MOST_NEES * score.frames, "{score}");
     let delay = refined.constants.iter().find(|c| c.kind == Kind::CameraDelay).expect("estimated");
     assert!((delay.value - 0.04).abs() < 3.0 * delay.sigma && delay.sigma > 0.01, "{delay:?}");
+    let clock = refined.clocks.iter().find(|clock| clock.other == Kind::CompassDelay).expect("estimated");
+    assert!(clock.is_settled() && clock.sigma_s < 0.5 * delay.sigma, "{clock:?}");
 }
 
 /// A rolling shutter that vibrates: frames are displaced row by row, and nothing else is believed to be wrong.
