@@ -6,6 +6,7 @@ mod ground;
 mod honesty;
 mod matrix;
 mod misfit;
+mod misfit_table;
 mod ownship;
 mod tags;
 mod time;

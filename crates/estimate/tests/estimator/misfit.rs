@@ -5,16 +5,14 @@ use nalgebra::{Rotation2, Vector2, Vector3};
 use windhover_base::geo::Ground;
 use windhover_base::msg::{EstimatorOutput, FeatureTrack, MarkerDetection, MisfitCause};
 use windhover_base::settings::{Rig, TargetModel};
-use windhover_simulate::{
-    CameraPose, GroundMisfit, Route, Scenario, SpeedPlan, Stream, World, corners_in_vehicle,
-};
+use windhover_simulate::{CameraPose, Route, Scenario, SpeedPlan, Stream, World, corners_in_vehicle};
 
 use super::filter::{Flight, Input, Score, estimates, fly, score};
 use super::time::{errors, flown};
 use super::vibration::means;
 
 /// Pixels as sharp as rendered ones: what is wrong then shows most.
-fn sharp(scenario: &mut Scenario) {
+pub(super) fn sharp(scenario: &mut Scenario) {
     (scenario.camera.marker_noise_px, scenario.camera.feature_noise_px) = (0.1, 0.1);
 }
 
@@ -75,17 +73,17 @@ pub(super) fn with_movers(
 }
 
 /// The flight through a filter of another configuration.
-fn configured(flight: &Flight, change: impl Fn(&mut Rig), ground: Ground) -> Vec<EstimatorOutput> {
+pub(super) fn configured(flight: &Flight, change: impl Fn(&mut Rig), ground: Ground) -> Vec<EstimatorOutput> {
     let mut rig = flight.rig().clone();
     change(&mut rig);
     flight.outputs_as(&rig, ground)
 }
 
-fn level() -> Ground {
+pub(super) fn level() -> Ground {
     Ground::Flat { down_m: 0.0 }
 }
 
-fn told(out: &[EstimatorOutput]) -> Vec<(MisfitCause, f64)> {
+pub(super) fn told(out: &[EstimatorOutput]) -> Vec<(MisfitCause, f64)> {
     let of = |o: &EstimatorOutput| match o {
         EstimatorOutput::Misfit(misfit) => Some((misfit.cause, misfit.figure)),
         _ => None,
@@ -93,13 +91,13 @@ fn told(out: &[EstimatorOutput]) -> Vec<(MisfitCause, f64)> {
     out.iter().filter_map(of).collect()
 }
 
-fn scored(flight: &Flight, out: &[EstimatorOutput], from_s: f64) -> Score {
+pub(super) fn scored(flight: &Flight, out: &[EstimatorOutput], from_s: f64) -> Score {
     let of: Vec<_> = estimates(out).into_iter().filter(|e| e.target == 0).collect();
     score(&of, &flight.world, from_s)
 }
 
 /// Heading and speed within so many times the twin's, honest, and never without an estimate.
-fn assert_as_good(what: &str, score: &Score, twin: &Score, times: f64) {
+pub(super) fn assert_as_good(what: &str, score: &Score, twin: &Score, times: f64) {
     println!("{what}: {score:?}\n  twin {twin:?}");
     assert!(score.coverage >= 0.99, "{what}: {score:?}");
     assert!(
@@ -110,7 +108,7 @@ fn assert_as_good(what: &str, score: &Score, twin: &Score, times: f64) {
 }
 
 /// Root mean squares over some flights.
-fn over_flights(seeds: std::ops::Range<u64>, one: impl Fn(u64) -> Score) -> Score {
+pub(super) fn over_flights(seeds: std::ops::Range<u64>, one: impl Fn(u64) -> Score) -> Score {
     let all: Vec<Score> = seeds.map(one).collect();
     let mean = |of: fn(&Score) -> f64| all.iter().map(of).sum::<f64>() / all.len() as f64;
     Score {
@@ -232,67 +230,6 @@ fn of_tags_seen_twice_those_of_the_vehicle_are_taken() {
     }
     out = late.outputs();
     assert_as_good("copies", &scored(&late, &out, 11.0), &bare, 1.5);
-}
-
-#[test]
-fn tags_place_the_height_where_the_ground_is_configured_elsewhere() {
-    let flight = fly("follow", 20.0, 6, sharp);
-    let bare = scored(&flight, &flight.outputs(), 6.0);
-    for down_m in [-10.0, -16.0, 10.0, -5.0] {
-        let out = configured(&flight, |_| {}, Ground::Flat { down_m });
-        assert_as_good(&format!("ground {down_m} m down"), &scored(&flight, &out, 6.0), &bare, 1.3);
-        let heights = told(&out).into_iter().filter(|(cause, _)| *cause == MisfitCause::Height);
-        // The receiver's bias is of the difference too.
-        let rise = heights.map(|(_, rise_m)| rise_m).next().expect("it is told");
-        assert!((rise + down_m).abs() < 8.0, "{rise} m of {down_m}");
-    }
-    assert!(told(&configured(&flight, |_| {}, level())).is_empty());
-}
-
-#[test]
-fn tags_that_are_not_as_configured_are_found_out() {
-    let flight = fly("follow", 30.0, 7, sharp);
-    let bare = scored(&flight, &flight.outputs(), 20.0);
-    type Change = fn(&mut Rig);
-    type Told = fn(&MisfitCause, f64) -> bool;
-    let changes: [(&str, Change, Told); 5] = [
-        (
-            "one tag larger",
-            |rig| rig.target[0].marker[1].size_m = Some(0.48 / 1.05),
-            |cause, figure| matches!(cause, MisfitCause::MarkerSize(_)) && (figure - 1.05).abs() < 0.005,
-        ),
-        (
-            "one tag 5 cm off",
-            |rig| rig.target[0].marker[1].position_m[1] += 0.05,
-            |cause, figure| matches!(cause, MisfitCause::MarkerPlace(_)) && (figure - 0.05).abs() < 0.01,
-        ),
-        (
-            "one tag turned",
-            |rig| rig.target[0].marker[1].yaw_deg += 5.0,
-            |cause, figure| {
-                matches!(cause, MisfitCause::MarkerTurn(_)) && (figure.to_degrees() + 5.0).abs() < 0.3
-            },
-        ),
-        (
-            "both tags larger",
-            |rig| rig.target[0].marker.iter_mut().for_each(|m| m.size_m = Some(0.48 / 1.05)),
-            |cause, _| matches!(cause, MisfitCause::MarkerPlace(_) | MisfitCause::MarkerSize(_)),
-        ),
-        (
-            "both tags turned",
-            |rig| rig.target[0].marker.iter_mut().for_each(|m| m.yaw_deg += 5.0),
-            |cause, _| matches!(cause, MisfitCause::MarkerPlace(_)),
-        ),
-    ];
-    for (what, change, expected) in changes {
-        let out = configured(&flight, change, level());
-        let score = scored(&flight, &out, 20.0);
-        println!("{what}: {score:?} twin {bare:?} told {:?}", told(&out).first());
-        assert!(score.coverage >= 0.99 && score.nees < 6.0, "{what}: {score:?}, twin {bare:?}");
-        assert!(score.speed <= 2.0 * bare.speed, "{what}: {score:?}, twin {bare:?}");
-        let last = told(&out).into_iter().rev().take(3).collect::<Vec<_>>();
-        assert!(last.iter().any(|(cause, figure)| expected(cause, *figure)), "{what}: {last:?}");
-    }
 }
 
 #[test]
@@ -425,80 +362,6 @@ fn a_vehicle_that_drives_off_slowly_is_woken() {
         assert!(worst < 0.35 && score.nees < 8.0, "{features} features: {worst} m/s, {score:?}");
     }
 }
-type Deviation = (&'static str, fn(&mut Scenario));
-
-fn deviations() -> Vec<Deviation> {
-    vec![
-        ("nominal", |_| {}),
-        ("people2", |s| s.misfit.company.people = 2),
-        ("people6", |s| s.misfit.company.people = 6),
-        ("convoy", |s| s.misfit.company.convoy = 1),
-        ("doubles", |s| s.misfit.company.doubles = 1),
-        ("size2", |s| s.misfit.markers.size = 0.02),
-        ("size5", |s| s.misfit.markers.size = 0.05),
-        ("one_size5", |s| s.misfit.markers.one_size = 0.05),
-        ("one_off", |s| s.misfit.markers.one_offset_m = [0.05, 0.0]),
-        ("one_turn", |s| s.misfit.markers.one_turn_deg = 5.0),
-        ("turn", |s| s.misfit.markers.turn_deg = 5.0),
-        ("higher20cm", |s| s.misfit.markers.higher_m = 0.2),
-        ("ground10", |s| s.misfit.ground = GroundMisfit::Lower(10.0)),
-        ("slip8", |s| s.misfit.driving.slip_deg = 8.0),
-        ("sway3", |s| {
-            s.misfit.driving.sway_deg = 3.0;
-            s.misfit.driving.bounce_m = 0.05;
-        }),
-        ("spin", |s| s.misfit.driving.spin_radps = 1.0),
-        ("accel", |s| {
-            s.misfit.driving.drive_rate = Some(6.0);
-            s.vehicles[0].speed =
-                SpeedPlan::StopAndGo { speed_mps: 4.0, go_s: 3.0, stop_s: 3.0, reverse_mps: 0.0 };
-        }),
-        ("accel.plan", |s| {
-            s.vehicles[0].speed =
-                SpeedPlan::StopAndGo { speed_mps: 4.0, go_s: 3.0, stop_s: 3.0, reverse_mps: 0.0 };
-        }),
-        ("antenna1m", |s| s.misfit.antenna_m = [1.0, 0.0, 0.0]),
-        ("nodist", |s| s.misfit.distortion = Some([0.0; 5])),
-    ]
-}
-
-/// What the filter tells of a flight, each thing once, with its first figure.
-fn told_once(out: &[EstimatorOutput]) -> Vec<(String, f64)> {
-    let mut once: Vec<(String, f64)> = Vec::new();
-    for (cause, figure) in told(out) {
-        let cause = format!("{cause:?}");
-        if once.iter().all(|(known, _)| *known != cause) {
-            once.push((cause, figure));
-        }
-    }
-    once
-}
-
-/// What deviations cost, and what is told of them: `cargo test --release -p windhover-estimate --test estimator -- --ignored
-/// --nocapture table_of_misfits`.
-#[test]
-#[ignore = "sixty flights take a minute"]
-fn table_of_misfits() {
-    let mut twin: Option<Score> = None;
-    for (what, change) in deviations() {
-        let words = std::cell::RefCell::new(Vec::new());
-        let s = over_flights(40..43, |seed| {
-            let flight = fly("follow", 25.0, seed, |scenario| {
-                sharp(scenario);
-                change(scenario);
-            });
-            let down_m = flight.world.scenario().told_ground_down_m().unwrap_or(0.0);
-            let out = configured(&flight, |_| {}, Ground::Flat { down_m });
-            words.replace(told_once(&out));
-            scored(&flight, &out, 6.0)
-        });
-        let t = twin.get_or_insert(s);
-        let (heading, speed, yaw_rate) = (s.heading / t.heading, s.speed / t.speed, s.yaw_rate / t.yaw_rate);
-        println!("{what:10} {heading:.2} {speed:.2} {yaw_rate:.2} {s:.4?} told {:.3?}", words.borrow());
-        assert!(s.coverage > 0.95, "{what}: {s:?}");
-    }
-}
-
 /// Where no ground is seen beside it, what is seen of a vehicle that drives off could be the helicopter's tilt as well: it
 /// must not be certain that it stands.
 #[test]

@@ -1,5 +1,9 @@
 //! The station's state of each payload, and the messages for its web page.
 
+mod payload;
+#[cfg(test)]
+mod tests;
+
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
@@ -11,11 +15,9 @@ use crate::app::openmetrics::{self, PayloadMetrics};
 use crate::io::link::{Arrival, PayloadStatus};
 use crate::io::proto::{foxglove, host_time, link::Thumbnail, windhover as wh};
 use crate::io::records::topic;
-use crate::text::finite;
-use windhover_base::geo::euler_321;
 use windhover_base::time::{MonoTime, NS_PER_S, Span, UtcTime};
 
-use super::freshness::{CURRENT, PayloadClock, status_at};
+use crate::app::ground::freshness::{CURRENT, PayloadClock, status_at};
 
 /// Estimates kept for pages that are opened later: ten minutes at 15 Hz.
 const TRAIL: usize = 9_000;
@@ -324,124 +326,6 @@ impl View {
     }
 }
 
-impl Payload {
-    fn estimate(&mut self, name: &str, state: wh::TargetState, live: bool) -> Option<Arc<str>> {
-        let t = host_time(state.timestamp.as_ref());
-        if self.targets.len() >= TARGETS && !self.targets.contains_key(&state.target) {
-            return None;
-        }
-        let target = self.targets.entry(state.target.clone()).or_default();
-        let mut message = json!({"k": "est", "p": name, "target": state.target, "t": ms(t),
-            "status": status_name(&state, Span::ZERO), "live": live});
-        if state.known {
-            let figures = json!({"lat": state.lat_deg, "lon": state.lon_deg, "n": state.north_m,
-                "e": state.east_m, "h": state.heading_rad, "v": state.speed_mps,
-                "w": state.yaw_rate_radps, "cov": covariance(&state.covariance)});
-            if let (Value::Object(message), Value::Object(figures)) = (&mut message, figures) {
-                message.extend(figures);
-            }
-        }
-        let text: Arc<str> = message.to_string().into();
-        target.trail.insert(t.ns(), Arc::clone(&text));
-        if target.trail.len() > TRAIL {
-            target.trail.pop_first();
-        }
-        let newer = |old: &Option<wh::TargetState>| {
-            old.as_ref().is_none_or(|old| host_time(old.timestamp.as_ref()) <= t)
-        };
-        if state.known {
-            target.places.insert(t.ns(), (state.lat_deg, state.lon_deg));
-            if target.places.len() > TRAIL {
-                target.places.pop_first();
-            }
-            if newer(&target.known) {
-                target.known = Some(state.clone());
-            }
-        }
-        if newer(&target.latest) {
-            target.latest = Some(state);
-        }
-        Some(text)
-    }
-
-    fn ownship(&mut self, name: &str, own: &wh::Ownship) -> Option<Arc<str>> {
-        let t = host_time(own.timestamp.as_ref());
-        let quaternion = nalgebra::Quaternion::new(own.qw, own.qx, own.qy, own.qz);
-        let attitude = nalgebra::UnitQuaternion::try_new(quaternion, 1e-9)?;
-        let (heading, ..) = euler_321(&attitude.to_rotation_matrix());
-        let text: Arc<str> =
-            json!({"k": "own", "p": name, "t": ms(t), "lat": own.lat_deg, "lon": own.lon_deg,
-            "heading": heading, "above": -own.down_m})
-            .to_string()
-            .into();
-        if self.own.as_ref().is_none_or(|(last, _)| *last <= t.ns()) {
-            self.own = Some((t.ns(), Arc::clone(&text)));
-            self.own_state = Some(own.clone());
-        }
-        Some(text)
-    }
-
-    fn health(&mut self, name: &str, health: &wh::Health) -> Option<Arc<str>> {
-        let t = host_time(health.timestamp.as_ref());
-        if let Some(ahead_ns) = health.utc_minus_host_ns {
-            self.clock.told_utc(Span::from_ns(ahead_ns));
-        }
-        let sources: Vec<Value> = health
-            .sources
-            .iter()
-            .map(|s| {
-                // Values that are not finite are shown as zero.
-                let (rate_hz, age_ms) = (finite(s.rate_hz).unwrap_or(0.0), finite(s.age_ms).unwrap_or(-1.0));
-                json!({"name": s.name, "rate_hz": rate_hz, "age_ms": age_ms, "refused": s.refused,
-                    "dropped": s.dropped})
-            })
-            .collect();
-        let misfits: Vec<Value> = health
-            .misfits
-            .iter()
-            .map(|m| json!({"source": m.source, "figure": m.figure, "cause": m.cause, "advice": m.advice}))
-            .collect();
-        let figures: BTreeMap<&str, f64> = health
-            .figures
-            .iter()
-            .filter(|(_, x)| x.is_finite())
-            .map(|(name, x)| (name.as_str(), *x))
-            .collect();
-        if self.receiver.is_none_or(|(last, _)| last <= t) {
-            let (hdop, geoid_m) = (health.hdop.and_then(finite), health.geoid_m.and_then(finite));
-            self.receiver = Some((t, Receiver { fix: health.fix, sats: health.sats, hdop, geoid_m }));
-        }
-        let text: Arc<str> = json!({"k": "health", "p": name, "t": ms(t), "sources": sources,
-            "fix": health.fix, "sats": health.sats, "clock_sigma_ms": finite(health.clock_sigma_ms),
-            "misfits": misfits, "words": health.words, "figures": figures})
-        .to_string()
-        .into();
-        if self.health.as_ref().is_none_or(|(last, _)| *last <= t.ns()) {
-            self.health = Some((t.ns(), Arc::clone(&text)));
-            self.health_told = Some(health.clone());
-        }
-        Some(text)
-    }
-
-    fn notice(&mut self, name: &str, log: &foxglove::Log) -> Option<Arc<str>> {
-        let t = host_time(log.timestamp.as_ref());
-        let level = u32::try_from(log.level).unwrap_or(0);
-        let text =
-            if log.name.is_empty() { log.message.clone() } else { format!("{}: {}", log.name, log.message) };
-        Some(self.remark(name, t, level, &text))
-    }
-
-    fn remark(&mut self, name: &str, t: MonoTime, level: u32, text: &str) -> Arc<str> {
-        let message = json!({"k": "event", "p": name, "t": ms(t), "level": level, "text": text});
-        let message: Arc<str> = message.to_string().into();
-        self.notices.push_back(Arc::clone(&message));
-        if self.notices.len() > NOTICES {
-            self.notices.pop_front();
-        }
-        message
-    }
-}
-
 /// UTC as `hhmmss.ss` and `ddmmyy`; empty where it is not known.
 pub fn nmea_time(utc: Option<UtcTime>) -> (String, String) {
     let Some(civil) = utc.map(UtcTime::civil) else { return Default::default() };
@@ -450,102 +334,4 @@ pub fn nmea_time(utc: Option<UtcTime>) -> (String, String) {
         format!("{:02}{:02}{:02}.{hundredths:02}", civil.hour, civil.minute, civil.second),
         format!("{:02}{:02}{:02}", civil.day, civil.month, civil.year.rem_euclid(100)),
     )
-}
-
-#[cfg(test)]
-mod tests {
-    use std::time::Duration;
-
-    use super::*;
-    use crate::io::link::Channel;
-    use crate::io::proto::timestamp;
-
-    fn arrival(
-        (topic, schema_name): (&str, &str),
-        t: MonoTime,
-        message: &impl prost::Message,
-        arrived: Instant,
-    ) -> Arrival {
-        let (topic, schema_name) = (topic.to_owned(), schema_name.to_owned());
-        Arrival {
-            payload: "alpha".into(),
-            run: 1,
-            flight: "boot-1".into(),
-            number: 0,
-            channel: Arc::new(Channel { topic, schema_name, schema: Vec::new() }),
-            log_time: t,
-            publish_time: t,
-            data: message.encode_to_vec(),
-            live: true,
-            arrived,
-        }
-    }
-
-    fn at(s: f64) -> MonoTime {
-        MonoTime::from_ns(0) + Span::from_s(s)
-    }
-
-    fn state(s: f64, status: wh::TrackStatus, arrived: Instant) -> Arrival {
-        let state = wh::TargetState {
-            timestamp: Some(timestamp(at(s))),
-            target: "ugv".into(),
-            status: status.into(),
-            known: true,
-            lat_deg: 30.0,
-            lon_deg: -85.0,
-            ..Default::default()
-        };
-        arrival(("/target/ugv/state", "windhover.TargetState"), at(s), &state, arrived)
-    }
-
-    fn status() -> PayloadStatus {
-        PayloadStatus {
-            name: "alpha".into(),
-            connected: true,
-            address: ([127, 0, 0, 1], 7447).into(),
-            rtt_ms: 1.0,
-            silent: Duration::ZERO,
-            software: "windhover".into(),
-            live: 1,
-            bytes: 100,
-            progress: Default::default(),
-        }
-    }
-
-    #[test]
-    fn a_vehicle_that_nothing_more_is_heard_of_is_lost_in_every_output() {
-        let mut view = View::default();
-        let came = Instant::now();
-        view.record(&state(100.0, wh::TrackStatus::Tracking, came));
-        let line = view.line(&status(), came);
-        assert!(line.contains("ugv tracking N 0.00"), "{line}");
-        assert!(view.vehicles(came)[0].is_current());
-        // When nothing is received any more, whatever the payload's clock shows.
-        let now = came + Duration::from_secs(35);
-        let line = view.line(&status(), now);
-        assert!(line.contains("ugv lost, last known 35 s ago"), "{line}");
-        assert!(!line.contains("N 0.00"), "{line}");
-        let vehicle = &view.vehicles(now)[0];
-        assert_eq!((vehicle.status, vehicle.is_current(), vehicle.age.s().round()), ("lost", false, 35.0));
-        // A page that is opened then gets the age of everything.
-        let told: Value = serde_json::from_str(&view.link(&[status()], 1.0, now)).expect("JSON");
-        assert_eq!(told["payloads"][0]["now"].as_f64().map(f64::round), Some(135_000.0));
-        assert_eq!(view.history().last().map(|text| text.contains("\"k\":\"link\"")), Some(true));
-    }
-
-    #[test]
-    fn a_camera_that_dies_makes_the_vehicle_old_while_health_goes_on() {
-        let mut view = View::default();
-        let came = Instant::now();
-        view.record(&state(100.0, wh::TrackStatus::Tracking, came));
-        let utc_minus_host_ns = Some(1_795_000_000_000_000_000);
-        let health =
-            wh::Health { timestamp: Some(timestamp(at(110.0))), utc_minus_host_ns, ..Default::default() };
-        view.record(&arrival(("/health", "windhover.Health"), at(110.0), &health, came));
-        let vehicle = &view.vehicles(came)[0];
-        assert_eq!((vehicle.status, vehicle.age.s().round()), ("lost", 10.0));
-        assert_eq!(vehicle.utc.map(UtcTime::unix_ns), Some(1_795_000_100_000_000_000));
-        let told: Value = serde_json::from_str(&view.link(&[status()], 1.0, came)).expect("JSON");
-        assert_eq!(told["payloads"][0]["utc_ms"], json!(1_795_000_000_000.0));
-    }
 }
