@@ -254,7 +254,7 @@ fn decode_compass(bytes: &[u8], args: &CompassArgs, out: &mut impl Write) -> std
             "heading_deg", "pitch_deg", "roll_deg", "true", "valid"
         )?;
     }
-    for ReceivedAttitude { reading, .. } in &heard {
+    for ReceivedAttitude { reading, .. } in heard.iter().filter(|heard| !heard.reading.is_inertial_only()) {
         let CompassReading { heading_deg, pitch_deg, roll_deg, heading_is_true, .. } = *reading;
         let valid = reading.is_valid();
         if json {

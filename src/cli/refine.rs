@@ -8,7 +8,7 @@ use super::surveyed::SurveyedArgs;
 use super::{CliError, CliResult, place};
 use crate::app::flight::Flight;
 use crate::app::refine::{
-    RefineFlightError, RefinedFlight, adopted, beside, constant_words, refine_flights, source_name,
+    RefineFlightError, RefinedFlight, adopted, beside, constant_words, refine_flights, source_name, too_many,
 };
 use crate::app::replay::{self, ReplayError};
 use crate::app::report;
@@ -141,6 +141,15 @@ pub(super) fn refined(
 
 /// Prints the constants that a flight determines to differ from its configuration, as TOML.
 pub(super) fn print_adopted(done: &RefinedFlight) -> CliResult {
+    let wrong = too_many(&done.refined, &done.config);
+    if !wrong.is_empty() {
+        note!(
+            "nothing is adopted: the flight shows {} to be wrong at once, and one flight does not tell their effects apart. \
+             Measure some of them, correct the configuration, replay and refine again",
+            one_line(&wrong.join(", "))
+        );
+        return Ok(());
+    }
     let toml = adopted(&done.refined, &done.config);
     if toml.is_empty() {
         note!("the flight determines no constant that differs from the configuration");

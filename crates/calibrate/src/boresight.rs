@@ -121,6 +121,18 @@ enum Item<'a> {
 /// velocities, compass angles, pixels of markers. Values of the configuration are the initial values and weak priors.
 /// `surveyed` are markers with known positions.
 ///
+/// ```
+/// use std::collections::BTreeMap;
+/// use windhover_calibrate::boresight::{BoresightError, Recording, boresight};
+/// use windhover_simulate::Scenario;
+///
+/// let rig = Scenario::named("hover10").expect("a named scenario").rig;
+/// assert_eq!(boresight(&rig, 0.0, &[], &BTreeMap::new()), Err(BoresightError::NoFlight));
+/// // A flight without measurements is named by its number.
+/// let unusable = boresight(&rig, 0.0, &[Recording::default()], &BTreeMap::new());
+/// assert!(matches!(unusable, Err(BoresightError::Unusable { number: 1, .. })));
+/// ```
+///
 /// # Errors
 /// There is no flight, or a flight has no fixes, readings or markers, or is too short. The error has the number of the
 /// flight.

@@ -19,6 +19,16 @@ const MOST_ASIDE: f64 = 0.15;
 const BLUR_PX: f64 = 1.0;
 
 /// A chessboard whose white squares hold tags, numbered row by row from 0 (OpenCV's `CharucoBoard`).
+///
+/// ```
+/// use windhover_base::msg::{GrayImage, TagFamily};
+/// use windhover_calibrate::{CharucoBoard, CharucoError, WINDOW_PX};
+///
+/// let board = CharucoBoard { family: TagFamily::Tag36h11, columns: 6, rows: 4, square_m: 0.04, tag_m: 0.03 };
+/// assert_eq!(board.tags(), 17);
+/// let blank = GrayImage::new(320, 280);
+/// assert_eq!(board.find(blank.view(), WINDOW_PX), Err(CharucoError::TooFew { corners: 0, tags: 0 }));
+/// ```
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct CharucoBoard {
     /// Family of the tags.

@@ -71,6 +71,26 @@ pub const WINDOW_PX: f64 = 11.0;
 ///
 /// `window_px` is half the width of the window in which each corner is located ([`WINDOW_PX`]).
 ///
+/// ```
+/// use windhover_base::msg::GrayImage;
+/// use windhover_calibrate::{BoardError, WINDOW_PX, find_corners};
+///
+/// // A board of 6 by 5 squares of 40 pixels on white: 5 by 4 inner corners.
+/// let mut image = GrayImage::from_vec(320, 280, vec![255; 320 * 280]).expect("as many pixels as rows and columns");
+/// for (v, u) in (0..200).flat_map(|v| (0..240).map(move |u| (v, u))) {
+///     if (u / 40 + v / 40) % 2 == 0 {
+///         image.data[(v + 40) * 320 + u + 40] = 0;
+///     }
+/// }
+/// let corners = find_corners(image.view(), 5, 4, WINDOW_PX).expect("the board is in view");
+/// let first = corners[0].expect("no corner is hidden");
+/// // Between the squares: pixel centres are at whole numbers.
+/// assert!((first.x - 79.5).abs() < 0.1 && (first.y - 79.5).abs() < 0.1, "{first}");
+///
+/// let blank = GrayImage::new(320, 280);
+/// assert!(matches!(find_corners(blank.view(), 5, 4, WINDOW_PX), Err(BoardError::NotSeen { .. })));
+/// ```
+///
 /// # Errors
 /// Where no board of this size is found, or too many of its corners are hidden.
 pub fn find_corners(

@@ -67,6 +67,29 @@ pub struct Intrinsics {
 /// Minimises the squared distance between seen and projected points over the camera and every
 /// plane's pose by Levenberg–Marquardt; poses are eliminated view by view (Schur complement).
 ///
+/// ```
+/// use nalgebra::{Rotation3, Vector2, Vector3};
+/// use windhover_base::geo::{CameraModel, LensModel};
+/// use windhover_calibrate::{PlaneView, intrinsics};
+///
+/// // What a camera sees of a plane from four sides.
+/// let camera = CameraModel { fx: 900.0, fy: 905.0, cx: 642.0, cy: 510.0, ..CameraModel::UNIT };
+/// let view = |about_x: f64, about_y: f64| {
+///     let points = (0..48).map(|k| Vector2::new(f64::from(k % 8) * 0.05, f64::from(k / 8) * 0.05));
+///     let turned = Rotation3::from_euler_angles(about_x, about_y, 0.1);
+///     let pixel = |p: &Vector2<f64>| {
+///         let seen = turned * Vector3::new(p.x - 0.175, p.y - 0.125, 0.0) + Vector3::new(0.0, 0.0, 0.5);
+///         camera.project(&seen).expect("it is in front of the camera").px
+///     };
+///     PlaneView { plane_m: points.clone().collect(), px: points.map(|p| pixel(&p)).collect() }
+/// };
+/// let views = [view(0.4, 0.0), view(-0.4, 0.1), view(0.0, 0.5), view(0.1, -0.5)];
+/// let wanted = intrinsics::Wanted { model: LensModel::Brown, k3: false, skew: false };
+/// let found = intrinsics::calibrate(&views, 1280.0, 1024.0, wanted)
+///     .expect("four tilted views determine a camera");
+/// assert!((found.camera.fx - 900.0).abs() < 1e-3 && (found.camera.cy - 510.0).abs() < 1e-3);
+/// ```
+///
 /// # Errors
 /// With too few views, or where they do not determine the camera (for example all parallel to the image plane).
 pub fn calibrate(

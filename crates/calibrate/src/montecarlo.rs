@@ -173,6 +173,19 @@ impl Setup {
     /// At (35): `σ_N² = σ_pN² + h² (σ_θ² + σ_u²)`, `σ_E² = σ_pE² + h² (σ_φ² + σ_v²)` with u and v
     /// along the body axes. An error of focal length or principal point acts as one of the pixel.
     ///
+    /// ```
+    /// use windhover_base::settings::MonteCarloConfig;
+    /// use windhover_calibrate::montecarlo::Setup;
+    /// use windhover_simulate::Scenario;
+    ///
+    /// let camera = Scenario::named("hover10").expect("a named scenario").rig.camera;
+    /// let setup = Setup::new(&MonteCarloConfig::default(), &camera);
+    /// let drawn = setup.run(20_000, 1).expect("it looks at the ground");
+    /// let (north, east) = (drawn.closed_m2[(0, 0)].sqrt(), drawn.sample_m2[(0, 0)].sqrt());
+    /// // Draws and closed form agree.
+    /// assert!((north / east - 1.0).abs() < 0.05);
+    /// ```
+    ///
     /// # Errors
     /// Where the ray of the pixel does not meet the ground.
     pub fn closed_form(&self, sigmas: &PerSource) -> Result<Matrix2<f64>, LocateError> {

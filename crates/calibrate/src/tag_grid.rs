@@ -12,6 +12,15 @@ pub(super) const LEAST_PX: f64 = 14.0;
 const FEWEST: usize = 3;
 
 /// Tags numbered row by row from 0, all upright, a gap between neighbours.
+///
+/// ```
+/// use windhover_base::msg::{GrayImage, TagFamily};
+/// use windhover_calibrate::{TagGrid, TagGridError};
+///
+/// let grid = TagGrid { family: TagFamily::Tag36h11, columns: 6, rows: 6, tag_m: 0.088, gap_m: 0.0264 };
+/// let blank = GrayImage::new(320, 280);
+/// assert_eq!(grid.find(blank.view()), Err(TagGridError::TooFew { found: 0, wanted: 36 }));
+/// ```
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct TagGrid {
     /// Family of the tags.

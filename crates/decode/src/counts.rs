@@ -45,6 +45,20 @@ impl Refusal {
 }
 
 /// Counts of a decoder.
+///
+/// ```
+/// use windhover_base::time::MonoTime;
+/// use windhover_decode::{GnssDecoder, Refusal, framed};
+///
+/// let (mut decoder, mut epochs) = (GnssDecoder::new(), Vec::new());
+/// // A wrong checksum; an impossible speed, which is left out alone.
+/// let speed = framed("GPRMC,101112,A,3030.0,N,08530.0,W,-1.0,90.0,010226,,,A") + "\r\n";
+/// decoder.push(b"$GPRMC,101111,A*00\r\n", MonoTime::default(), &mut epochs);
+/// decoder.push(speed.as_bytes(), MonoTime::default(), &mut epochs);
+/// let counts = decoder.counts();
+/// assert_eq!((counts.used, counts.refused(Refusal::BadChecksum)), (1, 1));
+/// assert_eq!(counts.left_out().collect::<Vec<_>>(), [("RMC speed", 1)]);
+/// ```
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct DecodeCounts {
     /// Sentences or packets that were used.

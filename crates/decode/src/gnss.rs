@@ -42,6 +42,23 @@ const LEADING_MAX: usize = 8;
 /// Sentences without a time (GSA, VTG, PGRME, PGRMV) go to the epoch of their burst. An epoch is output with the last
 /// sentence of the receiver's cycle once that is known, else when the next epoch begins, or by [`GnssDecoder::tick`]
 /// after silence.
+///
+/// ```
+/// use windhover_base::msg::FixKind;
+/// use windhover_base::time::MonoTime;
+/// use windhover_decode::{GnssDecoder, framed};
+///
+/// let burst = ["GPRMC,101112,A,3030.0,N,08530.0,W,10.0,90.0,010226,,,A", "GPGGA,101112,3030.0,N,08530.0,W,1,08,1.1,100.0,M,-27.0,M,,"];
+/// let (mut decoder, mut epochs) = (GnssDecoder::patient(), Vec::new());
+/// for body in burst {
+///     decoder.push((framed(body) + "\r\n").as_bytes(), MonoTime::from_ns(1_000_000_000), &mut epochs);
+/// }
+/// decoder.flush(&mut epochs);
+/// // Both sentences are of one time, so they are one epoch.
+/// let epoch = epochs[0].epoch;
+/// assert_eq!((epochs.len(), epoch.fix, epoch.alt_msl_m), (1, FixKind::ThreeD, Some(100.0)));
+/// assert_eq!(epoch.utc.map(|utc| utc.to_string()), Some("2026-02-01T10:11:12.000Z".into()));
+/// ```
 #[derive(Clone, Debug)]
 pub struct GnssDecoder {
     format: GpsFormat,

@@ -3,6 +3,15 @@
 use super::counts::Refusal;
 
 /// A sentence with a correct checksum.
+///
+/// ```
+/// use windhover_decode::{Refusal, Sentence, framed};
+///
+/// let line = framed("PGRMM,WGS 84");
+/// assert_eq!(line, "$PGRMM,WGS 84*06");
+/// assert_eq!(Sentence::of_line(line.as_bytes()).map(|sentence| sentence.body), Ok("PGRMM,WGS 84"));
+/// assert_eq!(Sentence::of_line(b"$PGRMM,WGS 84*07").err(), Some(Refusal::BadChecksum));
+/// ```
 #[derive(Clone, Copy, Debug)]
 pub struct Sentence<'a> {
     /// The text between `$` and `*`.

@@ -14,7 +14,8 @@
 //! | ZDA | time | day, month, year | |
 //! | GST | time | one-sigma of latitude, longitude, altitude | the ellipse |
 //!
-//! An unknown mode or quality counts as no measured fix, but an unknown quality of GGA leaves the decision to the other
+//! Unknown modes of GNS count as no measured fix; an unknown mode beside a status (RMC, GLL) or of VTG is left out, so that the
+//! status decides; an unknown quality of GGA leaves the decision to the other
 //! sentences of its epoch. Fields that are not listed are not read.
 //!
 //! The crate is used without its state, because it merges sentences of different times. It splits angles at fixed
@@ -291,6 +292,15 @@ fn mode_is_measured(mode: &str) -> bool {
     mode.is_empty() || mode.chars().any(|letter| matches!(letter, 'A' | 'D' | 'F' | 'P' | 'R'))
 }
 
+/// Whether a mode beside a status leaves the status in force. An unknown one is left out: the status decides.
+fn mode_agrees(report: &mut Report, name: &'static str, mode: &str) -> bool {
+    let known = mode.is_empty() || mode.chars().any(|letter| "ADFPREMSN".contains(letter));
+    if !known {
+        report.left_out.push(name);
+    }
+    !known || mode_is_measured(mode)
+}
+
 /// How a measured position was obtained, by the letters of its modes, one for each constellation: as good as the worst
 /// of those that took part.
 fn solution_of_modes(modes: &str) -> Option<Solution> {
@@ -304,7 +314,7 @@ fn solution_of_modes(modes: &str) -> Option<Solution> {
 }
 
 fn of_rmc(report: &mut Report, data: &RmcData, sentence: &Sentence<'_>) {
-    let valid = sentence.field(2) != "V" && mode_is_measured(sentence.field(12));
+    let valid = mode_agrees(report, "RMC mode", sentence.field(12)) && sentence.field(2) != "V";
     report.valid = Some(valid);
     report.date = data.fix_date.and_then(|date| Date::new(date.year(), date.month() as u8, date.day() as u8));
     if valid {
@@ -350,7 +360,7 @@ fn of_gns(report: &mut Report, data: &GnsData, sentence: &Sentence<'_>) {
 }
 
 fn of_gll(report: &mut Report, data: &GllData, sentence: &Sentence<'_>) {
-    report.valid = Some(data.valid && mode_is_measured(sentence.field(7)));
+    report.valid = Some(mode_agrees(report, "GLL mode", sentence.field(7)) && data.valid);
 }
 
 fn of_gsa(report: &mut Report, data: &GsaData, sentence: &Sentence<'_>) -> Result<(), Refusal> {
@@ -378,7 +388,7 @@ fn gsa_fix(sentence: &Sentence<'_>) -> Result<FixKind, Refusal> {
 }
 
 fn of_vtg(report: &mut Report, data: &VtgData, sentence: &Sentence<'_>) {
-    if mode_is_measured(sentence.field(9)) {
+    if mode_agrees(report, "VTG mode", sentence.field(9)) {
         let by_kmh = || sentence.number(7, 0.0, 4_000.0).unwrap_or(None).map(|kmh| kmh / 3.6);
         report.speed_mps = data.speed_over_ground.map(|knots| decimal(knots) * KNOT_MPS).or_else(by_kmh);
         report.course_deg = data.true_course.map(decimal);

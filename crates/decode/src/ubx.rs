@@ -148,6 +148,15 @@ pub fn ubx_framed(class: u8, identity: u8, payload: &[u8]) -> Vec<u8> {
 }
 
 /// Class, identity and payload of each complete packet with a correct checksum.
+///
+/// ```
+/// use windhover_decode::{ubx_framed, ubx_packets};
+///
+/// // An acknowledgement between other bytes.
+/// let bytes = [&b"noise"[..], &ubx_framed(0x05, 0x01, &[0x06, 0x8A]), b"$GP"].concat();
+/// let packets: Vec<_> = ubx_packets(&bytes).collect();
+/// assert_eq!(packets, [(0x05, 0x01, &[0x06, 0x8A][..])]);
+/// ```
 pub fn ubx_packets(bytes: &[u8]) -> impl Iterator<Item = (u8, u8, &[u8])> {
     bytes.windows(HEAD).enumerate().filter_map(|(at, head)| {
         let &[0xB5, 0x62, class, identity, low, high] = head else { return None };

@@ -42,18 +42,19 @@ fn longest_edge(quad: &Quad) -> f32 {
 }
 
 /// The tag that a quadrilateral given in frame coordinates holds, its corners refined; `None` where it holds none, or where
-/// the fit shows that its corners are not where the print is.
+/// the fit shows that its corners are not where the print is. `noise` is that of a pixel, grey levels.
 pub(super) fn decode(
     image: ImageView<'_>,
     pyramid: &Pyramid,
     quad: &Quad,
     family: &Family,
-    refiner: &mut Refiner,
+    (refiner, noise): (&mut Refiner, f32),
 ) -> Option<Found> {
     let reading = payload::read(image, pyramid, quad, family)?;
     let word = reading.word;
     let corners: Quad = std::array::from_fn(|i| quad[(i + word.turns) % 4]);
-    let refined = match refiner.refine(image, &corners, family, word.id, reading.is_over_exposed) {
+    let spreads = reading.is_over_exposed;
+    let refined = match refiner.refine(image, &corners, (family, word.id), spreads, f64::from(noise)) {
         Some(refined) => refined,
         // No fit near these corners, and wrong bits: a corner was drawn to something beside the tag.
         None if word.hamming > 0 => return None,
@@ -147,7 +148,9 @@ mod tests {
             ];
             let Some(reading) = payload::read(image.view(), &pyramid, &quad, &family) else { continue };
             doubtful += u32::from(reading.word.hamming > 0);
-            let Some(found) = decode(image.view(), &pyramid, &quad, &family, &mut refiner) else { continue };
+            let Some(found) = decode(image.view(), &pyramid, &quad, &family, (&mut refiner, 1.0)) else {
+                continue;
+            };
             let tag = detection(&found);
             let true_corners = [[near, near], [far, near], [far, far], [near, far]];
             for (seen, truth) in tag.corners_px.iter().zip(true_corners) {

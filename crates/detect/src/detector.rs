@@ -367,7 +367,7 @@ impl Detector {
             // Of a small tag a side may be drawn to what is beside it: then as it was.
             let tag = [straight, in_frame].iter().find_map(|quad| {
                 let mut families = families.iter().filter(|f| f.in_negative == inverted);
-                families.find_map(|f| decode(image, pyramid, quad, f, refiner))
+                families.find_map(|f| decode(image, pyramid, quad, f, (refiner, *noise)))
             });
             found.extend(tag);
         }

@@ -62,8 +62,9 @@ impl Equations {
     }
 }
 
+/// The sum of all lanes, halves added to halves.
 #[inline(always)]
-fn total(x: &Lanes) -> f64 {
+pub(super) fn total(x: &Lanes) -> f64 {
     let mut sums = *x;
     let mut half = LANES / 2;
     while half > 0 {
@@ -122,8 +123,9 @@ impl Kernel for Accumulate<'_> {
     }
 }
 
+/// Adds a product, lane by lane.
 #[inline(always)]
-fn add_product(to: &mut Lanes, a: &Lanes, b: &Lanes) {
+pub(super) fn add_product(to: &mut Lanes, a: &Lanes, b: &Lanes) {
     *to = std::array::from_fn(|lane| to[lane] + a[lane] * b[lane]);
 }
 

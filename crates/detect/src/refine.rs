@@ -18,10 +18,11 @@ use nalgebra::{Cholesky, Const, Vector2};
 use super::edge_points::{Locate, Located, PARAMETERS};
 use super::equations::{Accumulate, Advance, Equations, Information, Row, weigh};
 use super::family::Family;
+use super::pixel_fit::{FOCUS, PixelFit};
 use super::quad::{Quad, distance};
 use super::simd::Simd;
 use super::tag_edges::{MOST_BLOCKS, TagEdges};
-use super::tag_model::{Model, Refined};
+use super::tag_model::{FLOOR_PX, Model, PIXELS_FLOOR_PX, Refined};
 use super::windows::{WIDEST_CELL, Windows};
 use windhover_base::msg::ImageView;
 
@@ -71,6 +72,12 @@ const LEAST_STEP_PX: f64 = 0.005;
 const ENOUGH_SEEN: f64 = 0.93;
 const MISTAKEN: f64 = 0.25;
 
+/// Widest cells of tags whose corners are those of the pixels, pixels: of wider ones edges are as good, and quicker.
+const WIDEST_OF_PIXELS: f64 = 4.0;
+
+/// Most rounds that lead up to the fit to pixels.
+const MOST_APPROACHES: usize = 3;
+
 /// Fewest edge points.
 const LEAST_EDGES: usize = 24;
 
@@ -81,24 +88,67 @@ pub(super) struct Refiner {
     edges: TagEdges,
     located: Vec<Located>,
     equations: Equations,
+    pixels: PixelFit,
 }
 
 impl Refiner {
     pub fn new(simd: Simd) -> Self {
-        Self { simd, edges: TagEdges::default(), located: Vec::new(), equations: Equations::default() }
+        let (edges, equations) = (TagEdges::default(), Equations::default());
+        Self { simd, edges, located: Vec::new(), equations, pixels: PixelFit::new(simd) }
     }
 
-    /// Refines corners given in the tag's own order; `None` where too few edges are seen or the fit moves away from the
-    /// given corners. Where white `spreads`, the distance is fitted too.
+    /// Refines corners given in the tag's own order: those of small tags by their pixels, if these are those of the tag in
+    /// one light, others by their edges. `None` where too few edges are seen or the fit moves away from the given corners.
+    /// Where white `spreads`, the distance is fitted too. `noise` is that of a pixel, grey levels.
     pub fn refine(
         &mut self,
         image: ImageView<'_>,
         corners: &Quad,
-        family: &Family,
-        id: u32,
+        (family, id): (&Family, u32),
+        spreads: bool,
+        noise: f64,
+    ) -> Option<Refined> {
+        let is_small = f64::from(edge_of(corners)) < WIDEST_OF_PIXELS * family.width as f64;
+        let of_pixels =
+            if is_small && !spreads { self.of_pixels(image, corners, (family, id), noise) } else { None };
+        of_pixels.or_else(|| self.of_edges(image, corners, (family, id), spreads))
+    }
+
+    /// Refines corners by the pixels, started where a half of the edges are.
+    fn of_pixels(
+        &mut self,
+        image: ImageView<'_>,
+        corners: &Quad,
+        (family, id): (&Family, u32),
+        noise: f64,
+    ) -> Option<Refined> {
+        let edge = f64::from(edge_of(corners));
+        let cell = edge / family.width as f64;
+        let start = Model::of_corners(corners, false)?;
+        self.edges.place(family, id, cell);
+        let held = held(0.5 * edge, cell);
+        let mut model = start;
+        let blurs = match self.approach(image, &mut model, family.width, held) {
+            Some(windows) => windows.blurs_squared().map(f64::sqrt),
+            None => {
+                model = start;
+                [FOCUS; 2]
+            }
+        };
+        let (model, covariance) = self.pixels.fit(image, (&model, blurs, &held), (family, id), noise)?;
+        // How far the corners have moved does not matter: what the pixels show is the tag.
+        model.result(&covariance, [0.0; 2], PIXELS_FLOOR_PX)
+    }
+
+    /// Refines corners by the edges.
+    fn of_edges(
+        &mut self,
+        image: ImageView<'_>,
+        corners: &Quad,
+        (family, id): (&Family, u32),
         spreads: bool,
     ) -> Option<Refined> {
-        let edge = (0..4).map(|i| distance(corners[i], corners[(i + 1) % 4])).sum::<f32>() / 4.0;
+        let edge = edge_of(corners);
         let cell = f64::from(edge) / family.width as f64;
         let mut model = Model::of_corners(corners, spreads)?;
         self.edges.place(family, id, cell);
@@ -113,11 +163,35 @@ impl Refiner {
                 (NEIGHBOURS * blurs[k] / pitch.powi(3)).powi(2) + (SHIFT_ERROR * model.shift(k)).powi(2);
             left.min((0.2 * pitch).powi(2)) + (mistaken * pitch).powi(2)
         });
-        let refined = model.result(&covariance, common)?;
-        let moved = (0..4).map(|i| {
-            (refined.corners[i] - Vector2::new(f64::from(corners[i][0]), f64::from(corners[i][1]))).norm()
-        });
-        (moved.fold(0.0, f64::max) < (1.5 * cell).max(2.0)).then_some(refined)
+        let refined = model.result(&covariance, common, FLOOR_PX)?;
+        is_near(&refined, corners, cell).then_some(refined)
+    }
+
+    /// Moves a model near the edges, with a half of them in wide windows.
+    fn approach(
+        &mut self,
+        image: ImageView<'_>,
+        model: &mut Model,
+        cells: usize,
+        held: [f64; HELD],
+    ) -> Option<Windows> {
+        let mut windows = Windows::default();
+        for _ in 0..MOST_APPROACHES {
+            let pitches = model.pitches(cells);
+            windows.half = windows.halves(pitches, true);
+            self.locate(image, model, windows.half, 2);
+            if self.count() < LEAST_EDGES {
+                return None;
+            }
+            self.normalise();
+            let (before, spread) = (*model, self.spread());
+            self.settle(model, held, spread)?;
+            windows.sharpness = self.sharpness();
+            if !windows.widen() && model.moved(&before) < 0.1 * pitches[0].min(pitches[1]) {
+                break;
+            }
+        }
+        Some(windows)
     }
 
     /// Moves a model to where the edges are; the covariance of its parameters.
@@ -281,6 +355,19 @@ impl Refiner {
         let flattening = solved.flattening.clamp(0.4, 1.0);
         (blocks > 4.0).then(|| inverse * (lambda / (flattening * flattening)))
     }
+}
+
+/// Mean length of the sides, pixels.
+fn edge_of(corners: &Quad) -> f32 {
+    (0..4).map(|i| distance(corners[i], corners[(i + 1) % 4])).sum::<f32>() / 4.0
+}
+
+/// Whether refined corners are those that were given, but for an error in placing them.
+fn is_near(refined: &Refined, corners: &Quad, cell: f64) -> bool {
+    let moved = (0..4).map(|i| {
+        (refined.corners[i] - Vector2::new(f64::from(corners[i][0]), f64::from(corners[i][1]))).norm()
+    });
+    moved.fold(0.0, f64::max) < (1.5 * cell).max(2.0)
 }
 
 /// Sigmas of the priors at zero of the parameters after the homography's, for a tag with this half side and these

@@ -10,6 +10,9 @@ use super::quad::Quad;
 /// Where the corners are in ξ and η.
 const CORNERS: [(f64, f64); 4] = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
 
+/// The first parameter that moves edges and not the tag.
+const SHIFTS: usize = 13;
+
 /// A refined tag.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(super) struct Refined {
@@ -21,6 +24,8 @@ pub(super) struct Refined {
 
 /// Part of an edge's error that remains when noise is averaged out: sampling, neighbouring cells, print. Pixels.
 pub(super) const FLOOR_PX: f64 = 0.02;
+/// The same of a fit to pixels, whose model includes neighbouring cells and sampling.
+pub(super) const PIXELS_FLOOR_PX: f64 = 0.004;
 
 /// Homography in ξ, η (row by row, last entry 1), the bow, the barrel, the twist, the shifts of edges and
 /// the spread of light.
@@ -103,15 +108,37 @@ impl Model {
     /// How far blur moves the visible edges beside cells that are one wide towards the other cell, for edges crossed
     /// along ξ (0) or η (1), pixels.
     pub fn shift(&self, axis: usize) -> f64 {
-        self.theta[13 + axis]
+        self.theta[SHIFTS + axis]
+    }
+
+    /// The same without shifts of edges.
+    pub fn without_shifts(&self) -> Self {
+        let mut model = *self;
+        model.theta.rows_mut(SHIFTS, PARAMETERS - SHIFTS).fill(0.0);
+        model
+    }
+
+    /// Half sides over the root mean square of their lengths.
+    pub fn sides(&self) -> [Vector2<f64>; 2] {
+        self.sides
+    }
+
+    /// The pixel of a tag point.
+    pub fn pixel(&self, xi: f64, eta: f64) -> Vector2<f64> {
+        self.at(xi, eta).0 + self.origin
+    }
+
+    /// Where the pixel coordinates of the parameters begin.
+    pub fn origin(&self) -> Vector2<f64> {
+        self.origin
     }
 
     /// Corners and centre with their covariances; `common` are variances that all edges crossed along ξ and all those
-    /// along η share, px².
-    pub fn result(&self, covariance: &Information, common: [f64; 2]) -> Option<Refined> {
+    /// along η share, px², `floor_px` is an error that no other term contains.
+    pub fn result(&self, covariance: &Information, common: [f64; 2], floor_px: f64) -> Option<Refined> {
         let axes = self.sides.map(|s| s / s.norm().max(1e-9));
         let shared = (0..2).map(|i| axes[i] * axes[i].transpose() * common[i]);
-        let floor = shared.fold(Matrix2::identity() * FLOOR_PX.powi(2), |sum, c| sum + c);
+        let floor = shared.fold(Matrix2::identity() * floor_px.powi(2), |sum, c| sum + c);
         let at = |xi: f64, eta: f64| {
             let (p, jacobian) = self.at(xi, eta);
             (p + self.origin, jacobian * covariance * jacobian.transpose() + floor)

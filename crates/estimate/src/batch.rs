@@ -15,16 +15,17 @@ use super::Site;
 use super::aid::disc::Disc;
 use super::aid::feature::FeaturePixel;
 use super::aid::heading::Heading;
-use super::aid::tag::Tag;
+use super::aid::tag::{Tag, TagCorner};
 use super::aid::tilt::TiltReading;
 use super::aid::{compass, gnss};
-use super::blocks::{TARGET, own};
+use super::blocks::{SHAKE_NODES as NODES, TARGET, own};
 use super::core::Core;
 use super::force::{D_WIND, Force};
 use super::kind::Felt;
 use super::measurement::Measurement;
 use super::output::target_state;
 use super::own::{COMPASS, Own};
+use super::shake::Shake;
 use super::sway::Sway;
 
 /// Columns of the filter's error state, by name.
@@ -71,6 +72,10 @@ pub const TARGET_COLUMNS: usize = TARGET;
 pub const TAG_COLUMNS: usize = super::blocks::TAG_FIT;
 /// How a vehicle sways on its springs: roll and pitch of its body, rad, and how much lower it is, m.
 pub const SWAY_COLUMNS: usize = super::blocks::SWAY;
+/// Displacement of a frame whose camera shakes: along x and y at so many nodes each, and its roll.
+pub const SHAKE_COLUMNS: usize = super::blocks::SHAKE;
+/// Nodes of an axis.
+pub const SHAKE_NODES: usize = super::blocks::SHAKE_NODES;
 /// Correlation time of sway, s.
 pub const SWAY_TAU_S: f64 = super::sway::CORRELATION_S;
 
@@ -233,19 +238,41 @@ impl Predictor {
             target.mean.copy_from_slice(&means[layout.target(i).all().range()]);
             target.sway.mean.copy_from_slice(&means[layout.sway(i).range()]);
         }
+        if self.core.state.shake.is_open() {
+            self.core.state.shake.mean.copy_from_slice(&means[layout.shake().range()]);
+        }
         self.core.state.features[0].mean.copy_from_slice(&means[layout.feature(0).range()]);
         for (i, tag) in self.core.state.tags.iter_mut().enumerate() {
             tag.mean.copy_from_slice(&means[layout.tag(i).all().range()]);
         }
     }
 
-    /// Puts camera and antenna beside their configuration.
+    /// Sets whether the camera shakes, with the time from the first row to the last by which displacement lasts from row to row, s:
+    /// each frame is displaced at its rows then.
+    pub fn set_shakes(&mut self, readout_s: Option<f64>) {
+        let models = &self.core.models;
+        self.core.state.shake =
+            readout_s.map_or_else(Shake::default, |readout_s| Shake::of_batch(readout_s, models));
+    }
+
+    /// Columns of a frame's displacement: along x and along y at its nodes, in normalised coordinates, and its roll, rad.
+    pub fn shake_columns(&self) -> Range<usize> {
+        self.core.state.layout().shake().range()
+    }
+
+    /// Covariance between the nodes of one axis over the variance.
+    pub fn shake_kernel(&self) -> SMatrix<f64, NODES, NODES> {
+        self.core.state.shake.kernel()
+    }
+
+    /// Puts camera and antenna beside their configuration. All rows are exposed at once: the caller puts each point's state at
+    /// the time of its row.
     pub fn put_rig(&mut self, by: &RigOffsets) {
         let (m, c) = (&mut self.core.models, &self.configured);
         m.camera_from_body = c.camera_from_body * Rotation3::new(by.mount).matrix().transpose();
         m.camera_at = c.camera_at + by.camera_at;
         m.antenna_at = c.antenna_at + by.antenna_at;
-        m.readout_s = c.readout_s + by.readout_s;
+        m.readout_s = 0.0;
         let factor = by.ln_focal.exp();
         (m.camera.fx, m.camera.fy) = (c.camera.fx * factor, c.camera.fy * factor);
     }
@@ -335,20 +362,27 @@ impl Predictor {
         Some(Linear(&self.core.z))
     }
 
-    /// A marker: a tag's corners, else a centre. `None` where it is none of ours or cannot be in view.
-    pub fn marker(&mut self, seen: &MarkerDetection) -> Option<Linear<'_>> {
+    /// Pixels of a marker: a tag's corners, else a centre; empty where it is none of ours.
+    pub fn marker_px<'a>(&self, seen: &'a MarkerDetection) -> &'a [Vector2<f64>] {
+        let Some((target, marker)) = self.core.models.find(seen.marker) else { return &[] };
+        let corners = self.core.models.targets[target].markers[marker].corners.is_some();
+        match &seen.corners_px {
+            Some(corners_px) if corners => corners_px,
+            _ => std::slice::from_ref(&seen.center_px),
+        }
+    }
+
+    /// The `i`-th of these pixels. `None` where it cannot be in view.
+    pub fn marker_point(&mut self, seen: &MarkerDetection, i: usize) -> Option<Linear<'_>> {
         let (target, marker) = self.core.models.find(seen.marker)?;
         let marker = self.core.models.targets[target].markers[marker].clone();
         let corners = marker.corners.as_ref().zip(seen.corners_px.as_ref());
         let linearised = match corners {
-            Some((points, corners_px)) => self.core.linearise(&Tag {
-                target,
-                center: &marker.center,
-                points,
-                fit: marker.fit,
-                corners_px,
-                cov_px2: &seen.corner_cov_px2,
-            }),
+            Some((points, corners_px)) => {
+                let (center, fit, cov_px2) = (&marker.center, marker.fit, &seen.corner_cov_px2);
+                let tag = Tag { target, center, points, fit, corners_px, cov_px2 };
+                self.core.linearise(&TagCorner(tag, i))
+            }
             None => self.core.linearise(&Disc {
                 target,
                 point: &marker.center,
@@ -374,6 +408,16 @@ impl Predictor {
     /// Height of a frame, px.
     pub fn image_height_px(&self) -> f64 {
         self.core.models.image_px.1
+    }
+
+    /// Configured time from the first row's exposure to the last one's, s.
+    pub fn readout_s(&self) -> f64 {
+        self.configured.readout_s
+    }
+
+    /// Focal length, px.
+    pub fn focal_px(&self) -> f64 {
+        self.configured.camera.fx
     }
 
     /// A target's state at its reference point.

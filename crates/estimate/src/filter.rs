@@ -268,6 +268,14 @@ impl Estimator {
         self.core.state.own.velocity_age_s()
     }
 
+    /// Of a camera that was found to shake: displacement of rows in normalised coordinates and roll, rad, one sigma; and the time
+    /// from the first row to the last, s.
+    pub fn camera_shake(&self) -> Option<([f64; 2], f64)> {
+        let state = &self.core.state;
+        let readout_s = state.own.whole_readout_s(self.core.models.readout_s);
+        state.shake.is_shown().then(|| (state.shake.sigmas(), readout_s))
+    }
+
     /// One line on what the filter believes of the sensors and of the intensities of motion.
     pub fn inside(&self) -> String {
         let (own, l) = (&self.core.state.own, &self.core.state.learnt);

@@ -77,6 +77,9 @@ pub(crate) struct Shake {
     /// The covariance between nodes over the variance, inverted, and its correlation length as a share of the frame's height.
     inverse: SMatrix<f64, NODES, NODES>,
     length: f64,
+    /// Focal length that displacements are multiplied by, px: one that is itself estimated would be made larger by displacements
+    /// that are expected to be small.
+    focal_px: Vector2<f64>,
     /// Whether the read-out time was not known since it was doubted last.
     unsettled: bool,
     /// Whether enough features were fused in the frame at hand.
@@ -104,11 +107,26 @@ fn node(k: usize) -> f64 {
     k as f64 / (NODES - 1) as f64 - 0.5
 }
 
+/// Correlation length as a share of a frame's height, with this time from the first row to the last.
+fn length(readout_s: f64) -> f64 {
+    (CORRELATION_S / readout_s.abs().max(1e-4)).clamp(LENGTHS.0, LENGTHS.1)
+}
+
 impl Shake {
     /// Of a camera of which nothing is known yet.
     pub(crate) fn presumed(models: &Models) -> Self {
         let var = (PRESUMED_PX / models.camera.fx).powi(2);
         Self { displacement_var: var, roll_var: var, unsettled: true, ..Self::default() }
+    }
+
+    /// Of a frame whose displacements a batch estimates: it has their variance, and leaves out what lies between the nodes.
+    pub(crate) fn of_batch(readout_s: f64, models: &Models) -> Self {
+        let focal_px = Vector2::new(models.camera.fx, models.camera.fy);
+        let mut shake = Self { length: length(readout_s), focal_px, ..Self::default() };
+        if let Some(inverse) = shake.kernel().try_inverse() {
+            (shake.begun, shake.inverse) = (true, inverse);
+        }
+        shake
     }
 
     /// Whether the frame at hand has displacements of its own.
@@ -121,6 +139,11 @@ impl Shake {
         self.displacement_var > 0.0 || self.roll_var > 0.0
     }
 
+    /// Whether the camera was taken to shake for so long that the flight has shown it.
+    pub(crate) fn is_shown(&self) -> bool {
+        self.shakes() && self.open_s >= PRESUMED_S
+    }
+
     /// Displacement of a row in normalised coordinates, and roll, rad, one sigma; 0 where there is none.
     pub(crate) fn sigmas(&self) -> [f64; 2] {
         [self.displacement_var.sqrt(), self.roll_var.sqrt()]
@@ -131,37 +154,38 @@ impl Shake {
     }
 
     /// Covariance between nodes over the variance.
-    fn kernel(&self) -> SMatrix<f64, NODES, NODES> {
+    pub(crate) fn kernel(&self) -> SMatrix<f64, NODES, NODES> {
         let own = |a: usize, b: usize| if a == b { ALONE } else { 0.0 };
         SMatrix::from_fn(|a, b| self.correlation(node(a) - node(b)) + own(a, b))
     }
 
     /// Displacement of a point seen at `px`, in the row at this share of the frame's height.
     pub(crate) fn displaced(&self, models: &Models, px: &Vector2<f64>, share: f64) -> Displaced {
-        let lens = &models.camera;
+        let (lens, focal) = (&models.camera, &self.focal_px);
         let to_nodes = SVector::<f64, NODES>::from_fn(|k, _| self.correlation(share - node(k)));
         let weights = self.inverse * to_nodes;
         let left = (1.0 - weights.dot(&to_nodes)).max(0.0) * self.displacement_var;
         let mut derivative = SMatrix::<f64, 2, SHAKE>::zeros();
         for k in 0..NODES {
-            derivative[(0, k)] = lens.fx * weights[k];
-            derivative[(1, NODES + k)] = lens.fy * weights[k];
+            derivative[(0, k)] = focal.x * weights[k];
+            derivative[(1, NODES + k)] = focal.y * weights[k];
         }
-        derivative[(0, ROLL)] = -lens.fx * (px.y - lens.cy) / lens.fy;
-        derivative[(1, ROLL)] = lens.fy * (px.x - lens.cx) / lens.fx;
+        derivative[(0, ROLL)] = -focal.x * (px.y - lens.cy) / focal.y;
+        derivative[(1, ROLL)] = focal.y * (px.x - lens.cx) / focal.x;
         Displaced {
             by_px: derivative * SVector::from(self.mean),
             derivative,
-            noise_px2: Matrix2::new(lens.fx * lens.fx, 0.0, 0.0, lens.fy * lens.fy) * left,
+            noise_px2: Matrix2::new(focal.x * focal.x, 0.0, 0.0, focal.y * focal.y) * left,
         }
     }
 }
 
 impl State {
     /// Before a frame: displacements of their own.
-    pub(crate) fn begin_shake(&mut self, readout_s: f64) {
+    pub(crate) fn begin_shake(&mut self, readout_s: f64, models: &Models) {
         let shake = &mut self.shake;
-        shake.length = (CORRELATION_S / readout_s.abs().max(1e-4)).clamp(LENGTHS.0, LENGTHS.1);
+        shake.focal_px = Vector2::new(models.camera.fx, models.camera.fy);
+        shake.length = length(readout_s);
         let kernel = shake.kernel();
         let Some(inverse) = kernel.try_inverse() else { return };
         (shake.begun, shake.inverse, shake.mean) = (true, inverse, [0.0; SHAKE]);
@@ -253,7 +277,7 @@ impl Core {
             return;
         }
         let [readout_s, sigma_s] = self.readout();
-        self.state.begin_shake(readout_s.hypot(sigma_s));
+        self.state.begin_shake(readout_s.hypot(sigma_s), &self.models);
     }
 
     /// After a frame was fused.

@@ -39,6 +39,10 @@ pub enum Source {
     Outside,
     /// Changes of the helicopter's velocity that are faster than a gust.
     Vibration,
+    /// Displacements of the rows of a frame whose camera shakes.
+    Shake,
+    /// Roll of a frame about the optical axis, likewise.
+    ShakeRoll,
     /// Rows with noise that is not fitted.
     Known,
 }
@@ -78,18 +82,20 @@ impl Source {
             Self::Known => 9,
             Self::Vibration => 10,
             Self::Outside => 11,
-            Self::Marker(target) => 12 + 6 * target,
-            Self::Drive(target) => 13 + 6 * target,
-            Self::Turn(target) => 14 + 6 * target,
-            Self::Sway(target) => 15 + 6 * target,
-            Self::Heave(target) => 16 + 6 * target,
-            Self::Slip(target) => 17 + 6 * target,
+            Self::Shake => 12,
+            Self::ShakeRoll => 13,
+            Self::Marker(target) => 14 + 6 * target,
+            Self::Drive(target) => 15 + 6 * target,
+            Self::Turn(target) => 16 + 6 * target,
+            Self::Sway(target) => 17 + 6 * target,
+            Self::Heave(target) => 18 + 6 * target,
+            Self::Slip(target) => 19 + 6 * target,
         }
     }
 
     /// Number of sources with this many targets.
     pub(crate) const fn count(targets: usize) -> usize {
-        12 + 6 * targets
+        14 + 6 * targets
     }
 }
 

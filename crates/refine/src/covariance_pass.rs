@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::{SMatrix, UnitQuaternion};
+use nalgebra::UnitQuaternion;
 
 use windhover_base::msg::{MarkerId, Ownship, TargetEstimate, TrackStatus};
 use windhover_estimate::Site;
@@ -12,10 +12,11 @@ use crate::front::Back;
 use crate::noise::Components;
 use crate::problem::{Origin, Pass, Problem};
 use crate::recording::Recording;
-use crate::result::{Constant, Outlier, Refined, Tally};
+use crate::result::{ClockDifference, Constant, Outlier, Refined, Tally};
 use crate::solve::{EliminatedKind, Factors, Unsolved};
-use crate::unknowns::{Prior, knot};
-use crate::values::Values;
+use crate::stamped::{own_covariance, target_covariance};
+use crate::unknowns::{Prior, constant, knot};
+use crate::values::{Knot, Values};
 
 /// Result of a pass with covariances.
 pub(crate) struct PassResult {
@@ -49,9 +50,14 @@ pub(crate) fn look(
         for (what, e) in factors.segment(index, pass, values, noise)?.iter().rev() {
             back.solve_with_covariance(e);
             match what {
-                EliminatedKind::Constants => looked.refined.constants = constants(problem, values, &back),
+                EliminatedKind::Constants => {
+                    looked.refined.constants = constants(problem, values, &back);
+                    looked.refined.clocks = clocks(problem, values, &back);
+                }
+                // Its frame's displacement is still closed.
+                EliminatedKind::Knot(k) if problem.is_displaced(*k) => {}
                 EliminatedKind::Landmark(_) => {}
-                EliminatedKind::Knot(k) => {
+                EliminatedKind::Knot(k) | EliminatedKind::Shake(k) => {
                     pass.blocks(*k, values, noise, &mut |origin: Origin, block: &Block| {
                         looked.take(origin, block, &back, problem, (*k, noise), &mut counts);
                     });
@@ -77,10 +83,12 @@ impl PassResult {
         (site, recordings): (&Site, &[Recording]),
     ) {
         let (problem, stop) = (pass.problem, &pass.problem.plan.stops[k]);
-        self.refined.own.push((stop.flight, ownship(problem, values, back, k, site, recordings)));
+        let late_s = values.constants[constant::CAMERA_DELAY];
+        let state = pass.state_at(k, values, late_s);
+        self.refined.own.push((stop.flight, ownship(pass, (k, late_s), &state, back, site, recordings)));
         if stop.frame.is_some() {
             for target in 0..problem.targets {
-                let estimate = target_estimate(pass, values, back, k, target, recordings);
+                let estimate = target_estimate(pass, (k, late_s), &state, back, target, recordings);
                 self.refined.targets.push((stop.flight, estimate));
             }
         }
@@ -159,7 +167,7 @@ impl PixelMemory {
 fn tallies(targets: usize, counts: &[(usize, usize)], noise: &Noise) -> Vec<Tally> {
     use Source as S;
     let own = [S::Outside, S::GpsPosition, S::GpsVelocity, S::Heading, S::Tilt, S::Feature];
-    let motion = [S::TiltMotion, S::YawMotion, S::Gust, S::Thrust, S::Vibration];
+    let motion = [S::TiltMotion, S::YawMotion, S::Gust, S::Thrust, S::Vibration, S::Shake, S::ShakeRoll];
     let of_targets = (0..targets)
         .flat_map(|t| [S::Marker(t), S::Drive(t), S::Turn(t), S::Sway(t), S::Heave(t), S::Slip(t)]);
     let all = own.into_iter().chain(motion).chain(of_targets);
@@ -180,16 +188,34 @@ fn constants(problem: &Problem<'_>, values: &Values, back: &Back) -> Vec<Constan
     problem.priors.iter().zip(&values.constants).enumerate().map(constant).collect()
 }
 
+fn clocks(problem: &Problem<'_>, values: &Values, back: &Back) -> Vec<ClockDifference> {
+    let (camera, at) = (constant::CAMERA_DELAY, problem.shape.constants_at());
+    let others = [constant::COMPASS_DELAY, constant::GPS_DELAY];
+    let estimated = |i: &usize| problem.priors[*i].is_estimated() && problem.priors[camera].is_estimated();
+    let difference = |other: usize| {
+        let [a, b, ab] =
+            [(camera, camera), (other, other), (camera, other)].map(|(i, j)| back.covariance(at + i, at + j));
+        let late_s = values.constants[camera] - values.constants[other];
+        let sigma_s = (a + b - 2.0 * ab).max(0.0).sqrt();
+        ClockDifference { other: problem.priors[other].kind, late_s, sigma_s }
+    };
+    others.into_iter().filter(estimated).map(difference).collect()
+}
+
 fn ownship(
-    problem: &Problem<'_>,
-    values: &Values,
+    pass: &Pass<'_>,
+    (k, late_s): (usize, f64),
+    state: &Knot,
     back: &Back,
-    k: usize,
     site: &Site,
     recordings: &[Recording],
 ) -> Ownship {
-    let (stop, state) = (&problem.plan.stops[k], &values.knots[k]);
-    let at = problem.shape.knot_at(k);
+    let problem = pass.problem;
+    let stop = &problem.plan.stops[k];
+    let mut covariance = own_covariance(problem, (k, late_s), state, pass.pushed_at(k), back);
+    for i in knot::ATTITUDE..knot::ATTITUDE + 2 {
+        covariance[(i, i)] += problem.considered_tilt_var;
+    }
     let position = state.three(knot::POSITION);
     let place = site.frame.geodetic(&position);
     Ownship {
@@ -201,25 +227,20 @@ fn ownship(
         lat_deg: place.lat_deg,
         lon_deg: place.lon_deg,
         height_m: place.height_m,
-        covariance: SMatrix::from_fn(|i, j| {
-            let tilt = i == j && (knot::ATTITUDE..knot::ATTITUDE + 2).contains(&i);
-            let considered = if tilt { problem.considered_tilt_var } else { 0.0 };
-            back.covariance(at + i, at + j) + considered
-        }),
+        covariance,
     }
 }
 
 fn target_estimate(
     pass: &Pass<'_>,
-    values: &Values,
+    (k, late_s): (usize, f64),
+    state: &Knot,
     back: &Back,
-    k: usize,
     target: usize,
     recordings: &[Recording],
 ) -> TargetEstimate {
     let problem = pass.problem;
     let stop = &problem.plan.stops[k];
-    let at = problem.shape.knot_at(k) + knot::target(target);
     let frame = stop.frame.map(|frame| &recordings[stop.flight].frames[frame].value);
     let shown = frame.is_some_and(|frame| {
         let of = |marker| pass.predictor.find(marker).is_some_and(|(t, _)| t == target);
@@ -230,8 +251,8 @@ fn target_estimate(
         (true, true) => TrackStatus::Tracking,
         (true, false) => TrackStatus::Coasting,
     };
-    let covariance = SMatrix::<f64, 5, 5>::from_fn(|i, j| back.covariance(at + i, at + j));
-    let mean = &values.knots[k].target(target)[..5];
+    let covariance = target_covariance(problem, (k, late_s), state, target, back);
+    let mean = &state.target(target)[..5];
     let state = stop.held[target].then(|| pass.predictor.target_state(target, mean, &covariance));
     TargetEstimate { t_valid: stop.t, frame: frame.map_or(0, |frame| frame.frame), target, status, state }
 }

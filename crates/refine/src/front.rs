@@ -1,6 +1,6 @@
 //! Normal equations along time: each unknown is eliminated as soon as no later row contains it.
 //!
-//! The order of the unknowns is: knot 0, the landmarks last seen there, knot 1, …, and the constants at the end. At any
+//! The order of the unknowns is: the displacement of the frame at knot 0, knot 0, the landmarks last seen there, knot 1, …, and the constants at the end. At any
 //! moment only a *front* of them is open: two neighbouring knots, the landmarks in view, the constants. Its normal
 //! equations are one dense matrix, whatever the length of the flight:
 //!
@@ -11,19 +11,21 @@
 
 use crate::dense::{Singular, add_rows, backward, cholesky, forward};
 
-/// Layout of a front: two knots, then landmarks of two components each, then the constants.
+/// Layout of a front: two knots, landmarks of two components each, the displacement of a frame, the constants.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(crate) struct Shape {
     pub(crate) knot: usize,
     /// Most landmarks that are open at once.
     pub(crate) landmarks: usize,
+    /// Components of the displacement of a frame; 0 where the camera does not shake.
+    pub(crate) shake: usize,
     pub(crate) constants: usize,
 }
 
 impl Shape {
     /// Unknowns of the front.
     pub(crate) const fn len(self) -> usize {
-        2 * self.knot + 2 * self.landmarks + self.constants
+        self.constants_at() + self.constants
     }
 
     /// The first unknown of knot `k`: neighbouring knots alternate.
@@ -36,9 +38,14 @@ impl Shape {
         2 * self.knot + 2 * place
     }
 
+    /// The first component of the displacement of the frame at hand.
+    pub(crate) const fn shake_at(self) -> usize {
+        2 * self.knot + 2 * self.landmarks
+    }
+
     /// The first constant.
     pub(crate) const fn constants_at(self) -> usize {
-        2 * self.knot + 2 * self.landmarks
+        self.shake_at() + self.shake
     }
 }
 
@@ -301,15 +308,15 @@ mod tests {
 
     use super::*;
 
-    /// Twelve knots of three unknowns, landmarks that appear and disappear, two constants: the same result as the dense
-    /// equations.
+    /// Twelve knots of three unknowns, each with two of its frame, landmarks that appear and disappear, two constants: the same
+    /// result as the dense equations.
     #[test]
     fn solution_and_covariances_are_those_of_the_dense_equations() {
-        let shape = Shape { knot: 3, landmarks: 2, constants: 2 };
+        let shape = Shape { knot: 3, landmarks: 2, shake: 2, constants: 2 };
         let knots = 12;
         let spans = [(0, 4, 0), (2, 9, 1), (5, 11, 0)];
-        let total = 3 * knots + 2 * spans.len() + 2;
-        let of_landmark = |i: usize| 3 * knots + 2 * i;
+        let total = 5 * knots + 2 * spans.len() + 2;
+        let of_landmark = |i: usize| 5 * knots + 2 * i;
         let constants = total - 2;
         let mut seed = 1u64;
         let mut random = move || {
@@ -332,7 +339,8 @@ mod tests {
             let knot = |k: usize| (0..3).map(move |i| (shape.knot_at(k) + i, 3 * k + i));
             let constant = (0..2).map(|i| (shape.constants_at() + i, constants + i));
             for _ in 0..4 {
-                let (here, whole) = knot(k).chain(constant.clone()).unzip();
+                let shake = (0..2).map(|i| (shape.shake_at() + i, 3 * knots + 2 * k + i));
+                let (here, whole) = knot(k).chain(shake).chain(constant.clone()).unzip();
                 add(&mut front, here, whole);
                 if k + 1 < knots {
                     let (here, whole) = knot(k).chain(knot(k + 1)).unzip();
@@ -346,6 +354,7 @@ mod tests {
                     }
                 }
             }
+            done.push((front.eliminate(shape.shake_at(), 2, 0.0).expect("regular"), 3 * knots + 2 * k));
             done.push((front.eliminate(shape.knot_at(k), 3, 0.0).expect("regular"), 3 * k));
             for (i, (_, to, place)) in spans.into_iter().enumerate() {
                 if to == k {
@@ -378,7 +387,7 @@ mod tests {
 
     #[test]
     fn what_nothing_ties_down_is_singular() {
-        let shape = Shape { knot: 2, landmarks: 0, constants: 0 };
+        let shape = Shape { knot: 2, landmarks: 0, shake: 0, constants: 0 };
         let mut front = Front::new(shape);
         front.add(&[0, 1], &[1.0, 1.0], &[0.5], 1.0);
         assert_eq!(front.eliminate(0, 2, 0.0).err(), Some(Singular));

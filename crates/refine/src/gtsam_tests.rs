@@ -143,7 +143,7 @@ fn proof_gtsam_agrees() {
     let plan = planned(&predictor, &recordings, &firsts, rig.target.len(), 30.0);
     let problem = stated((&rig, &config, &site), &recordings, plan, &mut predictor, &firsts);
     let mut values = first_values(&problem, &firsts, &predictor, &rig, &site);
-    let noise = first_noise(problem.targets, config.side_force_mps2, config.thrust_mps2);
+    let noise = first_noise(problem.targets, config.side_force_mps2, config.thrust_mps2, None);
     let mut pass = Pass::new(&problem, predictor);
     solve(&mut pass, &mut values, &noise, 10.0, &mut |_| true).expect("a flight");
     let solved = factorise(&mut pass, &values, &noise, 0.0, &mut |_| true).expect("a flight");
@@ -155,6 +155,7 @@ fn proof_gtsam_agrees() {
         let key = match what {
             EliminatedKind::Knot(k) => *k,
             EliminatedKind::Landmark(landmark) => knots + landmark,
+            EliminatedKind::Shake(_) => continue,
             EliminatedKind::Constants => knots + problem.plan.landmarks,
         };
         sigmas.insert(key, e.range().map(|column| back.covariance(column, column).sqrt()).collect());

@@ -28,6 +28,8 @@ pub(crate) struct InitialValues {
     pub(crate) sways: Vec<bool>,
     /// What the filter found to be configured wrongly.
     pub(crate) wrong: Vec<MisfitCause>,
+    /// Of a camera that the filter found to shake: displacement of rows and roll, rad, and the time from the first row to the last, s.
+    pub(crate) shake: Option<([f64; 2], f64)>,
     /// How many times as far as configured the receiver's slow error wanders.
     pub(crate) wanders: f64,
     /// Why and when the filter was reset.
@@ -64,6 +66,7 @@ pub(crate) fn filtered(
         first.take(&mut out, t);
     }
     filter.finish(&mut out);
+    first.shake = filter.camera_shake();
     first.take(&mut out, MonoTime::default());
     first.own.sort_by_key(|own| own.t_valid);
     first.own.dedup_by_key(|own| own.t_valid);

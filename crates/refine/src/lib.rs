@@ -5,6 +5,7 @@ mod beginnings;
 mod block;
 mod dense;
 mod initial;
+mod frame;
 mod front;
 #[cfg(test)]
 mod gtsam_tests;
@@ -22,6 +23,7 @@ mod roughness;
 #[cfg(test)]
 mod segments;
 mod solve;
+mod stamped;
 mod surveyed;
 mod result;
 mod unknowns;
@@ -30,5 +32,5 @@ mod values;
 pub use block::Source;
 pub use recording::{OutsidePosition, Recording, SurveyedMarker};
 pub use refine::{RefineError, refine};
-pub use result::{Constant, Outlier, Refined, Tally};
+pub use result::{ClockDifference, Constant, Outlier, Refined, Tally};
 pub use unknowns::ConstantKind;

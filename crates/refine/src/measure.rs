@@ -40,7 +40,7 @@ impl Rows {
         Self { width: shape.len(), rows: Vec::new(), touched: vec![false; shape.len()] }
     }
 
-    fn begin(&mut self, m: usize) {
+    pub(crate) fn begin(&mut self, m: usize) {
         self.rows.clear();
         self.rows.resize(m * self.width, 0.0);
         self.touched.fill(false);
@@ -91,19 +91,38 @@ impl Instant<'_> {
     /// Writes rows of a linearised measurement; returns the rate of change of each component.
     pub(crate) fn write(&self, linear: &Linear<'_>, rows: &mut Rows) -> Vec<f64> {
         rows.begin(linear.len());
-        (0..linear.len()).map(|row| self.write_row(linear, row, rows)).collect()
+        (0..linear.len()).map(|row| self.write_row((linear, row), row, rows)).collect()
     }
 
-    fn write_row(&self, linear: &Linear<'_>, row: usize, rows: &mut Rows) -> f64 {
-        for (column, value) in linear.columns().iter().zip(linear.row(row)) {
+    /// Writes the two components of a point of the picture at `row`, with the camera's deviation from its configuration; `target`
+    /// is the vehicle that it is on.
+    pub(crate) fn write_point(
+        &self,
+        linear: &Linear<'_>,
+        row: usize,
+        target: Option<usize>,
+        (seen, shake, lens): (&Vector2<f64>, &[f64], &Lens),
+        rows: &mut Rows,
+    ) {
+        let flow = [0, 1].map(|i| {
+            let moved = target.map_or(0.0, |target| self.target((linear, i), row + i, target, rows));
+            self.write_row((linear, i), row + i, rows) + moved
+        });
+        let displaced = [0, 1].map(|i| self.displaced(linear, i, shake));
+        self.camera(linear, row, flow, (seen, displaced, lens), rows);
+    }
+
+    fn write_row(&self, (linear, i): (&Linear<'_>, usize), row: usize, rows: &mut Rows) -> f64 {
+        for (column, value) in linear.columns().iter().zip(linear.row(i)) {
             match self.places[*column] {
                 Place::Knot(i) => rows.add(row, self.at + i, *value),
                 Place::Constant(i) => rows.add(row, self.shape.constants_at() + i, *value),
                 Place::Landmark(i) => rows.add(row, self.landmark_at + i, *value),
+                Place::Shake(i) => rows.add(row, self.shape.shake_at() + i, *value),
                 Place::Known(_) | Place::Nowhere => {}
             }
         }
-        let by = ByState::of(linear, row);
+        let by = ByState::of(linear, i);
         let turned = self.state.attitude.matrix().transpose() * by.attitude;
         let (v, rate, spin) =
             (self.state.three(knot::VELOCITY), self.state.three(knot::RATE), self.state.three(knot::SPIN));
@@ -119,27 +138,26 @@ impl Instant<'_> {
                 match self.places[*column] {
                     Place::Knot(i) => rows.add(row, self.at + i, moved),
                     Place::Constant(i) => rows.add(row, self.shape.constants_at() + i, moved),
-                    Place::Landmark(_) | Place::Known(_) | Place::Nowhere => {}
+                    Place::Landmark(_) | Place::Shake(_) | Place::Known(_) | Place::Nowhere => {}
                 }
             }
         }
         by.position.dot(&v) + by.velocity.dot(&self.pushed.0) + turned.dot(&rate) + by.rate.dot(&spin)
     }
 
-    /// Adds the effect of a target's motion on a component until that time; returns its rate of change.
-    pub(crate) fn target(&self, linear: &Linear<'_>, row: usize, target: usize, rows: &mut Rows) -> f64 {
+    /// Adds the effect of a target's motion until that time on a component, at `row` of the rows; returns its rate of change.
+    fn target(&self, (linear, i): (&Linear<'_>, usize), row: usize, target: usize, rows: &mut Rows) -> f64 {
         let mut by = [0.0; 5];
-        for (column, value) in linear.columns().iter().zip(linear.row(row)) {
+        for (column, value) in linear.columns().iter().zip(linear.row(i)) {
             if let Place::Knot(i) = self.places[*column]
                 && (knot::target(target)..knot::target(target) + 5).contains(&i)
             {
                 by[i - knot::target(target)] += value;
             }
         }
-        let (t, flow) = (self.state.target(target), self.state.target_flow(target));
+        let t = self.state.target(target);
         let (s, c) = t[knot::HEADING].sin_cos();
-        let speed = t[knot::SPEED];
-        let (at, dt) = (self.at + knot::target(target), self.dt);
+        let (at, dt, speed) = (self.at + knot::target(target), self.dt, t[knot::SPEED]);
         if dt != 0.0 {
             rows.add(row, at + knot::HEADING, (by[1] * c - by[0] * s) * speed * dt);
             rows.add(row, at + knot::SPEED, (by[0] * c + by[1] * s) * dt);
@@ -147,7 +165,7 @@ impl Instant<'_> {
             rows.add(row, at + knot::ACCELERATION, by[3] * dt);
             rows.add(row, at + knot::YAW_ACCELERATION, by[4] * dt);
         }
-        by.iter().zip(flow).map(|(by, flow)| by * flow).sum()
+        by.iter().zip(self.state.target_flow(target)).map(|(by, flow)| by * flow).sum()
     }
 
     /// Adds a constant's derivative to a component, where it is estimated.
@@ -157,22 +175,34 @@ impl Instant<'_> {
         }
     }
 
+    /// Adds the effect of a delay on the time of a measurement: `sign` of it later.
+    pub(crate) fn timed(&self, flows: &[f64], delay: usize, sign: f64, rows: &mut Rows) {
+        flows.iter().enumerate().for_each(|(row, flow)| self.constant(row, delay, sign * flow, rows));
+    }
+
+    /// By how much a camera that shakes displaces a component, px.
+    fn displaced(&self, linear: &Linear<'_>, i: usize, shake: &[f64]) -> f64 {
+        let of_shake = |(column, by): (&usize, &f64)| match self.places[*column] {
+            Place::Shake(k) => by * shake[k],
+            _ => 0.0,
+        };
+        linear.columns().iter().zip(linear.row(i)).map(of_shake).sum()
+    }
+
     /// Adds the camera's deviation from its configuration to the two components of a pixel that begin at `row`; `flow`
-    /// is their rate of change, `seen` and `left` the pixel and its residual.
-    pub(crate) fn camera(
+    /// is their rate of change, `seen` where it is, and `displaced` what of that is a camera that shakes.
+    fn camera(
         &self,
         linear: &Linear<'_>,
         row: usize,
         flow: [f64; 2],
-        (seen, left): (&Vector2<f64>, &Vector2<f64>),
-        lens: &Lens,
+        (seen, displaced, lens): (&Vector2<f64>, [f64; 2], &Lens),
         rows: &mut Rows,
     ) {
         let r = self.state.attitude.matrix();
         let share = lens.share(seen.y);
-        let from_principal = seen - left - lens.principal_px;
         for k in 0..2 {
-            let by = ByState::of(linear, row + k);
+            let by = ByState::of(linear, k);
             // The position's column is −∂px/∂point; of the camera's place in the body the same, turned.
             let at = r.transpose() * by.position;
             let mount = r.transpose() * by.attitude + at.cross(&lens.camera_at);
@@ -180,9 +210,11 @@ impl Instant<'_> {
                 self.constant(row + k, constant::CAMERA_AT + i, at[i], rows);
                 self.constant(row + k, constant::MOUNT + i, mount[i], rows);
             }
-            self.constant(row + k, constant::FOCAL, from_principal[k], rows);
+            // Displacements are no directions that the lens enlarges: to take them as such is to find it longer, since smaller
+            // ones fit what is expected of them better.
+            let from_principal = seen[k] - linear.residual(k) - displaced[k] - lens.principal_px[k];
+            self.constant(row + k, constant::FOCAL, from_principal, rows);
             self.constant(row + k, constant::READOUT, share * flow[k], rows);
-            self.constant(row + k, constant::CAMERA_DELAY, -flow[k], rows);
         }
     }
 
@@ -208,6 +240,8 @@ pub(crate) struct Lens {
     pub(crate) height_px: f64,
     /// Where it is in the body, m.
     pub(crate) camera_at: Vector3<f64>,
+    /// From the exposure of the first row to that of the last, s.
+    pub(crate) readout_s: f64,
 }
 
 impl Lens {
@@ -215,37 +249,17 @@ impl Lens {
     fn share(&self, v_px: f64) -> f64 {
         v_px / (self.height_px - 1.0) - 0.5
     }
+
+    /// How long after the middle row a row is exposed, s.
+    pub(crate) fn after_s(&self, v_px: f64) -> f64 {
+        self.share(v_px) * self.readout_s
+    }
 }
 
 /// Iron's heading error and its derivatives: sine and cosine of the heading, and of twice the heading.
 pub(crate) fn iron(heading: f64) -> [f64; 4] {
     let ((s, c), (s2, c2)) = (heading.sin_cos(), (2.0 * heading).sin_cos());
     [s, c, s2, c2]
-}
-
-/// A block of pixels, two components each: of a marker on a target, or of a ground feature. `seen` gives their places.
-pub(crate) fn pixels(
-    instant: &Instant<'_>,
-    linear: &Linear<'_>,
-    target: Option<usize>,
-    seen: &dyn Fn(usize) -> Vector2<f64>,
-    lens: &Lens,
-    factor: f64,
-    (rows, block): (&mut Rows, &mut Block),
-) -> bool {
-    let mut flows = instant.write(linear, rows);
-    if let Some(target) = target {
-        for (row, flow) in flows.iter_mut().enumerate() {
-            *flow += instant.target(linear, row, target, rows);
-        }
-    }
-    let residual: Vec<f64> = (0..linear.len()).map(|i| linear.residual(i)).collect();
-    for i in 0..linear.len() / 2 {
-        let row = 2 * i;
-        let left = Vector2::new(residual[row], residual[row + 1]);
-        instant.camera(linear, row, [flows[row], flows[row + 1]], (&seen(i), &left), lens, rows);
-    }
-    finish(rows, |a, b| linear.noise(a, b), &residual, factor, block)
 }
 
 /// Converts rows and residuals to a block of unit variance, `factor` on the variance of the noise; `false` where the

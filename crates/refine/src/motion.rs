@@ -193,7 +193,7 @@ impl Link<'_> {
         match self.places[column] {
             Place::Knot(i) => Some(at + i),
             Place::Constant(i) => Some(self.shape.constants_at() + i),
-            Place::Landmark(_) | Place::Known(_) | Place::Nowhere => None,
+            Place::Landmark(_) | Place::Shake(_) | Place::Known(_) | Place::Nowhere => None,
         }
     }
 

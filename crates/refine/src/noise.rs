@@ -123,6 +123,8 @@ fn fitted(targets: usize) -> impl Iterator<Item = Source> {
         S::Gust,
         S::Thrust,
         S::Vibration,
+        S::Shake,
+        S::ShakeRoll,
     ];
     own.into_iter().chain(
         (0..targets)
@@ -142,6 +144,8 @@ fn limits(source: Source) -> (f64, f64) {
         Source::Vibration => (1e-5, 1.0),
         // Over the configured one: of a vehicle that rolls nothing is given away.
         Source::Slip(_) => (1.0, 1e4),
+        // A hundredth of a pixel of a wide lens to ten of a long one, rad².
+        Source::Shake | Source::ShakeRoll => (1e-11, 1e-4),
         // Displacements of a millimetre to half a metre.
         Source::Sway(_) | Source::Heave(_) => (1e-6, 0.25),
         _ => MOTION,
@@ -151,14 +155,21 @@ fn limits(source: Source) -> (f64, f64) {
 /// Initial displacement of the markers of a target that sways, m.
 const SWAY_M: f64 = 0.02;
 
+/// Least initial displacement of a frame whose camera shakes, rad.
+const SHAKE_RAD: f64 = 2e-4;
+
 /// Initial factors: intensities of jerk and its changes, variances of gusts and of the excess thrust.
-pub(crate) fn first(targets: usize, gust_mps2: f64, thrust_mps2: f64) -> Noise {
+pub(crate) fn first(targets: usize, gust_mps2: f64, thrust_mps2: f64, shake: Option<[f64; 2]>) -> Noise {
     let mut noise = Noise::new(targets);
     noise.set(Source::TiltMotion, 3.0);
     noise.set(Source::YawMotion, 0.5);
     noise.set(Source::Gust, gust_mps2.powi(2));
     noise.set(Source::Thrust, thrust_mps2.powi(2));
     noise.set(Source::Vibration, 0.02f64.powi(2));
+    for (source, sigma) in [Source::Shake, Source::ShakeRoll].into_iter().zip(shake.unwrap_or([SHAKE_RAD; 2]))
+    {
+        noise.set(source, sigma.max(SHAKE_RAD).powi(2));
+    }
     for target in 0..targets {
         noise.set(Source::Drive(target), 6.0);
         noise.set(Source::Turn(target), 2.0);

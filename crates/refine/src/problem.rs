@@ -2,17 +2,18 @@
 
 use windhover_base::geo::wrap_angle;
 use windhover_base::msg::{FixKind, GnssEpoch, MarkerId};
+use windhover_base::time::MonoTime;
 use windhover_estimate::batch::Predictor;
 
 use crate::block::{Block, Noise, Source};
 use crate::front::{Front, Shape};
 use crate::measure::{self, Instant, Lens, Rows};
 use crate::motion::{Link, Processes, Pushed};
-use crate::plan::Plan;
+use crate::plan::{Plan, Stop};
 use crate::recording::Recording;
 use crate::surveyed::ControlPoint;
 use crate::unknowns::{Place, Prior, constant, rig_offsets};
-use crate::values::{Knot, Values};
+use crate::values::{Aside, Knot, Values};
 
 /// The measurements and priors. Nothing here changes during the solution.
 pub(crate) struct Problem<'a> {
@@ -53,8 +54,13 @@ impl Problem<'_> {
         first..(first + self.segment_len).min(self.plan.stops.len())
     }
 
+    /// Whether the frame at a knot has a displacement of its own.
+    pub(crate) fn is_displaced(&self, k: usize) -> bool {
+        self.shape.shake > 0 && self.plan.stops[k].frame.is_some()
+    }
+
     /// A knot's state at a measurement's time, `dt` after it.
-    fn instant<'b>(
+    pub(crate) fn instant<'b>(
         &'b self,
         k: usize,
         state: &'b Knot,
@@ -76,7 +82,7 @@ pub(crate) struct Origin {
 }
 
 impl Origin {
-    const fn of(source: Source) -> Self {
+    pub(crate) const fn of(source: Source) -> Self {
         Self { source, marker: None, landmark: None }
     }
 }
@@ -85,12 +91,12 @@ impl Origin {
 pub(crate) struct Pass<'a> {
     pub(crate) problem: &'a Problem<'a>,
     pub(crate) predictor: Predictor,
-    rows: Rows,
-    block: Block,
-    means: Vec<f64>,
-    estimated: Vec<bool>,
-    pushed: Vec<Pushed>,
-    lens: Lens,
+    pub(crate) rows: Rows,
+    pub(crate) block: Block,
+    pub(crate) means: Vec<f64>,
+    pub(crate) estimated: Vec<bool>,
+    pub(crate) pushed: Vec<Pushed>,
+    pub(crate) lens: Lens,
 }
 
 impl<'a> Pass<'a> {
@@ -100,6 +106,7 @@ impl<'a> Pass<'a> {
             principal_px: predictor.principal_point(),
             height_px: predictor.image_height_px(),
             camera_at: problem.camera_at,
+            readout_s: 0.0,
         };
         Self {
             rows: Rows::new(problem.shape),
@@ -118,9 +125,10 @@ impl<'a> Pass<'a> {
         let offsets = rig_offsets(&values.constants);
         self.predictor.put_rig(&offsets);
         self.lens.camera_at = self.problem.camera_at + offsets.camera_at;
+        self.lens.readout_s = self.predictor.readout_s() + offsets.readout_s;
         self.pushed.clear();
         for state in &values.knots {
-            values.put(state, [0.0; 2], &self.problem.places, &mut self.means, &mut self.predictor);
+            values.put(state, &Aside::NONE, &self.problem.places, &mut self.means, &mut self.predictor);
             self.pushed.push(self.predictor.acceleration());
         }
     }
@@ -185,10 +193,21 @@ impl<'a> Pass<'a> {
         }
     }
 
+    /// How long after a knot something was at this time by its own clock, s: knots are at the exposures of frames, which are
+    /// earlier than their stamps by the camera's delay.
+    fn after_knot(stop: &Stop, t: MonoTime, values: &Values) -> f64 {
+        (t - stop.t).s() + values.constants[constant::CAMERA_DELAY]
+    }
+
     /// The knot's state `dt` later.
-    fn state_at(&self, k: usize, values: &Values, dt: f64) -> Knot {
+    pub(crate) fn state_at(&self, k: usize, values: &Values, dt: f64) -> Knot {
         let state = &values.knots[k];
         if dt == 0.0 { state.clone() } else { state.after(dt, &self.pushed[k].0) }
+    }
+
+    /// Acceleration at a knot.
+    pub(crate) fn pushed_at(&self, k: usize) -> &Pushed {
+        &self.pushed[k]
     }
 
     fn epochs(&mut self, k: usize, values: &Values, noise: &Noise, take: &mut dyn FnMut(Origin, &Block)) {
@@ -196,17 +215,18 @@ impl<'a> Pass<'a> {
         let stop = &problem.plan.stops[k];
         for &index in &stop.epochs {
             let epoch = &problem.recordings[stop.flight].epochs[index];
-            let dt = (epoch.t_valid - stop.t).s();
+            let dt = Self::after_knot(stop, epoch.t_valid, values);
             let state = self.state_at(k, values, dt);
             for source in [Source::GpsVelocity, Source::GpsPosition] {
-                values.put(&state, [0.0; 2], &problem.places, &mut self.means, &mut self.predictor);
+                values.put(&state, &Aside::NONE, &problem.places, &mut self.means, &mut self.predictor);
                 let linear = match source {
                     Source::GpsVelocity => self.predictor.gps_velocity(&epoch.value),
                     _ => self.predictor.gps_position(&epoch.value),
                 };
                 let Some(linear) = linear.filter(|linear| linear.is_finite()) else { continue };
                 let instant = problem.instant(k, &state, &self.pushed[k], dt, &self.estimated);
-                instant.write(&linear, &mut self.rows);
+                let flows = instant.write(&linear, &mut self.rows);
+                instant.timed(&flows, constant::CAMERA_DELAY, 1.0, &mut self.rows);
                 instant.antenna(&linear, &mut self.rows);
                 let residual: Vec<f64> = (0..linear.len()).map(|i| linear.residual(i)).collect();
                 let (noise, factor) = (|a, b| linear.noise(a, b), noise.of(source));
@@ -232,9 +252,9 @@ impl<'a> Pass<'a> {
         let (stop, places) = (&problem.plan.stops[k], &problem.outside_places[..]);
         for &index in &stop.positions {
             let outside = &problem.recordings[stop.flight].positions[index];
-            let dt = (outside.t - stop.t).s();
+            let dt = Self::after_knot(stop, outside.t, values);
             let state = self.state_at(k, values, dt);
-            values.put(&state, [0.0; 2], places, &mut self.means, &mut self.predictor);
+            values.put(&state, &Aside::NONE, places, &mut self.means, &mut self.predictor);
             let epoch = GnssEpoch {
                 fix: FixKind::ThreeD,
                 lat_deg: Some(outside.at.lat_deg),
@@ -246,7 +266,8 @@ impl<'a> Pass<'a> {
             let Some(linear) = linear else { continue };
             let mut instant = problem.instant(k, &state, &self.pushed[k], dt, &self.estimated);
             instant.places = places;
-            instant.write(&linear, &mut self.rows);
+            let flows = instant.write(&linear, &mut self.rows);
+            instant.timed(&flows, constant::CAMERA_DELAY, 1.0, &mut self.rows);
             instant.antenna(&linear, &mut self.rows);
             let residual: Vec<f64> = (0..linear.len()).map(|i| linear.residual(i)).collect();
             let var = |a: usize, b: usize| if a == b { outside.sigma_m[a].powi(2) } else { 0.0 };
@@ -262,12 +283,12 @@ impl<'a> Pass<'a> {
         let late_s = values.constants[constant::COMPASS_DELAY];
         for &index in &stop.readings {
             let reading = &problem.recordings[stop.flight].readings[index];
-            let dt = (reading.t_valid - stop.t).s() - late_s;
+            let dt = Self::after_knot(stop, reading.t_valid, values) - late_s;
             let state = self.state_at(k, values, dt);
             let forward = state.attitude.matrix().column(0).into_owned();
             let iron = measure::iron(forward.y.atan2(forward.x));
             for source in [Source::Heading, Source::Tilt] {
-                values.put(&state, [0.0; 2], &problem.places, &mut self.means, &mut self.predictor);
+                values.put(&state, &Aside::NONE, &problem.places, &mut self.means, &mut self.predictor);
                 let linear = match source {
                     Source::Heading => self.predictor.heading(&reading.value),
                     _ => self.predictor.tilt(&reading.value),
@@ -276,9 +297,8 @@ impl<'a> Pass<'a> {
                 let instant = problem.instant(k, &state, &self.pushed[k], dt, &self.estimated);
                 let flows = instant.write(&linear, &mut self.rows);
                 let mut residual: Vec<f64> = (0..linear.len()).map(|i| linear.residual(i)).collect();
-                for (row, flow) in flows.iter().enumerate() {
-                    instant.constant(row, constant::COMPASS_DELAY, -flow, &mut self.rows);
-                }
+                instant.timed(&flows, constant::CAMERA_DELAY, 1.0, &mut self.rows);
+                instant.timed(&flows, constant::COMPASS_DELAY, -1.0, &mut self.rows);
                 if source == Source::Heading {
                     for (i, by) in iron.iter().enumerate() {
                         residual[0] -= by * values.constants[constant::IRON + i];
@@ -290,49 +310,6 @@ impl<'a> Pass<'a> {
                 if measure::finish(&self.rows, noise, &residual, factor, &mut self.block) {
                     take(Origin::of(source), &self.block);
                 }
-            }
-        }
-    }
-
-    fn frame(&mut self, k: usize, values: &Values, noise: &Noise, take: &mut dyn FnMut(Origin, &Block)) {
-        let problem = self.problem;
-        let stop = &problem.plan.stops[k];
-        let Some(index) = stop.frame else { return };
-        let seen = &problem.recordings[stop.flight].frames[index].value;
-        let dt = -values.constants[constant::CAMERA_DELAY];
-        let state = self.state_at(k, values, dt);
-        for marker in &seen.markers {
-            let Some((target, _)) = self.predictor.find(marker.marker) else { continue };
-            if !stop.held[target] {
-                continue;
-            }
-            values.put(&state, [0.0; 2], &problem.places, &mut self.means, &mut self.predictor);
-            let Some(linear) = self.predictor.marker(marker).filter(|l| l.is_finite()) else { continue };
-            let instant = problem.instant(k, &state, &self.pushed[k], dt, &self.estimated);
-            let pixel = |i: usize| marker.corners_px.map_or(marker.center_px, |corners| corners[i]);
-            let origin = Origin { marker: Some(marker.marker), ..Origin::of(Source::Marker(target)) };
-            let work = (&mut self.rows, &mut self.block);
-            let factor = noise.of(origin.source);
-            if measure::pixels(&instant, &linear, Some(target), &pixel, &self.lens, factor, work) {
-                take(origin, &self.block);
-            }
-        }
-        for followed in &stop.features {
-            if problem.dropped[followed.landmark] {
-                continue;
-            }
-            let feature = &seen.features[followed.index];
-            let landmark = values.landmarks[followed.landmark];
-            values.put(&state, landmark, &problem.places, &mut self.means, &mut self.predictor);
-            let linear = self.predictor.feature(&feature.px, feature.sigma_px);
-            let Some(linear) = linear.filter(|linear| linear.is_finite()) else { continue };
-            let mut instant = problem.instant(k, &state, &self.pushed[k], dt, &self.estimated);
-            instant.landmark_at = problem.shape.landmark_at(followed.place);
-            let origin = Origin { landmark: Some(followed.landmark), ..Origin::of(Source::Feature) };
-            let work = (&mut self.rows, &mut self.block);
-            let factor = noise.of(Source::Feature);
-            if measure::pixels(&instant, &linear, None, &|_| feature.px, &self.lens, factor, work) {
-                take(origin, &self.block);
             }
         }
     }

@@ -7,7 +7,7 @@ use windhover_base::msg::{FeltTilt, FixKind, TargetEstimate};
 use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::MonoTime;
 use windhover_estimate::Site;
-use windhover_estimate::batch::Predictor;
+use windhover_estimate::batch::{Predictor, SHAKE_COLUMNS};
 
 use crate::covariance_pass::{PassResult, look};
 use crate::front::Shape;
@@ -103,7 +103,9 @@ pub fn refine(
     }
     let mut problem = stated((rig, estimator, site), recordings, plan, &mut predictor, &firsts);
     let mut values = first_values(&problem, &firsts, &predictor, rig, site);
-    let mut noise = first_noise(problem.targets, estimator.side_force_mps2, estimator.thrust_mps2);
+    let (gust_mps2, thrust_mps2) = (estimator.side_force_mps2, estimator.thrust_mps2);
+    let mut noise =
+        first_noise(problem.targets, gust_mps2, thrust_mps2, shake_of(&firsts).map(|shake| shake.0));
     let total = (problem.plan.stops.len() * (ROUNDS + 1) * 3) as f64;
     let mut done = 0usize;
     let mut step = |_: usize| {
@@ -150,6 +152,11 @@ fn why_not_started(recordings: &[Recording]) -> RefineError {
     }
 }
 
+/// How far the camera shakes, of several flights that in which it does most.
+fn shake_of(firsts: &[InitialValues]) -> Option<([f64; 2], f64)> {
+    firsts.iter().filter_map(|first| first.shake).max_by(|a, b| a.0[0].total_cmp(&b.0[0]))
+}
+
 pub(crate) fn planned(
     predictor: &Predictor,
     recordings: &[Recording],
@@ -180,6 +187,9 @@ pub(crate) fn stated<'a>(
     let sways: Vec<bool> =
         (0..targets).map(|target| firsts.iter().any(|first| first.sways[target])).collect();
     sways.iter().enumerate().for_each(|(target, sways)| predictor.set_sways(target, *sways));
+    let shake = shake_of(firsts);
+    predictor.set_shakes(shake.map(|shake| shake.1));
+    let shakes = shake.is_some();
     let wanders = firsts.iter().map(|first| first.wanders).fold(1.0, f64::max);
     let seen = plan.stops.iter().filter(|stop| stop.held.contains(&true)).count();
     let blind = (seen as f64) < BLIND * plan.stops.len() as f64;
@@ -189,12 +199,17 @@ pub(crate) fn stated<'a>(
     }
     let reading = predictor.tilt_error();
     let control_points = control_points(rig, predictor, &site.frame, recordings, &priors);
-    let places = places(predictor, &sways, &priors);
+    let places = places(predictor, &sways, shakes, &priors);
     let heights = sways.iter().enumerate().map(|(t, sways)| sways.then(|| predictor.markers_height_m(t)));
     let sways = heights.collect();
     let best_fix = recordings.iter().flat_map(|r| &r.epochs).map(|e| e.value.fix).max();
     let (vars, tau_s) = predictor.gps_bias(best_fix.unwrap_or(FixKind::ThreeD));
-    let shape = Shape { knot: knot::target(targets), landmarks: plan.places, constants: priors.len() };
+    let shape = Shape {
+        knot: knot::target(targets),
+        landmarks: plan.places,
+        shake: if shakes { SHAKE_COLUMNS } else { 0 },
+        constants: priors.len(),
+    };
     Problem {
         recordings,
         control_points,
@@ -247,6 +262,7 @@ pub(crate) fn first_values(
         knots,
         landmarks: vec![[0.0; 2]; problem.plan.landmarks],
         constants: problem.priors.iter().map(|prior| prior.mean).collect(),
+        shakes: if problem.shape.shake > 0 { vec![[0.0; SHAKE_COLUMNS]; stops.len()] } else { Vec::new() },
     };
     place_landmarks(problem, rig, site, &mut values);
     values
@@ -327,6 +343,7 @@ impl Refined {
         felt: Option<FeltTilt>,
         inflation: f64,
     ) {
+        self.clocks.iter_mut().for_each(|clock| clock.sigma_s *= inflation.sqrt());
         for (constant, prior) in self.constants.iter_mut().zip(&problem.priors) {
             if prior.is_estimated() {
                 constant.sigma = (constant.sigma * inflation.sqrt()).min(prior.sigma);

@@ -41,6 +41,28 @@ impl Constant {
     }
 }
 
+/// By how much the camera's delay is larger than another one: known far better than each of them, since only configured
+/// latencies say anything of absolute time.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct ClockDifference {
+    /// The other delay.
+    pub other: ConstantKind,
+    /// The difference, s.
+    pub late_s: f64,
+    /// One sigma, s.
+    pub sigma_s: f64,
+}
+
+impl ClockDifference {
+    /// Whether it is no difference of careful latencies: beyond three sigmas, and larger than exposure times and drivers have.
+    pub fn is_settled(&self) -> bool {
+        self.late_s.abs() > LEAST_LATE_S.max(3.0 * self.sigma_s)
+    }
+}
+
+/// Less is not reported, s.
+const LEAST_LATE_S: f64 = 0.01;
+
 /// A measurement that does not fit.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Outlier {
@@ -78,6 +100,8 @@ pub struct Refined {
     pub targets: Vec<(usize, TargetEstimate)>,
     /// Constants of the flight.
     pub constants: Vec<Constant>,
+    /// By how much the camera's delay is larger than that of the compass and of the receiver.
+    pub clocks: Vec<ClockDifference>,
     /// EliminatedKind the tilt sensor was assumed to measure.
     pub felt: Option<FeltTilt>,
     /// The outliers, the largest first.

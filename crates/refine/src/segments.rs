@@ -24,7 +24,7 @@ fn a_flight_in_segments_is_solved_as_in_one() {
         let mut problem = stated((&rig, &config, &site), &recordings, plan, &mut predictor, &firsts);
         problem.segment_len = segment_len;
         let mut values = first_values(&problem, &firsts, &predictor, &rig, &site);
-        let noise = first_noise(problem.targets, config.side_force_mps2, config.thrust_mps2);
+        let noise = first_noise(problem.targets, config.side_force_mps2, config.thrust_mps2, None);
         let mut pass = Pass::new(&problem, predictor);
         let factors = solve(&mut pass, &mut values, &noise, 1e-3, &mut |_| true).expect("a flight");
         let looked = look(&mut pass, &factors, &values, &noise, &site, &recordings);

@@ -19,6 +19,8 @@ pub(crate) const LANDMARK: f64 = 1e-8;
 pub(crate) enum EliminatedKind {
     Knot(usize),
     Landmark(usize),
+    /// The displacement of the frame at a knot.
+    Shake(usize),
     Constants,
 }
 
@@ -142,6 +144,9 @@ fn eliminate_knot(
         cost += loss.cost;
         front.add(&block.columns, &block.rows, &block.right, loss.weight);
     });
+    if problem.is_displaced(k) {
+        steps.push((EliminatedKind::Shake(k), front.eliminate(shape.shake_at(), shape.shake, raised)?));
+    }
     steps.push((EliminatedKind::Knot(k), front.eliminate(shape.knot_at(k), shape.knot, raised)?));
     for (place, landmark) in &problem.plan.stops[k].closes {
         let first = shape.landmark_at(*place);
@@ -207,6 +212,7 @@ impl Values {
         match what {
             EliminatedKind::Knot(k) => self.knots[k].step(dx),
             EliminatedKind::Landmark(l) => self.landmarks[l].iter_mut().zip(dx).for_each(|(x, d)| *x += d),
+            EliminatedKind::Shake(k) => self.shakes[k].iter_mut().zip(dx).for_each(|(x, d)| *x += d),
             EliminatedKind::Constants => self.constants.iter_mut().zip(dx).for_each(|(x, d)| *x += d),
         }
     }

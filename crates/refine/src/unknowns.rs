@@ -261,6 +261,8 @@ pub(crate) enum Place {
     Knot(usize),
     Constant(usize),
     Landmark(usize),
+    /// Displacement of the frame at hand.
+    Shake(usize),
     /// A constant that is not estimated.
     Known(usize),
     /// No unknown.
@@ -275,7 +277,7 @@ pub(crate) fn outside_places(places: &[Place]) -> Vec<Place> {
 }
 
 /// The place of each column.
-pub(crate) fn places(predictor: &Predictor, sways: &[bool], priors: &[Prior]) -> Vec<Place> {
+pub(crate) fn places(predictor: &Predictor, sways: &[bool], shakes: bool, priors: &[Prior]) -> Vec<Place> {
     let mut places = vec![Place::Nowhere; predictor.len()];
     let of_knot = [
         (columns::POSITION, knot::POSITION),
@@ -313,6 +315,8 @@ pub(crate) fn places(predictor: &Predictor, sways: &[bool], priors: &[Prior]) ->
         range.enumerate().filter(|_| *sways).for_each(|(i, column)| places[column] = Place::Knot(first + i));
     }
     predictor.feature_columns().enumerate().for_each(|(i, column)| places[column] = Place::Landmark(i));
+    let shake = predictor.shake_columns().enumerate().filter(|_| shakes);
+    shake.for_each(|(i, column)| places[column] = Place::Shake(i));
     for tag in 0..predictor.tags().len() {
         let first = constant::TAGS + TAG_COLUMNS * tag;
         let range = predictor.tag_columns(tag);

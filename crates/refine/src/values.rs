@@ -2,7 +2,7 @@
 
 use nalgebra::{Rotation3, Vector3};
 
-use windhover_estimate::batch::Predictor;
+use windhover_estimate::batch::{Predictor, SHAKE_COLUMNS};
 
 use crate::unknowns::{Place, knot};
 
@@ -45,8 +45,10 @@ impl Knot {
         let targets = (self.x.len() - knot::TARGETS) / knot::TARGET;
         for i in 0..targets {
             let flow = self.target_flow(i);
+            let bend = self.target_bend(i);
             let at = knot::target(i);
-            next.x[at..at + 5].iter_mut().zip(flow).for_each(|(x, rate)| *x += rate * dt);
+            let changes = flow.iter().zip(bend).map(|(rate, bend)| dt * (rate + 0.5 * dt * bend));
+            next.x[at..at + 5].iter_mut().zip(changes).for_each(|(x, change)| *x += change);
         }
         next
     }
@@ -58,6 +60,15 @@ impl Knot {
         let speed = t[knot::SPEED];
         [speed * c, speed * s, t[knot::YAW_RATE], t[knot::ACCELERATION], t[knot::YAW_ACCELERATION]]
     }
+
+    /// Rates of change of these rates.
+    pub(crate) fn target_bend(&self, i: usize) -> [f64; 5] {
+        let t = self.target(i);
+        let (s, c) = t[knot::HEADING].sin_cos();
+        let (along, across) = (t[knot::ACCELERATION], t[knot::SPEED] * t[knot::YAW_RATE]);
+        let turn = t[knot::YAW_ACCELERATION];
+        [along * c - across * s, along * s + across * c, turn, t[knot::JERK], t[knot::YAW_JERK]]
+    }
 }
 
 /// All unknowns.
@@ -67,14 +78,32 @@ pub(crate) struct Values {
     /// North and east of each ground feature.
     pub(crate) landmarks: Vec<[f64; 2]>,
     pub(crate) constants: Vec<f64>,
+    /// Displacement of the frame at each knot by a camera that shakes; empty where it does not.
+    pub(crate) shakes: Vec<[f64; SHAKE_COLUMNS]>,
+}
+
+/// What a measurement depends on beside a knot's state and the constants.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Aside {
+    pub(crate) landmark: [f64; 2],
+    pub(crate) shake: [f64; SHAKE_COLUMNS],
+}
+
+impl Aside {
+    pub(crate) const NONE: Self = Self { landmark: [0.0; 2], shake: [0.0; SHAKE_COLUMNS] };
 }
 
 impl Values {
-    /// Sets the models to a knot's state, with a landmark.
+    /// The displacement of the frame at a knot.
+    pub(crate) fn shake(&self, k: usize) -> [f64; SHAKE_COLUMNS] {
+        self.shakes.get(k).copied().unwrap_or([0.0; SHAKE_COLUMNS])
+    }
+
+    /// Sets the models to a knot's state.
     pub(crate) fn put(
         &self,
         state: &Knot,
-        landmark: [f64; 2],
+        aside: &Aside,
         places: &[Place],
         means: &mut [f64],
         predictor: &mut Predictor,
@@ -83,7 +112,8 @@ impl Values {
             *mean = match *place {
                 Place::Knot(i) => state.x[i],
                 Place::Constant(i) | Place::Known(i) => self.constants[i],
-                Place::Landmark(i) => landmark[i],
+                Place::Landmark(i) => aside.landmark[i],
+                Place::Shake(i) => aside.shake[i],
                 Place::Nowhere => 0.0,
             };
         }

@@ -30,6 +30,23 @@ pub struct Lateness {
 }
 
 /// The sensors of a flight that is being flown.
+///
+/// ```
+/// use std::sync::Arc;
+/// use nalgebra::Vector3;
+/// use windhover_simulate::{ClosedFlight, Lateness, Scenario, World};
+///
+/// let world = Arc::new(World::flown(Scenario::named("hover10").expect("a named scenario"), 7));
+/// // Without threads nothing is rendered.
+/// let (mut flight, mut events) = (ClosedFlight::new(Arc::clone(&world), Lateness::default(), 0), Vec::new());
+/// for _ in 0..200 {
+///     // The pilot demands an acceleration; the sensors measure what comes of it.
+///     world.fly(&Vector3::new(0.5, 0.0, 0.0));
+///     flight.step(&mut events).expect("nothing is compressed");
+/// }
+/// assert!(flight.now() > world.time(0.5) && !events.is_empty());
+/// assert!(world.ownship(flight.now()).velocity_ned_mps.x > 0.0);
+/// ```
 pub struct ClosedFlight {
     world: Arc<World>,
     renderer: Option<Renderer>,

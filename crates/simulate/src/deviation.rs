@@ -4,6 +4,16 @@ use super::deviations::{COMPOSED, DEVIATIONS};
 use super::scenario::Scenario;
 
 /// One deviation from the configuration.
+///
+/// ```
+/// use windhover_simulate::{Deviation, DeviationError, Scenario};
+///
+/// // A flight with three people in view and a tag that is 5 % larger than configured.
+/// let scenario = Scenario::described("follow+people=3+tag-size=5").expect("both are within their limits");
+/// assert_eq!(scenario.rig.target[0].marker[0].size_m, Some(0.48));
+/// assert!(Deviation::named("tag-size").is_some_and(|deviation| deviation.limits.1 >= 5.0));
+/// assert!(matches!(Scenario::described("follow+tag-size=1e9"), Err(DeviationError::OutOfLimits { .. })));
+/// ```
 #[derive(Clone, Copy, Debug)]
 pub struct Deviation {
     /// Its name.

@@ -55,6 +55,26 @@ impl Default for FollowerTuning {
 }
 
 /// The follower.
+///
+/// ```
+/// use nalgebra::Vector3;
+/// use windhover_base::time::{MonoTime, Span};
+/// use windhover_simulate::{FollowTarget, Follower, FollowerTuning};
+///
+/// let mut follower = Follower::new(FollowerTuning::default());
+/// let (now, here) = (MonoTime::from_ns(1_000_000_000), Vector3::new(0.0, 0.0, -12.0));
+/// // A vehicle 5 m north that stands: it accelerates north.
+/// let target = FollowTarget {
+///     stamp: Span::from_s(100.0),
+///     position_m: Vector3::new(5.0, 0.0, 0.0),
+///     velocity_mps: Vector3::zeros(),
+///     acceleration_mps2: Vector3::zeros(),
+/// };
+/// follower.hear(&target, now);
+/// follower.command(now, &here, &Vector3::zeros());
+/// let wanted = follower.command(now + Span::from_ms(100.0), &here, &Vector3::zeros());
+/// assert!(wanted.x > 0.0 && wanted.y.abs() < 1e-9);
+/// ```
 #[derive(Clone, Debug)]
 pub struct Follower {
     tuning: FollowerTuning,

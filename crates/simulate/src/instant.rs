@@ -25,6 +25,18 @@ pub struct OwnshipTruth {
 }
 
 /// A vehicle at an instant: the ground under the middle of its rear axle.
+///
+/// ```
+/// use windhover_simulate::{Scenario, World};
+/// use nalgebra::Vector3;
+///
+/// let world = World::new(Scenario::named("hover10").expect("a named scenario"), 7);
+/// let vehicle = world.vehicle(0, world.time(1.0));
+/// // Its reference point, a metre ahead of the rear axle.
+/// let ahead = vehicle.reference(1.0);
+/// let origin = vehicle.ned_of(&Vector3::zeros());
+/// assert!(((ahead - origin.xy()).norm() - 1.0).abs() < 1e-9);
+/// ```
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct VehicleTruth {
     /// Metres north of the origin.

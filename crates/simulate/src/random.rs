@@ -5,6 +5,14 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 
 /// One stream of random figures. Streams of one seed with different purposes are independent.
+///
+/// ```
+/// use windhover_simulate::Stream;
+///
+/// let draw = |seed, number| Stream::new(seed, number).normal();
+/// assert_eq!(draw(7, 1), draw(7, 1));
+/// assert!(draw(7, 1) != draw(7, 2) && draw(7, 1) != draw(8, 1));
+/// ```
 #[derive(Clone, Debug)]
 pub struct Stream(ChaCha8Rng);
 
@@ -71,6 +79,17 @@ impl Stream {
 const TERMS: usize = 7;
 
 /// A smooth random function of time: sines whose periods spread over a band, with random phases.
+///
+/// ```
+/// use windhover_simulate::{SmoothNoise, Stream};
+///
+/// let sway = SmoothNoise::new(0.5, 1.0, 8.0, &mut Stream::new(7, 1));
+/// let mean_square = (0..10_000).map(|k| sway.at(f64::from(k) * 0.1).powi(2)).sum::<f64>() / 10_000.0;
+/// assert!((mean_square.sqrt() - 0.5).abs() < 0.05);
+/// // The rate is the derivative.
+/// let by_difference = (sway.at(3.0 + 1e-5) - sway.at(3.0 - 1e-5)) / 2e-5;
+/// assert!((sway.rate(3.0) - by_difference).abs() < 1e-6);
+/// ```
 #[derive(Clone, Debug)]
 pub struct SmoothNoise {
     amplitude: f64,

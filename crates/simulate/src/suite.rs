@@ -77,6 +77,25 @@ impl Followed {
 
 /// The sensors of one flight. An iterator of [`Sample`]s in order of arrival; nothing is allocated
 /// from one sample to the next once the buffers have grown.
+///
+/// ```
+/// use std::sync::Arc;
+/// use windhover_simulate::{Sample, Scenario, SensorSuite, World};
+///
+/// let mut scenario = Scenario::named("hover10").expect("a named scenario");
+/// scenario.duration_s = 2.0;
+/// let world = Arc::new(World::new(scenario, 7));
+/// let mut suite = SensorSuite::new(Arc::clone(&world));
+/// let (mut fixes, mut seen) = (0, 0);
+/// while let Some(sample) = suite.next() {
+///     match sample {
+///         Sample::Gnss { .. } => fixes += 1,
+///         Sample::Attitude { .. } => {}
+///         Sample::Frame { .. } => seen += suite.observations().markers.len(),
+///     }
+/// }
+/// assert!(fixes > 5 && seen > 20, "{fixes} fixes, {seen} markers");
+/// ```
 #[derive(Clone, Debug)]
 pub struct SensorSuite {
     world: Arc<World>,

@@ -23,6 +23,19 @@ pub fn vehicle_header(world: &World, target: usize) -> String {
 
 /// A vehicle's row at a frame: what was true in the middle of the exposure, under the frame's stamp.
 /// Speed is that of the rear axle. A marker behind the camera has no centre.
+///
+/// ```
+/// use std::sync::Arc;
+/// use windhover_simulate::{Sample, Scenario, SensorSuite, World, truth};
+///
+/// let world = Arc::new(World::new(Scenario::named("hover10").expect("a named scenario"), 7));
+/// let first = SensorSuite::new(Arc::clone(&world)).find_map(|sample| match sample {
+///     Sample::Frame { truth, .. } => Some(truth),
+///     _ => None,
+/// });
+/// let row = truth::vehicle_row(&world, 0, &first.expect("there are frames"));
+/// assert_eq!(row.split(',').count(), truth::vehicle_header(&world, 0).split(',').count());
+/// ```
 pub fn vehicle_row(world: &World, target: usize, frame: &FrameTruth) -> String {
     let vehicle = world.vehicle(target, frame.t_true);
     let config = &world.scenario().rig.target[target];

@@ -20,6 +20,16 @@ const AFTER_S: f64 = 1.0;
 const VIBRATION_S: (f64, f64) = (0.02, 0.06);
 
 /// The motion of everything in a scenario. Deterministic in scenario and seed.
+///
+/// ```
+/// use windhover_simulate::{Scenario, World};
+///
+/// let world = World::new(Scenario::named("follow").expect("a named scenario"), 7);
+/// let (before, after) = (world.vehicle(0, world.time(9.9)), world.vehicle(0, world.time(10.1)));
+/// // Position and speed are of one motion.
+/// let moved = (after.north_m - before.north_m).hypot(after.east_m - before.east_m);
+/// assert!((moved / 0.2 - world.vehicle(0, world.time(10.0)).speed_mps.abs()).abs() < 0.05);
+/// ```
 #[derive(Clone, Debug)]
 pub struct World {
     scenario: Scenario,

@@ -29,6 +29,40 @@ pub fn adopted(refined: &Refined, config: &Config) -> String {
     text + &markers(&found, config)
 }
 
+/// What a flight may show to be wrong at once: of more, what is one and what is the other is not known.
+const MOST_AT_ONCE: usize = 3;
+
+/// The parts of the configuration that a flight shows to be wrong, where these are too many for one flight to tell their effects
+/// apart; empty otherwise. Each absorbs some of the others then, and sigmas do not show it.
+pub fn too_many(refined: &Refined, config: &Config) -> Vec<String> {
+    let found = Found(&refined.constants);
+    let any = |kinds: &[ConstantKind]| kinds.iter().any(|kind| found.settled(*kind).is_some());
+    let three = |of: fn(usize) -> ConstantKind| [0, 1, 2].map(of);
+    let lens = [0, 1, 2, 3].map(ConstantKind::Lens);
+    let angles = [ConstantKind::HeadingBias, ConstantKind::TiltBias(0), ConstantKind::TiltBias(1)];
+    let parts = [
+        ("the receiver's latency", any(&[ConstantKind::GpsDelay])),
+        ("the antenna's place", any(&three(ConstantKind::AntennaAt))),
+        ("the compass's angles", any(&angles)),
+        ("the compass's latency", any(&[ConstantKind::CompassDelay])),
+        ("the camera's exposure offset", any(&[ConstantKind::CameraDelay])),
+        ("its read-out", any(&[ConstantKind::Readout])),
+        ("its focal length", any(&[ConstantKind::Focal])),
+        ("its distortion", any(&lens)),
+        ("its place", any(&three(ConstantKind::CameraAt))),
+        ("its mount", any(&three(ConstantKind::Mount))),
+    ];
+    let mut wrong: Vec<String> =
+        parts.into_iter().filter(|(_, wrong)| *wrong).map(|(part, _)| part.to_owned()).collect();
+    for (target, of) in config.target.iter().enumerate() {
+        let tag = |marker: usize| [0, 1, 2, 3].map(|part| ConstantKind::Tag { target, marker, part });
+        if (0..of.marker.len()).any(|marker| any(&tag(marker))) {
+            wrong.push(format!("the markers of {}", of.name));
+        }
+    }
+    if wrong.len() > MOST_AT_ONCE { wrong } else { Vec::new() }
+}
+
 struct Found<'a>(&'a [Constant]);
 
 impl Found<'_> {

@@ -6,7 +6,7 @@ mod outside;
 mod words;
 mod write;
 
-pub use adopt::adopted;
+pub use adopt::{adopted, too_many};
 pub use beside::RefinedBeside;
 pub use words::{ConstantWords, constant_words, source_name};
 

@@ -76,6 +76,8 @@ pub fn source_name(source: Source, targets: &[TargetConfig]) -> String {
         Source::Gust => "gust".into(),
         Source::Thrust => "thrust".into(),
         Source::Vibration => "vibration".into(),
+        Source::Shake => "camera_shake".into(),
+        Source::ShakeRoll => "camera_shake_roll".into(),
         Source::Drive(target) => format!("{}/drive", of(target)),
         Source::Turn(target) => format!("{}/turn", of(target)),
         Source::Sway(target) => format!("{}/sway", of(target)),
@@ -127,6 +129,18 @@ pub(super) fn remarks(flight: &Flight, refined: &Refined) -> Vec<String> {
     if refined.features.1 > 0 {
         let moving = counted(refined.features.1, "ground feature");
         remarks.push(format!("{moving} left out: they lie on something that moves"));
+    }
+    for clock in refined.clocks.iter().filter(|clock| clock.is_settled()) {
+        let other = if clock.other == ConstantKind::GpsDelay {
+            "the receiver's fixes"
+        } else {
+            "the compass's readings"
+        };
+        remarks.push(format!(
+            "frames are {:.1} ± {:.1} ms later against {other} than configured; the flight does not show which of the two is wrong",
+            clock.late_s * 1e3,
+            clock.sigma_s * 1e3
+        ));
     }
     match refined.felt {
         Some(FeltTilt::Force) => remarks.push("the compass's tilt sensor measures specific force".to_owned()),

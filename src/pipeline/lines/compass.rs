@@ -12,6 +12,8 @@ pub(in crate::pipeline) struct CompassLine {
     decoder: CompassDecoder,
     heard: Vec<ReceivedAttitude>,
     clock: SteadyClock,
+    /// Of rates and forces that come in sentences of their own.
+    inertial_clock: SteadyClock,
     wire: Wire,
     latency: Span,
     /// Latency of its rates and forces, where these are used.
@@ -24,6 +26,7 @@ impl CompassLine {
             decoder: CompassDecoder::new(config.format).checksums_required(config.require_checksum),
             heard: Vec::new(),
             clock: SteadyClock::new(),
+            inertial_clock: SteadyClock::new(),
             wire: Wire::new(config.framing, config.baud),
             latency: Span::from_ms(config.latency_ms),
             inertial_latency: config.imu.then(|| Span::from_ms(inertial_latency_ms)),
@@ -35,10 +38,14 @@ impl CompassLine {
     fn stamp(&mut self, seq: u64, out: &mut Vec<SensorReading>) {
         for heard in self.heard.drain(..) {
             let length = heard.bytes + heard.bytes_after;
-            let began = self.clock.smooth(heard.t_first - self.wire.time(length));
+            let alone = heard.reading.is_inertial_only();
+            let clock = if alone { &mut self.inertial_clock } else { &mut self.clock };
+            let began = clock.smooth(heard.t_first - self.wire.time(length));
             let t_recv = heard.t_recv;
-            let sample = Stamped { t_valid: began - self.latency, t_recv, seq, value: heard.sample };
-            out.push(SensorReading::Attitude(sample));
+            if !alone {
+                let sample = Stamped { t_valid: began - self.latency, t_recv, seq, value: heard.sample };
+                out.push(SensorReading::Attitude(sample));
+            }
             let inertial = self.inertial_latency.zip(heard.reading.inertial);
             if let Some((latency, value)) = inertial.filter(|(_, sample)| sample.can_be()) {
                 out.push(SensorReading::Inertial(Stamped { t_valid: began - latency, t_recv, seq, value }));
@@ -99,6 +106,25 @@ mod tests {
                 }
                 _ => panic!("{imu}: {rest:?}"),
             }
+        }
+    }
+
+    #[test]
+    fn rates_in_sentences_of_their_own_leave_the_attitude_as_it_is() {
+        let (psbgi, heading) =
+            ("PSBGI,003944.74,-0.08,0.07,0.00,-0.02,0.06,-9.72,", "PSBGA,003944.740,V,1.0,2.0,30.0,,,,P,v,v");
+        for imu in [false, true] {
+            let config = CompassConfig { format: CompassFormat::Nmea, imu, ..CompassConfig::default() };
+            let (mut compass, mut out) = (CompassLine::new(&config, 0.0), Vec::new());
+            for period in 0..20_i64 {
+                for (ms, body) in [(0, heading), (3, psbgi), (10, psbgi)] {
+                    let t = MonoTime::from_ns((period * 20 + ms) * 1_000_000);
+                    compass.push((framed(body) + "\r\n").as_bytes(), t, 0, &mut out);
+                }
+            }
+            let attitudes = out.iter().filter(|r| matches!(r, SensorReading::Attitude(_))).count();
+            let rates = out.iter().filter(|r| matches!(r, SensorReading::Inertial(_))).count();
+            assert_eq!((attitudes, rates), (20, if imu { 40 } else { 0 }));
         }
     }
 }

@@ -22,6 +22,18 @@ pub enum LensModel {
 /// Fisheye, `θ = atan r`: `xd = x θd / r`, `yd = y θd / r`, `θd = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)`.
 /// Both: `u = fx (xd + skew · yd) + cx`, `v = fy yd + cy` (Brown 1966; Kannala and Brandt 2006; Bouguet's toolbox, `skew`
 /// is its α).
+///
+/// ```
+/// use windhover_base::geo::CameraModel;
+/// use nalgebra::Vector3;
+///
+/// let camera = CameraModel { fx: 1000.0, fy: 1000.0, cx: 640.0, cy: 512.0, ..CameraModel::UNIT };
+/// let seen = camera.project(&Vector3::new(1.0, -0.5, 10.0)).expect("it is in front of the camera");
+/// assert_eq!((seen.px.x, seen.px.y), (740.0, 462.0));
+/// let ray = camera.normalised(seen.px).expect("the lens has a ray for it");
+/// assert!((ray.x - 0.1).abs() < 1e-12 && (ray.y + 0.05).abs() < 1e-12);
+/// assert!(camera.project(&Vector3::new(0.0, 0.0, -1.0)).is_none());
+/// ```
 #[derive(Clone, Copy, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CameraModel {

@@ -21,6 +21,18 @@ pub struct DeclinationError {
 
 /// Declination at a place and time, radians, east positive: `ψ_true = ψ_magnetic + declination`.
 ///
+/// ```
+/// use windhover_base::geo::{Geodetic, declination};
+/// use windhover_base::time::UtcTime;
+///
+/// // Central Europe at the end of 2026: some degrees east.
+/// let place = Geodetic { lat_deg: 47.0, lon_deg: 8.0, height_m: 400.0 };
+/// let angle = declination(place, UtcTime::from_unix_ns(1_795_000_000_000_000_000)).expect("the model covers it");
+/// assert!((2.0..5.0).contains(&angle.to_degrees()));
+/// // The model has an end.
+/// assert!(declination(place, UtcTime::from_unix_ns(4_000_000_000_000_000_000)).is_err());
+/// ```
+///
 /// # Errors
 /// Where the model does not cover the place or the date.
 pub fn declination(at: Geodetic, date: UtcTime) -> Result<f64, DeclinationError> {

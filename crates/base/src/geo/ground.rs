@@ -7,6 +7,18 @@ use nalgebra::Vector3;
 use super::Terrain;
 
 /// A ground surface.
+///
+/// ```
+/// use windhover_base::geo::Ground;
+/// use nalgebra::Vector3;
+///
+/// let ground = Ground::Flat { down_m: 2.0 };
+/// let (from, direction) = (Vector3::new(0.0, 0.0, -8.0), Vector3::new(0.0, 1.0, 1.0));
+/// assert_eq!(ground.intersect(&from, &direction, 0.0), Some(10.0));
+/// // The roof of something 0.5 m high is met earlier; a ray that rises meets nothing.
+/// assert_eq!(ground.intersect(&from, &direction, 0.5), Some(9.5));
+/// assert_eq!(ground.intersect(&from, &-Vector3::z(), 0.0), None);
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub enum Ground {
     /// A level plane at this down coordinate, metres.

@@ -48,6 +48,22 @@ pub struct PoseSigmas {
 /// the ground (a marker on a roof), `limit_m` the largest accepted slant range. `d = ned_from_camera [u v 1]ᵀ`, `Zc =
 /// (D0 − p_D)/d_D`, `G = p + Zc d` (paper eq. 11–13, corrected).
 ///
+/// ```
+/// use windhover_base::geo::{CameraModel, Ground, ImageTop, LocateError, body_from_camera, locate};
+/// use nalgebra::{Vector2, Vector3};
+///
+/// // A level helicopter that heads north, 10 m over level ground.
+/// let camera = CameraModel { fx: 1000.0, fy: 1000.0, cx: 640.0, cy: 512.0, ..CameraModel::UNIT };
+/// let ned_from_camera = body_from_camera(ImageTop::Forward, 0.0, 0.0, 0.0);
+/// let (at, ground) = (Vector3::new(5.0, 0.0, -10.0), Ground::Flat { down_m: 0.0 });
+/// let find = |px, limit_m| locate(&camera, &at, &ned_from_camera, px, &ground, 0.0, limit_m);
+///
+/// // 100 pixels right of the centre are a metre east.
+/// let point = find(Vector2::new(740.0, 512.0), 100.0).expect("the ray meets the ground");
+/// assert!((point.ned_m - Vector3::new(5.0, 1.0, 0.0)).norm() < 1e-9);
+/// assert_eq!(find(Vector2::new(740.0, 512.0), 5.0), Err(LocateError::TooFar));
+/// ```
+///
 /// # Errors
 /// Where the pixel is outside the lens model, or its ray does not meet the ground within `limit_m`.
 pub fn locate(
@@ -73,6 +89,21 @@ pub fn locate(
 ///
 /// Let `n = (∂D/∂N, ∂D/∂E, −1)` be the ground's normal, scaled so that it is also valid on a slope. A small change `δ`
 /// of the ray's far end then moves the ground point by `(I − d nᵀ/(nᵀd)) δ`.
+///
+/// ```
+/// use windhover_base::geo::{CameraModel, Ground, ImageTop, PoseSigmas, body_from_camera, locate_with_covariance};
+/// use nalgebra::{Matrix2, Vector2, Vector3};
+///
+/// let camera = CameraModel { fx: 1000.0, fy: 1000.0, cx: 640.0, cy: 512.0, ..CameraModel::UNIT };
+/// let ned_from_camera = body_from_camera(ImageTop::Forward, 0.0, 0.0, 0.0);
+/// let (at, ground) = (Vector3::new(0.0, 0.0, -10.0), Ground::Flat { down_m: 0.0 });
+/// // A pixel's error alone: at 10 m and 1000 px it is a centimetre.
+/// let sigmas = PoseSigmas { pixel_px2: Matrix2::identity(), ..PoseSigmas::default() };
+/// let px = Vector2::new(640.0, 512.0);
+/// let point = locate_with_covariance(&camera, &at, &ned_from_camera, px, &ground, 0.0, 100.0, &sigmas)
+///     .expect("the ray meets the ground");
+/// assert!((point.covariance_m2[(0, 0)].sqrt() - 0.01).abs() < 1e-9);
+/// ```
 ///
 /// # Errors
 /// Those of [`locate`].

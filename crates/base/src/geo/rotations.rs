@@ -4,6 +4,12 @@ use nalgebra::{Matrix3, Rotation3, Vector3};
 use serde::{Deserialize, Serialize};
 
 /// An angle wrapped into (−π, π].
+///
+/// ```
+/// use std::f64::consts::PI;
+/// assert!((windhover_base::geo::wrap_angle(1.5 * PI) + 0.5 * PI).abs() < 1e-12);
+/// assert_eq!(windhover_base::geo::wrap_angle(-PI), PI);
+/// ```
 pub fn wrap_angle(angle: f64) -> f64 {
     let wrapped = angle.rem_euclid(std::f64::consts::TAU);
     if wrapped > std::f64::consts::PI { wrapped - std::f64::consts::TAU } else { wrapped }
@@ -20,21 +26,57 @@ pub fn rot_y(angle: f64) -> Rotation3<f64> {
 }
 
 /// Active rotation about z: `Rz = [c −s 0; s c 0; 0 0 1]`.
+///
+/// ```
+/// use windhover_base::geo::{rot_x, rot_y, rot_z};
+/// use nalgebra::Vector3;
+///
+/// let quarter = std::f64::consts::FRAC_PI_2;
+/// assert!((rot_z(quarter) * Vector3::x() - Vector3::y()).norm() < 1e-12);
+/// assert!((rot_x(quarter) * Vector3::y() - Vector3::z()).norm() < 1e-12);
+/// assert!((rot_y(quarter) * Vector3::z() - Vector3::x()).norm() < 1e-12);
+/// ```
 pub fn rot_z(angle: f64) -> Rotation3<f64> {
     Rotation3::from_axis_angle(&Vector3::z_axis(), angle)
 }
 
 /// The cross-product matrix: `skew(a) b = a × b`.
+///
+/// ```
+/// use nalgebra::Vector3;
+///
+/// let (a, b) = (Vector3::new(1.0, 2.0, 3.0), Vector3::new(-1.0, 0.5, 2.0));
+/// assert_eq!(windhover_base::geo::skew(&a) * b, a.cross(&b));
+/// ```
 pub fn skew(a: &Vector3<f64>) -> Matrix3<f64> {
     a.cross_matrix()
 }
 
 /// Aircraft sequence 3-2-1: `ned_from_body = Rz(heading) Ry(pitch) Rx(roll)`.
+///
+/// ```
+/// use windhover_base::geo::{euler_321, ned_from_body_321};
+/// use nalgebra::Vector3;
+///
+/// // Heading east, nose up 10°: the nose points east and up.
+/// let ned_from_body = ned_from_body_321(90_f64.to_radians(), 10_f64.to_radians(), 0.0);
+/// let nose = ned_from_body * Vector3::x();
+/// assert!(nose.y > 0.98 && nose.z < -0.17);
+/// let (heading, pitch, roll) = euler_321(&ned_from_body);
+/// assert!((heading.to_degrees() - 90.0).abs() < 1e-9 && (pitch.to_degrees() - 10.0).abs() < 1e-9 && roll.abs() < 1e-9);
+/// ```
 pub fn ned_from_body_321(heading: f64, pitch: f64, roll: f64) -> Rotation3<f64> {
     rot_z(heading) * rot_y(pitch) * rot_x(roll)
 }
 
 /// The paper's sequence 3-1-2: `ned_from_body = Rz(ψ) Rx(φ) Ry(θ)` (paper eq. 14–18, corrected).
+///
+/// ```
+/// use windhover_base::geo::{euler_312, ned_from_body_312};
+///
+/// let (psi, phi, theta) = euler_312(&ned_from_body_312(0.3, -0.1, 0.2));
+/// assert!((psi - 0.3).abs() < 1e-12 && (phi + 0.1).abs() < 1e-12 && (theta - 0.2).abs() < 1e-12);
+/// ```
 pub fn ned_from_body_312(psi: f64, phi: f64, theta: f64) -> Rotation3<f64> {
     rot_z(psi) * rot_x(phi) * rot_y(theta)
 }
@@ -54,6 +96,19 @@ pub fn euler_312(ned_from_body: &Rotation3<f64>) -> (f64, f64, f64) {
 }
 
 /// A compass's definition of pitch and roll; `g` is the down unit vector in the body.
+///
+/// ```
+/// use windhover_base::geo::{Tilt, TiltConvention};
+///
+/// // One attitude, as compasses of two conventions report it.
+/// let tilt = Tilt { pitch: 0.4, roll: 0.5 };
+/// let down = TiltConvention::Euler321.down_in_body(tilt).expect("there is such an attitude");
+/// let other = TiltConvention::Elevation.tilt_of(&down);
+/// assert!((other.pitch - 0.4).abs() < 1e-12 && other.roll < 0.47);
+/// // No body has both axes 60° above the horizon.
+/// let steep = Tilt { pitch: 60_f64.to_radians(), roll: 60_f64.to_radians() };
+/// assert_eq!(TiltConvention::Elevation.down_in_body(steep), None);
+/// ```
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum TiltConvention {
@@ -122,6 +177,13 @@ impl TiltConvention {
 }
 
 /// (pitch, roll) of the sequence 3-2-1 from a down vector in the body frame.
+///
+/// ```
+/// use nalgebra::Vector3;
+///
+/// let (pitch, roll) = windhover_base::geo::tilt_from_down(&Vector3::new(0.0, 1.0, 1.0));
+/// assert!(pitch == 0.0 && (roll.to_degrees() - 45.0).abs() < 1e-9);
+/// ```
 pub fn tilt_from_down(down: &Vector3<f64>) -> (f64, f64) {
     let g = down.normalize();
     ((-g.x).clamp(-1.0, 1.0).asin(), g.y.atan2(g.z))
@@ -157,6 +219,16 @@ impl ImageTop {
 }
 
 /// `body_from_camera = Rz(yaw) Ry(pitch) Rx(roll) · base(image_top)`, small mounting angles in radians.
+///
+/// ```
+/// use windhover_base::geo::{ImageTop, body_from_camera};
+/// use nalgebra::Vector3;
+///
+/// // The top of the image (−v) points to the nose, the optical axis down.
+/// let body_from_camera = body_from_camera(ImageTop::Forward, 0.0, 0.0, 0.0);
+/// assert!((body_from_camera * -Vector3::y() - Vector3::x()).norm() < 1e-12);
+/// assert!((body_from_camera * Vector3::z() - Vector3::z()).norm() < 1e-12);
+/// ```
 pub fn body_from_camera(image_top: ImageTop, yaw: f64, pitch: f64, roll: f64) -> Rotation3<f64> {
     ned_from_body_321(yaw, pitch, roll) * image_top.base()
 }

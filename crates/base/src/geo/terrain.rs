@@ -174,6 +174,21 @@ fn hgt_corner(stem: &str) -> Option<(f64, f64)> {
 }
 
 /// A tile as a surface in a NED frame.
+///
+/// ```
+/// use std::sync::Arc;
+/// use windhover_base::geo::{Geodetic, LocalFrame, Terrain, Tile};
+///
+/// // Four heights, a thousandth of a degree apart: the south is 10 m higher.
+/// let tile = Tile::new((47.001, 8.0), [1e-3; 2], (2, 2), vec![400.0, 400.0, 410.0, 410.0])
+///     .expect("as many heights as rows and columns");
+/// assert!(tile.covers(47.0005, 8.0005) && (tile.height_msl_m(47.0005, 8.0005) - 405.0).abs() < 1e-3);
+///
+/// let frame = LocalFrame::new(Geodetic { lat_deg: 47.0, lon_deg: 8.0, height_m: 450.0 });
+/// let terrain = Terrain::new(Arc::new(tile), &frame, 40.0);
+/// // The geoid is 40 m above the ellipsoid: the ground at the datum is at its height.
+/// assert!(terrain.down_m(0.0, 0.0).abs() < 1e-3 && terrain.down_m(100.0, 0.0) > 8.0);
+/// ```
 #[derive(Clone, PartialEq, Debug)]
 pub struct Terrain {
     tile: Arc<Tile>,

@@ -11,6 +11,14 @@ const F: f64 = 1.0 / 298.257_223_563;
 const E2: f64 = F * (2.0 - F);
 
 /// A position by latitude, longitude (degrees, as in files) and height above the ellipsoid (metres).
+///
+/// ```
+/// use windhover_base::geo::Geodetic;
+///
+/// let place = Geodetic { lat_deg: 47.0, lon_deg: 8.0, height_m: 400.0 };
+/// let back = Geodetic::from_ecef(&place.to_ecef());
+/// assert!((back.lat_deg - 47.0).abs() < 1e-12 && (back.height_m - 400.0).abs() < 1e-6);
+/// ```
 #[derive(Clone, Copy, PartialEq, Debug, Default, Serialize, Deserialize)]
 pub struct Geodetic {
     /// Latitude, degrees, north positive.
@@ -55,6 +63,15 @@ impl Geodetic {
 }
 
 /// The NED tangent frame at a datum.
+///
+/// ```
+/// use windhover_base::geo::{Geodetic, LocalFrame};
+/// use nalgebra::Vector3;
+///
+/// let frame = LocalFrame::new(Geodetic { lat_deg: 47.0, lon_deg: 8.0, height_m: 400.0 });
+/// let point = Vector3::new(120.0, -35.0, -10.0);
+/// assert!((frame.ned(frame.geodetic(&point)) - point).norm() < 1e-6);
+/// ```
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct LocalFrame {
     datum: Geodetic,

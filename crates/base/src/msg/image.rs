@@ -1,6 +1,14 @@
 //! Images in memory.
 
 /// An 8-bit grey image; row `v` starts at `v * stride`.
+///
+/// ```
+/// use windhover_base::msg::GrayImage;
+///
+/// let image = GrayImage::from_vec(3, 2, vec![0, 1, 2, 10, 11, 12]).expect("three columns, two rows");
+/// assert_eq!(image.view().crop(1, 0, 2, 2).row(1), [11, 12]);
+/// assert!(GrayImage::from_vec(3, 2, vec![0; 5]).is_none());
+/// ```
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct GrayImage {
     /// Columns.

@@ -88,6 +88,13 @@ impl Source {
     }
 
     /// The source of that name.
+    ///
+    /// ```
+    /// use windhover_base::msg::Source;
+    ///
+    /// assert_eq!(Source::named("gps"), Some(Source::Gps));
+    /// assert_eq!(Source::named("sonar"), None);
+    /// ```
     pub fn named(name: &str) -> Option<Self> {
         Self::ALL.iter().copied().find(|source| source.name() == name)
     }

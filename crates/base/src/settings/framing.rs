@@ -35,6 +35,13 @@ impl Default for Framing {
 
 impl Framing {
     /// Bits on the wire for a byte, including the start bit.
+    ///
+    /// ```
+    /// use windhover_base::settings::Framing;
+    ///
+    /// let framing = Framing::try_from("7E2".to_owned()).expect("seven bits, even parity, two stop bits");
+    /// assert_eq!(framing.bits(), 11);
+    /// ```
     pub fn bits(self) -> u32 {
         1 + u32::from(self.data_bits) + u32::from(self.parity != Parity::None) + u32::from(self.stop_bits)
     }

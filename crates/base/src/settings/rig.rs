@@ -39,6 +39,16 @@ impl Rig {
 }
 
 /// Whether receiver and compass share one line.
+///
+/// ```
+/// use windhover_base::settings::{CompassConfig, GpsConfig, shares_line};
+///
+/// let (gps, mut compass) = (GpsConfig { device: "/dev/ttyS0".into(), ..GpsConfig::default() }, CompassConfig::default());
+/// compass.device = "/dev/ttyS1".into();
+/// assert!(!shares_line(&gps, &compass));
+/// compass.device = "/dev/ttyS0".into();
+/// assert!(shares_line(&gps, &compass));
+/// ```
 pub fn shares_line(gps: &GpsConfig, compass: &CompassConfig) -> bool {
     gps.is_there() && gps.device == compass.device && !gps.device.starts_with("tcp://")
 }

@@ -281,7 +281,7 @@ impl CompassFormat {
 
     /// Whether the format has rates or forces in addition to the attitude.
     pub fn has_inertial(self) -> bool {
-        matches!(self, Self::Vectornav | Self::Witmotion)
+        matches!(self, Self::Vectornav | Self::Witmotion | Self::Nmea)
     }
 
     /// Whether the device sends lines of text.

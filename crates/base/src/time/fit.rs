@@ -57,6 +57,21 @@ pub struct ClockFit {
 /// the configured latency, plus jitter that is either symmetric or one-sided (late). Constant errors of the latency
 /// cannot be detected here. Single outliers are excluded; a step of the receiver or of a clock is followed after five
 /// epochs, an announced leap second at once.
+///
+/// ```
+/// use windhover_base::time::{GnssClock, MonoTime, Span};
+///
+/// // Epochs of a receiver at one a second, each 100 ms old when its first byte arrives, some later.
+/// let mut clock = GnssClock::new(Span::from_ms(100.0));
+/// let late_ms = |k: i64| [0, 9, 2, 15, 1][k as usize % 5];
+/// let arrival = |k: i64| MonoTime::from_ns(k * 1_000_000_000 + 100_000_000 + late_ms(k) * 1_000_000);
+/// for k in 0..60 {
+///     clock.observe(36_000_000_000_000 + k * 1_000_000_000, arrival(k));
+/// }
+/// let (valid, sigma) = clock.host_time_of(36_059_000_000_000, arrival(59)).expect("the epoch is on the line");
+/// // The jitter is removed: the epoch was valid 59 s after the first one.
+/// assert!((valid - MonoTime::from_ns(59_000_000_000)).ms().abs() < 4.0 && sigma < Span::from_ms(5.0));
+/// ```
 #[derive(Clone, Debug)]
 pub struct GnssClock {
     latency: Span,

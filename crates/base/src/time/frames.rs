@@ -22,6 +22,17 @@ const FEWEST: f64 = 12.0;
 /// them) distinguishes the two: of a deviation `r`, with a variance `V` above `GOOD`, the share `REAL / (REAL + V −
 /// GOOD)` is taken as real, which is its expectation where the rest is the stamp's error. Good stamps are returned
 /// unchanged.
+///
+/// ```
+/// use windhover_base::time::{FrameClock, MonoTime, Span};
+///
+/// // Good stamps are returned as they are.
+/// let mut clock = FrameClock::default();
+/// for k in 0..60 {
+///     let stamp = MonoTime::from_ns(k * 66_666_667);
+///     assert_eq!(clock.exposed(stamp, stamp + Span::from_ms(20.0)), stamp);
+/// }
+/// ```
 #[derive(Clone, Debug, Default)]
 pub struct FrameClock {
     beat: SteadyClock,

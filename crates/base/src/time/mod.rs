@@ -29,10 +29,24 @@ use std::ops::{Add, AddAssign, Neg, Sub, SubAssign};
 pub const NS_PER_S: i64 = 1_000_000_000;
 
 /// A point in host time, in nanoseconds: CLOCK_MONOTONIC plus the recording's constant.
+///
+/// ```
+/// use windhover_base::time::{MonoTime, Span};
+///
+/// let t = MonoTime::from_ns(1_000_000_000);
+/// assert_eq!(t + Span::from_ms(20.0), MonoTime::from_ns(1_020_000_000));
+/// assert_eq!(MonoTime::from_ns(3_000_000_000) - t, Span::from_s(2.0));
+/// ```
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct MonoTime(i64);
 
 /// A signed length of host time, in nanoseconds.
+///
+/// ```
+/// use windhover_base::time::Span;
+///
+/// assert_eq!((Span::from_s(1.5).ms(), Span::from_ms(-2.0).abs().ns()), (1_500.0, 2_000_000));
+/// ```
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct Span(i64);
 

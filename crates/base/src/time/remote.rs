@@ -37,6 +37,17 @@ impl Bound {
 }
 
 /// A remote clock.
+///
+/// ```
+/// use windhover_base::time::{MonoTime, RemoteClock, Span};
+///
+/// let ms = |ms: i64| MonoTime::from_ns(ms * 1_000_000);
+/// let mut clock = RemoteClock::default();
+/// // Sent at 1000 ms, answered at 40 ms of the other clock, received at 1006 ms.
+/// clock.exchanged(ms(1_000), Span::from_ms(40.0), ms(1_006));
+/// assert_eq!(clock.host(Span::from_ms(50.0)), Some(ms(1_013)));
+/// assert_eq!(clock.remote(ms(1_013)), Some(Span::from_ms(50.0)));
+/// ```
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct RemoteClock {
     exchanges: VecDeque<Bound>,

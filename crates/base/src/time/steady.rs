@@ -36,6 +36,20 @@ const LATE_PART: f64 = 0.3;
 /// jitter and the number of samples that must then be missing. (Coherence alone is not enough: arrivals that wait for a
 /// tick of 16 ms are as coherent at 32.5 Hz as at the 30 Hz of their device.) Samples may be missing; a change of the
 /// device's rate is followed. While there is no steady rate the arrivals are returned unchanged.
+///
+/// ```
+/// use windhover_base::time::{MonoTime, SteadyClock};
+///
+/// // A compass at 20 Hz whose readings arrive up to 8 ms late.
+/// let mut clock = SteadyClock::new();
+/// let late_ms = |k: i64| (k * 7) % 9;
+/// let mut smoothed = MonoTime::default();
+/// for k in 0..200 {
+///     smoothed = clock.smooth(MonoTime::from_ns(k * 50_000_000 + late_ms(k) * 1_000_000));
+/// }
+/// assert!((clock.period().expect("a steady device").ms() - 50.0).abs() < 0.1);
+/// assert!((smoothed - MonoTime::from_ns(199 * 50_000_000)).ms().abs() < 4.0);
+/// ```
 #[derive(Clone, Debug)]
 pub struct SteadyClock {
     fit: JitterFit,

@@ -6,6 +6,15 @@ use super::NS_PER_S;
 
 /// A point in UTC: nanoseconds since 1970-01-01 without leap seconds (POSIX). Second 60 of a leap
 /// minute maps to the second after it, as POSIX does.
+///
+/// ```
+/// use windhover_base::time::UtcTime;
+///
+/// let t = UtcTime::from_unix_ns(1_795_014_245_500_000_000);
+/// assert_eq!(t.to_string(), "2026-11-18T15:04:05.500Z");
+/// assert_eq!(t.compact(), "20261118T150405Z");
+/// assert_eq!(UtcTime::from_civil(t.civil()), Some(t));
+/// ```
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct UtcTime(i64);
 
@@ -110,6 +119,11 @@ impl fmt::Debug for UtcTime {
 }
 
 /// Days in a month of the Gregorian calendar.
+///
+/// ```
+/// assert_eq!(windhover_base::time::days_in_month(2028, 2), 29);
+/// assert_eq!(windhover_base::time::days_in_month(2100, 2), 28);
+/// ```
 pub fn days_in_month(year: i32, month: u8) -> u8 {
     match month {
         4 | 6 | 9 | 11 => 30,

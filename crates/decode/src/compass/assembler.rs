@@ -101,6 +101,18 @@ impl ReadingAssembler {
         out.push(heard(reading, span, span, counts));
     }
 
+    /// A sentence of rates and forces: a reading of its own beside those of the attitude.
+    pub(super) fn beside(
+        &self,
+        reading: CompassReading,
+        span: LineSpan,
+        counts: &mut DecodeCounts,
+        out: &mut Vec<ReceivedAttitude>,
+    ) {
+        counts.used += 1;
+        out.push(heard(reading, span, span, counts));
+    }
+
     /// A sentence of plain NMEA.
     pub(super) fn part(
         &mut self,

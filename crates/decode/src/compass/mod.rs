@@ -17,6 +17,7 @@ mod reading;
 mod records;
 mod revolution;
 mod rvc;
+mod sbg;
 mod tagged;
 mod tcm2;
 #[cfg(test)]
@@ -76,6 +77,21 @@ const fn reader(format: CompassFormat) -> Reader {
 }
 
 /// Reads a digital compass.
+///
+/// ```
+/// use windhover_base::settings::CompassFormat;
+/// use windhover_base::time::MonoTime;
+/// use windhover_decode::{CompassDecoder, framed};
+///
+/// // Heading and tilt in sentences of their own: one reading.
+/// let (mut decoder, mut readings) = (CompassDecoder::new(CompassFormat::Nmea), Vec::new());
+/// for body in ["HCHDM,100.5,M", "HCXDR,A,1.5,D,PITCH,A,-2.5,D,ROLL"] {
+///     decoder.push((framed(body) + "\r\n").as_bytes(), MonoTime::from_ns(1_000_000_000), &mut readings);
+/// }
+/// decoder.flush(&mut readings);
+/// let reading = readings[0].reading;
+/// assert_eq!((reading.heading_deg, reading.pitch_deg, reading.roll_deg), (Some(100.5), Some(1.5), Some(-2.5)));
+/// ```
 #[derive(Clone, Debug)]
 pub struct CompassDecoder {
     counts: DecodeCounts,
@@ -197,6 +213,9 @@ impl TextInput {
                 Err(why) => return counts.refuse(why),
             };
             match read(&sentence, counts) {
+                Ok(Some(reading)) if reading.is_inertial_only() => {
+                    assembler.beside(reading, line.span, counts, out);
+                }
                 Ok(Some(reading)) if is_part(&sentence) => {
                     assembler.part(reading, &sentence, line.span, counts, out);
                 }
@@ -210,7 +229,8 @@ impl TextInput {
 
 /// Whether a sentence is plain NMEA, which has an attitude in parts; others are a device's own.
 fn is_part(sentence: &Sentence<'_>) -> bool {
-    !sentence.address().starts_with("VN") && sentence.formatter().is_some()
+    let plain = !sentence.address().starts_with("VN") && sentence.formatter().is_some();
+    plain || sbg::is_part(sentence)
 }
 
 impl CompassDecoder {

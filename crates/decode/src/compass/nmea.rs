@@ -1,12 +1,12 @@
 //! Headings and transducers of plain NMEA 0183, which most compasses can send in addition to their own sentences.
 
-use super::by_gnss;
 use super::fields::{heading, optional, tilt};
 use super::reading::CompassReading;
+use super::{by_gnss, sbg};
 use crate::counts::{DecodeCounts, Refusal};
 use crate::sentence::Sentence;
 
-/// HDG, HDM, HDT, THS and XDR of any talker, and the sentences of receivers with several antennas.
+/// HDG, HDM, HDT, THS and XDR of any talker, and the sentences of receivers with several antennas and of SBG.
 pub(super) fn read(
     sentence: &Sentence<'_>,
     counts: &mut DecodeCounts,
@@ -29,7 +29,10 @@ pub(super) fn read(
             reading.heading_deg = heading(sentence.field(1))?.filter(|_| !reading.flagged);
         }
         Some("XDR") => return Ok(transducers(sentence, counts)),
-        _ => return by_gnss::read(sentence, counts),
+        _ => {
+            let of_sbg = sbg::read(sentence, counts)?;
+            return if of_sbg.is_some() { Ok(of_sbg) } else { by_gnss::read(sentence, counts) };
+        }
     }
     reading.flagged |= reading.heading_deg.is_none();
     Ok(Some(reading))

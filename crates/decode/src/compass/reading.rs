@@ -8,6 +8,16 @@ use crate::counts::DecodeCounts;
 use crate::lines::LineSpan;
 
 /// One reading as the device reports it, degrees; `None` where not given or not valid.
+///
+/// ```
+/// use windhover_decode::CompassReading;
+///
+/// // A tilt is used only where both angles are valid.
+/// let reading = CompassReading { heading_deg: Some(90.0), pitch_deg: Some(1.0), ..CompassReading::default() };
+/// let sample = reading.sample();
+/// assert!(reading.is_valid() && sample.tilt.is_none());
+/// assert_eq!(sample.heading, Some(std::f64::consts::FRAC_PI_2));
+/// ```
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct CompassReading {
     /// Heading, 0 to 360.
@@ -35,6 +45,12 @@ impl CompassReading {
             heading_is_true: self.heading_is_true,
             tilt: tilt.map(|(pitch, roll)| Tilt { pitch: pitch.to_radians(), roll: roll.to_radians() }),
         }
+    }
+
+    /// Whether it has rates or forces, and no part of an attitude.
+    pub fn is_inertial_only(&self) -> bool {
+        let angles = [self.heading_deg, self.pitch_deg, self.roll_deg];
+        self.inertial.is_some() && !self.flagged && angles.iter().all(Option::is_none)
     }
 
     /// Whether the device marked nothing in it as invalid, and it is not empty.

@@ -58,6 +58,17 @@ pub fn is_autopilot(frame: &MavlinkFrame) -> bool {
 }
 
 /// The time in a time request to an autopilot: `now`, marked as ours.
+///
+/// ```
+/// use windhover_base::time::MonoTime;
+/// use windhover_decode::{timesync_asked, timesync_question};
+///
+/// let now = MonoTime::from_ns(5_000_123_456);
+/// let ts1 = timesync_question(now);
+/// assert!(timesync_asked(ts1).is_some_and(|t| (t - now).ms().abs() < 0.001));
+/// // A request of another system.
+/// assert_eq!(timesync_asked(5_000_123_000), None);
+/// ```
 pub fn question(now: MonoTime) -> i64 {
     now.ns().div_euclid(1_000) * 1_000 + MARK_NS
 }
@@ -68,6 +79,27 @@ pub fn asked(ts1: i64) -> Option<MonoTime> {
 }
 
 /// MAVLink bytes to an autopilot's measurements.
+///
+/// ```
+/// use mavlink::dialects::development::{ATTITUDE_QUATERNION_DATA, MavMessage};
+/// use mavlink::{MavHeader, MavFrame, MavlinkVersion, write_v2_msg};
+/// use windhover_base::time::MonoTime;
+/// use windhover_decode::{AutopilotDecoder, AutopilotMeasurement};
+///
+/// // Level, heading north, from the autopilot of system 1.
+/// let message = MavMessage::ATTITUDE_QUATERNION(ATTITUDE_QUATERNION_DATA { q1: 1.0, ..Default::default() });
+/// let header = MavHeader { system_id: 1, component_id: 1, sequence: 0 };
+/// let mut bytes = Vec::new();
+/// write_v2_msg(&mut bytes, header, &message).expect("memory can be written");
+///
+/// let (mut decoder, mut received) = (AutopilotDecoder::new(Some(1)), Vec::new());
+/// decoder.push(&bytes, MonoTime::from_ns(1_000_000_000), &mut received);
+/// let attitude = received.iter().find_map(|received| match received.measurement {
+///     AutopilotMeasurement::Attitude(sample) => Some(sample),
+///     _ => None,
+/// });
+/// assert_eq!(attitude.and_then(|sample| sample.heading), Some(0.0));
+/// ```
 #[derive(Clone, Debug, Default)]
 pub struct AutopilotDecoder {
     frames: MavlinkFrames,

@@ -33,6 +33,22 @@ pub struct MavlinkFrame {
 }
 
 /// Finds frames in a stream.
+///
+/// ```
+/// use mavlink::dialects::development::{HEARTBEAT_DATA, MavMessage};
+/// use mavlink::{MavHeader, write_v2_msg};
+/// use windhover_decode::MavlinkFrames;
+///
+/// let mut bytes = b"noise".to_vec();
+/// let header = MavHeader { system_id: 7, component_id: 1, sequence: 3 };
+/// write_v2_msg(&mut bytes, header, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default())).expect("memory can be written");
+/// let (mut frames, mut found) = (MavlinkFrames::default(), Vec::new());
+/// // In two reads.
+/// frames.push(&bytes[..9], &mut found);
+/// assert!(found.is_empty());
+/// frames.push(&bytes[9..], &mut found);
+/// assert_eq!((found[0].system, found[0].sequence, frames.counts().noise_bytes), (7, 3, 5));
+/// ```
 #[derive(Clone, Debug, Default)]
 pub struct MavlinkFrames {
     buffer: Vec<u8>,

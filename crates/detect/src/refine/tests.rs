@@ -106,7 +106,7 @@ impl Tally {
             };
             let given =
                 sample.corners.map(|p| [p.x, p.y].map(|x| (x + cell * rng.random_range(-0.2..0.2)) as f32));
-            let Some(refined) = refiner.refine(image, &given, &family, id, false) else {
+            let Some(refined) = refiner.of_edges(image, &given, (&family, id), false) else {
                 tally.refused += 1;
                 continue;
             };

@@ -25,7 +25,7 @@ pub struct Seen<'a> {
     pub noise: f64,
 }
 
-/// Least possible RMS error of a corner, over all four, pixels.
+/// Least possible RMS error of a corner, over all four, pixels: of an estimate that expects a lens where there is none.
 pub fn corner_bound(seen: Seen<'_>) -> f64 {
     let h = seen.view / seen.view[(2, 2)];
     let back = h.try_inverse().expect("a view has an inverse");
@@ -52,6 +52,7 @@ pub fn corner_bound(seen: Seen<'_>) -> f64 {
         }
     }
     information.fill_upper_triangle_with_lower_triangle();
+    let told = information;
     // The lens's parameters have priors at zero, with the effect of a wide lens as sigma.
     let half = bent.half;
     let [bow, barrel, twist] = [0.75e-4 * half.powi(2), 3e-7 * half.powi(3), 2.5e-5 * half.powi(2)];
@@ -59,7 +60,8 @@ pub fn corner_bound(seen: Seen<'_>) -> f64 {
         information[(8 + k, 8 + k)] += (seen.noise / sigma).powi(2);
     }
     let inverse = information.cholesky().expect("a tag's pixels tell all of it").inverse();
-    let covariance = inverse.fixed_view::<GEOMETRY, GEOMETRY>(0, 0) * seen.noise.powi(2);
+    // Where there is no lens, as in what is drawn, the priors add no error: only noise does.
+    let covariance = (inverse * told * inverse).fixed_view::<GEOMETRY, GEOMETRY>(0, 0) * seen.noise.powi(2);
     let traces = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)].map(|(x, y)| {
         let by_geometry = bent.moved(x, y);
         (by_geometry * covariance * by_geometry.transpose()).trace()

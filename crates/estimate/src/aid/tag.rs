@@ -46,14 +46,37 @@ impl Aid for Tag<'_> {
     const SOURCE: FusionSource = FusionSource::Marker;
 
     fn linearise(&self, state: &State, models: &Models, z: &mut Measurement) -> Result<(), Disposition> {
+        let fit = self.fit.map(|slot| tag_fit::block(state, slot));
+        linearise_points(self.target, fit, self.sighted(state).into_iter(), state, models, z)
+    }
+}
+
+impl Tag<'_> {
+    /// Its corners as they are fitted, with their pixels.
+    fn sighted(&self, state: &State) -> [Sighting<'_>; 4] {
         let fitted = |slot: usize| {
             tag_fit::corners(&state.tags[slot].mean, self.center, self.points).map(|(p, d)| (p, Some(d)))
         };
         let points = self.fit.map_or_else(|| self.points.map(|point| (point, None)), fitted);
-        let corners = points.into_iter().zip(self.corners_px).zip(self.cov_px2);
-        let seen = corners.map(|(((point, d_fit), px), cov_px2)| Sighting { point, d_fit, px, cov_px2 });
-        let fit = self.fit.map(|slot| tag_fit::block(state, slot));
-        linearise_points(self.target, fit, seen, state, models, z)
+        std::array::from_fn(|i| {
+            let (point, d_fit) = points[i];
+            Sighting { point, d_fit, px: &self.corners_px[i], cov_px2: &self.cov_px2[i] }
+        })
+    }
+}
+
+/// One corner of a tag.
+#[derive(Clone, Copy)]
+pub(crate) struct TagCorner<'a>(pub(crate) Tag<'a>, pub(crate) usize);
+
+impl Aid for TagCorner<'_> {
+    const SOURCE: FusionSource = FusionSource::Marker;
+
+    fn linearise(&self, state: &State, models: &Models, z: &mut Measurement) -> Result<(), Disposition> {
+        let Self(tag, corner) = self;
+        let fit = tag.fit.map(|slot| tag_fit::block(state, slot));
+        let seen = tag.sighted(state)[*corner];
+        linearise_points(tag.target, fit, std::iter::once(seen), state, models, z)
     }
 }
 

@@ -170,7 +170,7 @@ pub(crate) fn random_core(seed: u64, ground: Ground) -> Core {
         target.sway.mean = [within(0.05), within(0.05), within(0.05)];
     }
     state.shake = Shake::presumed(&core.models);
-    state.begin_shake(0.02);
+    state.begin_shake(0.02, &core.models);
     state.renew(state.layout().shake(), &[0.0; SHAKE]);
     state.shake.mean = std::array::from_fn(|_| within(0.003));
     core
