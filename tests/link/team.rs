@@ -70,7 +70,7 @@ pub fn any(log: &Log, matches: impl Fn(&LinkEvent) -> bool) -> bool {
     log.lock().expect("not poisoned").iter().any(matches)
 }
 
-/// A state of 160 bytes, heard and true at `t`.
+/// A state of 160 bytes, received and valid at `t`.
 pub fn record(t: MonoTime) -> Record {
     Record {
         topic: "/target/ugv/state".into(),

@@ -215,7 +215,7 @@ class Soak:
         for flight, found in numbers.items():
             if len(found) != len(set(found)):
                 wrong.append(f"{flight}: {len(found) - len(set(found))} records are kept twice")
-            # Numbers that the payload no longer has are told on the page as lost on board.
+            # Numbers that the payload no longer has are shown on the page as lost on board.
             print(f"{flight}: {len(found)} records of {max(found) + 1}")
         events = re.findall(r"event=(\w+)", self.daemon.text())
         print("told:", {name: events.count(name) for name in sorted(set(events)) if name != "health"})

@@ -96,13 +96,13 @@ class Fleet(unittest.TestCase):
         live = list(heard)
         states = [s for s in live if s[0] == STATE]
         self.assertEqual({s[3] for s in states}, {"application/protobuf;windhover.TargetState"})
-        # Then: the latest is one of each key, not older than what was heard.
+        # Then: the latest is one of each key, not older than what was received.
         (latest,), errors = ask(client, STATE)
         self.assertEqual((latest[0], errors), (STATE, 0))
         self.assertGreaterEqual(latest[2].get_time(), states[-1][2].get_time())
         fleet, _ = ask(client, "windhover/*/health")
         self.assertEqual([s[0] for s in fleet], ["windhover/alpha/health"])
-        # And: the past holds everything that was heard, once.
+        # And: the past holds everything that was received, once.
         past, errors = ask(client, "windhover/alpha/**?_time=[now(-1h)..]")
         self.assertEqual(errors, 0)
         told = distinct(past)

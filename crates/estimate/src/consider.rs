@@ -8,7 +8,7 @@
 //!
 //! Ground features show tilt by the plane that they lie on, and nobody knows how level it is, nor whether some of them stand on a
 //! parked vehicle: half a metre of height seen from ten is 5 % of what the helicopter moves, which tilt and heading take up
-//! (hovering over a vehicle whose tags are not read, tilt was off by 1.4° told 0.2°). Without a marker they do not move tilt.
+//! (hovering over a vehicle whose tags are not read, tilt was off by 1.4° with a sigma of 0.2°). Without a marker they do not move tilt.
 
 use windhover_base::msg::FusionSource;
 
@@ -42,11 +42,11 @@ const WITHOUT_TILT: Held = BLIND.and(own::TURN).and(own::HEADING_BIAS).and(own::
 impl State {
     /// The states that a measurement of this source leaves as they are.
     pub(crate) fn held(&self, source: FusionSource) -> Held {
-        // One that was never heard tells nothing.
-        let tells = |watch: &TiltWatch| {
+        // A sensor without any reading shows nothing.
+        let shows = |watch: &TiltWatch| {
             watch.last_down().is_some() && matches!(watch.felt, Felt::Attitude | Felt::Share)
         };
-        let poor_tilt = !self.tilt.iter().any(tells);
+        let poor_tilt = !self.tilt.iter().any(shows);
         let held = match source {
             FusionSource::Marker => Held::NONE,
             FusionSource::Feature if !self.is_blind() => Held::NONE,

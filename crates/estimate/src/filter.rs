@@ -33,7 +33,7 @@ pub struct Estimator {
     blocks: Blocks,
     /// Room to look ahead in.
     pub(crate) ahead: State,
-    /// The state as it was last told between frames.
+    /// The state as it was last reported between frames.
     carried: State,
     /// Time of the state in the history from which it was carried on; `None` where a measurement came since.
     carried_from: Option<MonoTime>,
@@ -52,11 +52,11 @@ pub struct Estimator {
 
 /// Without any measurement for so long the state is given up.
 const SILENCE: Span = Span::from_ns(60_000_000_000);
-/// A source that does not fit is told of so often.
+/// A source that does not fit is reported so often.
 const MISFIT_INTERVAL: Span = Span::from_ns(1_000_000_000);
 /// Farther ahead than this a frame is not foreseen, s.
 const FORESIGHT_S: f64 = 2.0;
-/// Without any measurement for longer the helicopter's own state is not told, s.
+/// Without any measurement for longer the helicopter's own state is not reported, s.
 const GUESS_S: f64 = 10.0;
 /// Compass readings this old still start the filter, if there are enough of them.
 const COMPASS_AGE: Span = Span::from_ns(3_000_000_000);
@@ -223,7 +223,7 @@ impl Estimator {
     pub fn tick(&mut self, now: MonoTime, out: &mut Vec<EstimatorOutput>) {
         if self.core.state.alive && now - self.core.state.t > SILENCE {
             self.emit_smoothed_until(None, out);
-            self.reset("nothing was heard for a minute", out);
+            self.reset("no measurement for a minute", out);
         } else {
             self.emit_smoothed_until(Some(now - self.lag), out);
         }

@@ -32,9 +32,9 @@ const OTHERWISE: [f64; TAG_FIT] = [0.05, 0.05, 0.05, 0.09];
 /// Sigmas of the scale of all that is seen, and of the turn of all tags on the vehicle (rad).
 const SCALE_SIGMA: f64 = 0.03;
 const TURN_SIGMA: f64 = 0.04;
-/// Least that is told: share of a size, m, rad; and how well it must be known.
-const LEAST_TOLD: [f64; 3] = [0.005, 0.01, 0.005];
-const TOLD_SIGMAS: f64 = 3.0;
+/// Least that is reported: share of a size, m, rad; and how well it must be known.
+const LEAST_REPORTED: [f64; 3] = [0.005, 0.01, 0.005];
+const REPORTED_SIGMAS: f64 = 3.0;
 const WELL_KNOWN: [f64; 3] = [0.004, 0.01, 0.005];
 
 /// What one tag is beside its configuration.
@@ -208,7 +208,7 @@ impl Core {
         let depth_m = models.ground.down_m(camera.x, camera.y) + first.center.z - camera.z;
         let share = depth_m / (depth_m - first.center.z);
         along[own::POSITION.column(2)] = -depth_m;
-        // What the receiver has told of height is the sum of the two.
+        // What the receiver has shown of height is the sum of the two.
         along[own::GPS_BIAS.column(2)] = depth_m;
         let velocity = state.own.velocity;
         along[own::VELOCITY.range()].copy_from_slice((velocity * share).as_slice());
@@ -368,7 +368,7 @@ impl State {
             [size, place, turn]
         });
         let told = |k: usize, (value, sigma): (f64, f64)| {
-            let beyond = value.abs() > LEAST_TOLD[k].max(TOLD_SIGMAS * sigma);
+            let beyond = value.abs() > LEAST_REPORTED[k].max(REPORTED_SIGMAS * sigma);
             (beyond && sigma < WELL_KNOWN[k]).then_some((k, value))
         };
         let all = three.into_iter().flatten().enumerate();

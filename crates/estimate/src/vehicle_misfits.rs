@@ -1,4 +1,4 @@
-//! What does not fit of the vehicles, their tags and the ground about them, as it is told.
+//! What does not fit of the vehicles, their tags and the ground about them, as it is reported.
 
 use windhover_base::msg::{FusionSource, MisfitCause};
 
@@ -6,10 +6,10 @@ use super::core::Core;
 use super::state::State;
 
 /// Markers over which the share of those outside the gate is kept (some five seconds of two tags), and the share beyond
-/// which it is told. A flight that fits has a few in a thousand, one with 3 % of gross errors 3 %.
+/// which it is reported. A flight that fits has a few in a thousand, one with 3 % of gross errors 3 %.
 const MARKERS: f64 = 100.0;
 const OUTSIDE_SHARE: f64 = 0.12;
-/// Share of the tracked features that move, beyond which it is told.
+/// Share of the tracked features that move, beyond which it is reported.
 const MOVING_SHARE: f64 = 0.2;
 
 impl Core {

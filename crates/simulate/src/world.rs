@@ -147,7 +147,7 @@ impl World {
     /// Vehicle `target` at host time `t`.
     ///
     /// # Panics
-    /// Where there is no such vehicle.
+    /// Where there is no vehicle of this number.
     pub fn vehicle(&self, target: usize, t: MonoTime) -> VehicleTruth {
         self.vehicles[target].at(self.seconds(t))
     }

@@ -64,7 +64,7 @@ impl Film {
     /// The next frame; `None` where it cannot be decoded, or is of another size than the first.
     ///
     /// # Errors
-    /// The encoder takes no such frames, or fails.
+    /// The encoder does not take frames of this kind, or fails.
     pub fn frame(&mut self, frame: &FramePayload) -> Result<Option<FilmFrame>, VideoError> {
         let Ok(picture) = pixels::decode(frame, true) else { return Ok(None) };
         let size = (picture.gray.width, picture.gray.height);

@@ -44,7 +44,7 @@ fn deviations() -> Vec<Deviation> {
     ]
 }
 
-/// What the filter tells of a flight, each thing once, with its first figure.
+/// What the filter reports of a flight, each thing once, with its first figure.
 fn told_once(out: &[EstimatorOutput]) -> Vec<(String, f64)> {
     let mut once: Vec<(String, f64)> = Vec::new();
     for (cause, figure) in told(out) {
@@ -56,7 +56,7 @@ fn told_once(out: &[EstimatorOutput]) -> Vec<(String, f64)> {
     once
 }
 
-/// What deviations cost, and what is told of them: `cargo test --release -p windhover-estimate --test estimator -- --ignored
+/// What deviations cost, and what is reported of them: `cargo test --release -p windhover-estimate --test estimator -- --ignored
 /// --nocapture table_of_misfits`.
 #[test]
 #[ignore = "sixty flights take a minute"]

@@ -53,7 +53,7 @@ pub(super) fn errors(described: &str) -> [f64; 2] {
     sums.map(|sum: f64| (sum / n).sqrt())
 }
 
-/// By how much the camera is told to be late, s, the last time it was.
+/// By how much the camera is reported to be late, s, the last time it was.
 fn told_late(out: &[EstimatorOutput]) -> Option<f64> {
     let mut late = out.iter().filter_map(|output| match output {
         EstimatorOutput::Misfit(misfit) if misfit.cause == MisfitCause::Late => Some(misfit.figure),
