@@ -137,9 +137,10 @@ pub(super) fn remarks(flight: &Flight, refined: &Refined) -> Vec<String> {
             "the compass's readings"
         };
         remarks.push(format!(
-            "frames are {:.1} ± {:.1} ms later against {other} than configured; the flight does not show which of the two is wrong",
-            clock.late_s * 1e3,
-            clock.sigma_s * 1e3
+            "frames are {:.1} ± {:.1} ms {} against {other} than configured; the flight does not show which of the two is wrong",
+            clock.late_s.abs() * 1e3,
+            clock.sigma_s * 1e3,
+            if clock.late_s < 0.0 { "earlier" } else { "later" }
         ));
     }
     match refined.felt {
