@@ -1,6 +1,7 @@
 //! Common parts of the device tasks: reports, faults, waiting.
 
 use std::cell::Cell;
+use std::convert::Infallible;
 use std::fmt;
 use std::fs::File;
 use std::io;
@@ -278,6 +279,27 @@ impl Backoff {
         let wait = self.next;
         self.next = (wait * 2).min(Self::LONGEST);
         wait
+    }
+}
+
+/// Opens a line and watches it, without end: where it cannot be opened or is lost, this is reported and it is opened again after a
+/// pause. `open` may block; `watch` gives the reason why the line is lost.
+pub(super) async fn watch_line<T: Send + 'static, W: Future<Output = Fault>>(
+    open: impl Fn() -> Result<T, Fault> + Clone + Send + 'static,
+    watch: impl Fn(T) -> W,
+    reports: Reports<'_>,
+) -> Infallible {
+    let mut backoff = Backoff::new();
+    loop {
+        let fault = match blocking(open.clone()).await {
+            Ok(line) => {
+                backoff.reset();
+                watch(line).await
+            }
+            Err(fault) => fault,
+        };
+        reports(Report::Down(fault));
+        backoff.wait(reports).await;
     }
 }
 

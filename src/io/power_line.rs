@@ -7,9 +7,7 @@ use gpiocdev::Request;
 use gpiocdev::line::{EdgeDetection, Value};
 use tokio::io::Interest;
 
-use super::device::{
-    Backoff, Fault, FaultKind, OwnsDescriptor, Report, Reports, blocking, register, wait_for,
-};
+use super::device::{Fault, FaultKind, OwnsDescriptor, Report, Reports, register, wait_for, watch_line};
 use windhover_base::settings::GpioLine;
 
 /// Reading period for a line whose controller raises no interrupts.
@@ -28,23 +26,19 @@ unsafe impl OwnsDescriptor for Request {}
 
 /// Watches the line without end; `active` gets its level whenever it may have changed, and `false` where it is lost.
 pub async fn run(line: &GpioLine, reports: Reports<'_>, active: &(dyn Fn(bool) + Sync)) -> Infallible {
-    let mut backoff = Backoff::new();
-    loop {
-        let asked = line.clone();
-        let fault = match blocking(move || request(&asked)).await {
-            Ok(requested) => {
-                backoff.reset();
-                match watch(line, requested, reports, active).await {
-                    Ok(never) => match never {},
-                    Err(error) => fault(line, &error),
-                }
-            }
-            Err(fault) => fault,
-        };
-        active(false);
-        reports(Report::Down(fault));
-        backoff.wait(reports).await;
-    }
+    let asked = line.clone();
+    let watched = async |requested| {
+        let Err(error) = watch(line, requested, reports, active).await;
+        fault(line, &error)
+    };
+    // A line that is not there signals nothing.
+    let lost = |report| {
+        if matches!(report, Report::Down(_)) {
+            active(false);
+        }
+        reports(report);
+    };
+    watch_line(move || request(&asked), watched, &lost).await
 }
 
 async fn watch(

@@ -10,7 +10,7 @@ use rustix::ioctl::{Ioctl, IoctlOutput, Opcode, ioctl, opcode};
 use tokio::io::Interest;
 
 use super::clock::HostClock;
-use super::device::{Backoff, Fault, FaultKind, Report, Reports, blocking, register, wait_for};
+use super::device::{Fault, FaultKind, Report, Reports, register, wait_for, watch_line};
 use windhover_base::time::MonoTime;
 
 /// `struct pps_ktime` of linux/pps.h.
@@ -64,23 +64,14 @@ pub async fn run(
     reports: Reports<'_>,
     pulse: &(dyn Fn(MonoTime) + Sync),
 ) -> Infallible {
-    let mut backoff = Backoff::new();
-    loop {
-        let path = device.to_owned();
-        let fault = match blocking(move || File::open(path)).await {
-            Ok(file) => {
-                reports(Report::Up(format!("pulses of {device}")));
-                backoff.reset();
-                match watch(file, clock, reports, pulse).await {
-                    Ok(never) => match never {},
-                    Err(error) => Fault::new(FaultKind::Unplugged, device, error.to_string()),
-                }
-            }
-            Err(error) => Fault::from_io(device, &error),
-        };
-        reports(Report::Down(fault));
-        backoff.wait(reports).await;
-    }
+    let path = device.to_owned();
+    let open = move || File::open(&path).map_err(|error| Fault::from_io(&path, &error));
+    let watched = async |file| {
+        reports(Report::Up(format!("pulses of {device}")));
+        let Err(error) = watch(file, clock, reports, pulse).await;
+        Fault::new(FaultKind::Unplugged, device, error.to_string())
+    };
+    watch_line(open, watched, reports).await
 }
 
 /// Until the line is lost. The kernel wakes waiters at every edge; before Linux 6.14 it also reports at any time that

@@ -8,7 +8,7 @@ use gpiocdev::line::{EdgeDetection, EventClock};
 use tokio::io::Interest;
 
 use super::clock::HostClock;
-use super::device::{Backoff, Fault, FaultKind, Report, Reports, blocking, register, wait_for};
+use super::device::{Fault, FaultKind, Report, Reports, register, wait_for, watch_line};
 use windhover_base::settings::GpioLine;
 use windhover_base::time::MonoTime;
 
@@ -19,23 +19,13 @@ pub async fn run(
     reports: Reports<'_>,
     pulse: &(dyn Fn(MonoTime) + Sync),
 ) -> Infallible {
-    let mut backoff = Backoff::new();
-    loop {
-        let asked = line.clone();
-        let fault = match blocking(move || request(&asked)).await {
-            Ok(request) => {
-                reports(Report::Up(format!("pulses of {line}")));
-                backoff.reset();
-                match watch(request, clock, reports, pulse).await {
-                    Ok(never) => match never {},
-                    Err(error) => Fault::new(FaultKind::Unplugged, &line.to_string(), error.to_string()),
-                }
-            }
-            Err(fault) => fault,
-        };
-        reports(Report::Down(fault));
-        backoff.wait(reports).await;
-    }
+    let asked = line.clone();
+    let watched = async |request| {
+        reports(Report::Up(format!("pulses of {line}")));
+        let Err(error) = watch(request, clock, reports, pulse).await;
+        Fault::new(FaultKind::Unplugged, &line.to_string(), error.to_string())
+    };
+    watch_line(move || request(&asked), watched, reports).await
 }
 
 async fn watch(

@@ -266,8 +266,8 @@ impl PixelFit {
         }
         let inverse: Matrix = solved.information.inverse();
         let held: f64 = (0..UNKNOWNS).map(|k| solved.holds[k] * inverse[(k, k)]).sum();
-        let told = UNKNOWNS as f64 - held;
-        let lambda = sum / told / (1.0 - TAKEN_UP * told / blocks).max(0.4);
+        let determined = UNKNOWNS as f64 - held;
+        let lambda = sum / determined / (1.0 - TAKEN_UP * determined / blocks).max(0.4);
         let scale = lambda / self.sums.flattening().powi(2);
         let mut covariance = Information::zeros();
         let part = inverse.fixed_view::<BLUR, BLUR>(0, 0) * scale;

@@ -349,9 +349,9 @@ impl Refiner {
         // the prior.
         let held =
             solved.holds.iter().zip(PARAMETERS - HELD..).map(|(hold, k)| hold * inverse[(k, k)]).sum::<f64>();
-        let told = PARAMETERS as f64 - held;
+        let determined = PARAMETERS as f64 - held;
         // The fit absorbs some of it, most in the corners.
-        let lambda = sum / told / (1.0 - TAKEN_UP * told / blocks).max(0.5);
+        let lambda = sum / determined / (1.0 - TAKEN_UP * determined / blocks).max(0.5);
         let flattening = solved.flattening.clamp(0.4, 1.0);
         (blocks > 4.0).then(|| inverse * (lambda / (flattening * flattening)))
     }

@@ -146,7 +146,7 @@ impl Core {
     }
 
     /// Opens the sizes of two tags that contradict each other. By the first of them everything else is scaled: if it is the
-    /// wrong one, all of this is larger but the vehicle. Where the tags lie on it tells which.
+    /// wrong one, all of this is larger but the vehicle. Where the tags lie on it shows which.
     pub(crate) fn open_sizes(&mut self, target: usize, first: usize, second: usize) {
         let size = |slot: usize| self.state.layout().tag(slot).all().part::<1>(0);
         let (of_first, of_second) = (size(first), size(second));

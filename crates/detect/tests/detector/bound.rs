@@ -52,7 +52,7 @@ pub fn corner_bound(seen: Seen<'_>) -> f64 {
         }
     }
     information.fill_upper_triangle_with_lower_triangle();
-    let told = information;
+    let known = information;
     // The lens's parameters have priors at zero, with the effect of a wide lens as sigma.
     let half = bent.half;
     let [bow, barrel, twist] = [0.75e-4 * half.powi(2), 3e-7 * half.powi(3), 2.5e-5 * half.powi(2)];
@@ -61,7 +61,7 @@ pub fn corner_bound(seen: Seen<'_>) -> f64 {
     }
     let inverse = information.cholesky().expect("a tag's pixels tell all of it").inverse();
     // Where there is no lens, as in what is drawn, the priors add no error: only noise does.
-    let covariance = (inverse * told * inverse).fixed_view::<GEOMETRY, GEOMETRY>(0, 0) * seen.noise.powi(2);
+    let covariance = (inverse * known * inverse).fixed_view::<GEOMETRY, GEOMETRY>(0, 0) * seen.noise.powi(2);
     let traces = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)].map(|(x, y)| {
         let by_geometry = bent.moved(x, y);
         (by_geometry * covariance * by_geometry.transpose()).trace()

@@ -83,7 +83,7 @@ pub(super) fn level() -> Ground {
     Ground::Flat { down_m: 0.0 }
 }
 
-pub(super) fn told(out: &[EstimatorOutput]) -> Vec<(MisfitCause, f64)> {
+pub(super) fn misfits(out: &[EstimatorOutput]) -> Vec<(MisfitCause, f64)> {
     let of = |o: &EstimatorOutput| match o {
         EstimatorOutput::Misfit(misfit) => Some((misfit.cause, misfit.figure)),
         _ => None,
@@ -147,16 +147,16 @@ fn people_and_other_vehicles_are_not_taken_for_ground() {
         let bare = over_flights(4..8, |seed| {
             let flight = with_movers(fly("follow", 20.0, seed, sharp), movers, false);
             let out = flight.outputs();
-            assert!(told(&out).is_empty(), "{:?}", told(&out));
+            assert!(misfits(&out).is_empty(), "{:?}", misfits(&out));
             scored(&flight, &out, 6.0)
         });
         let score = over_flights(4..8, |seed| {
             let flight = with_movers(fly("follow", 20.0, seed, sharp), movers, true);
             let out = flight.outputs();
             assert!(
-                told(&out).iter().any(|(cause, _)| *cause == MisfitCause::MovingGround),
+                misfits(&out).iter().any(|(cause, _)| *cause == MisfitCause::MovingGround),
                 "{:?}",
-                told(&out)
+                misfits(&out)
             );
             scored(&flight, &out, 6.0)
         });
@@ -246,7 +246,7 @@ fn a_vehicle_that_turns_on_the_spot_is_let_turn_whatever_its_model() {
     let ackermann = scored(&flight, &out, 8.0);
     println!("unicycle {unicycle:?}\nackermann {ackermann:?}");
     assert!(ackermann.yaw_rate <= 1.5 * unicycle.yaw_rate, "{ackermann:?}, unicycle {unicycle:?}");
-    assert!(told(&out).iter().any(|(cause, _)| matches!(cause, MisfitCause::TargetTurns { target: 0 })));
+    assert!(misfits(&out).iter().any(|(cause, _)| matches!(cause, MisfitCause::TargetTurns { target: 0 })));
 }
 
 #[test]
@@ -298,14 +298,14 @@ fn a_vehicle_that_sways_on_its_springs_is_no_worse_than_its_sway() {
         );
         let (_, out) = flown(&scenario, 25.0, 3);
         let sways = |(cause, _): &(MisfitCause, f64)| matches!(cause, MisfitCause::TargetSways { target: 0 });
-        assert!(told(&out).iter().any(sways), "{deviation}");
+        assert!(misfits(&out).iter().any(sways), "{deviation}");
     }
 }
 
 #[test]
 fn a_lens_whose_distortion_is_left_out_is_found_out() {
     let lens =
-        |out: &[EstimatorOutput]| told(out).into_iter().rfind(|(cause, _)| *cause == MisfitCause::Lens);
+        |out: &[EstimatorOutput]| misfits(out).into_iter().rfind(|(cause, _)| *cause == MisfitCause::Lens);
     for scenario in ["follow", "circle20"] {
         let (world, out) = flown(scenario, 25.0, 3);
         let twin = score(&estimates(&out), &world, 6.0);
@@ -323,7 +323,7 @@ fn a_lens_whose_distortion_is_left_out_is_found_out() {
 #[test]
 fn an_antenna_that_is_elsewhere_is_found_out() {
     let antenna = |out: &[EstimatorOutput]| {
-        told(out).into_iter().rfind(|(cause, _)| *cause == MisfitCause::AntennaPlace)
+        misfits(out).into_iter().rfind(|(cause, _)| *cause == MisfitCause::AntennaPlace)
     };
     let (world, out) = flown("follow", 40.0, 3);
     let twin = score(&estimates(&out), &world, 6.0);

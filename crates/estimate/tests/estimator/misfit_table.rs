@@ -5,7 +5,7 @@ use windhover_base::msg::EstimatorOutput;
 use windhover_simulate::{GroundMisfit, Scenario, SpeedPlan};
 
 use super::filter::{Score, fly};
-use super::misfit::{configured, over_flights, scored, sharp, told};
+use super::misfit::{configured, misfits, over_flights, scored, sharp};
 
 type Deviation = (&'static str, fn(&mut Scenario));
 
@@ -47,7 +47,7 @@ fn deviations() -> Vec<Deviation> {
 /// What the filter reports of a flight, each thing once, with its first figure.
 fn told_once(out: &[EstimatorOutput]) -> Vec<(String, f64)> {
     let mut once: Vec<(String, f64)> = Vec::new();
-    for (cause, figure) in told(out) {
+    for (cause, figure) in misfits(out) {
         let cause = format!("{cause:?}");
         if once.iter().all(|(known, _)| *known != cause) {
             once.push((cause, figure));
@@ -76,7 +76,7 @@ fn table_of_misfits() {
         });
         let t = twin.get_or_insert(s);
         let (heading, speed, yaw_rate) = (s.heading / t.heading, s.speed / t.speed, s.yaw_rate / t.yaw_rate);
-        println!("{what:10} {heading:.2} {speed:.2} {yaw_rate:.2} {s:.4?} told {:.3?}", words.borrow());
+        println!("{what:10} {heading:.2} {speed:.2} {yaw_rate:.2} {s:.4?} reported {:.3?}", words.borrow());
         assert!(s.coverage > 0.95, "{what}: {s:?}");
     }
 }

@@ -5,7 +5,7 @@ use windhover_base::msg::{EstimatorOutput, MisfitCause};
 use windhover_base::settings::Rig;
 
 use super::filter::{Flight, fly};
-use super::misfit::{assert_as_good, configured, level, scored, sharp, told};
+use super::misfit::{assert_as_good, configured, level, misfits, scored, sharp};
 
 /// Time of each report of a misfit from the first estimate on, s, its cause and figure.
 fn reports(flight: &Flight, marker: usize, larger: f64) -> Vec<(f64, MisfitCause, f64)> {
@@ -50,12 +50,12 @@ fn tags_place_the_height_where_the_ground_is_configured_elsewhere() {
     for down_m in [-10.0, -16.0, 10.0, -5.0] {
         let out = configured(&flight, |_| {}, Ground::Flat { down_m });
         assert_as_good(&format!("ground {down_m} m down"), &scored(&flight, &out, 6.0), &bare, 1.3);
-        let heights = told(&out).into_iter().filter(|(cause, _)| *cause == MisfitCause::Height);
+        let heights = misfits(&out).into_iter().filter(|(cause, _)| *cause == MisfitCause::Height);
         // The receiver's bias is of the difference too.
-        let rise = heights.map(|(_, rise_m)| rise_m).next().expect("it is told");
+        let rise = heights.map(|(_, rise_m)| rise_m).next().expect("it is reported");
         assert!((rise + down_m).abs() < 8.0, "{rise} m of {down_m}");
     }
-    assert!(told(&configured(&flight, |_| {}, level())).is_empty());
+    assert!(misfits(&configured(&flight, |_| {}, level())).is_empty());
 }
 
 #[test]
@@ -63,8 +63,8 @@ fn tags_that_are_not_as_configured_are_found_out() {
     let flight = fly("follow", 30.0, 7, sharp);
     let bare = scored(&flight, &flight.outputs(), 20.0);
     type Change = fn(&mut Rig);
-    type Told = fn(&MisfitCause, f64) -> bool;
-    let changes: [(&str, Change, Told); 5] = [
+    type Reported = fn(&MisfitCause, f64) -> bool;
+    let changes: [(&str, Change, Reported); 5] = [
         (
             "one tag larger",
             |rig| rig.target[0].marker[1].size_m = Some(0.48 / 1.05),
@@ -96,10 +96,10 @@ fn tags_that_are_not_as_configured_are_found_out() {
     for (what, change, expected) in changes {
         let out = configured(&flight, change, level());
         let score = scored(&flight, &out, 20.0);
-        println!("{what}: {score:?} twin {bare:?} told {:?}", told(&out).first());
+        println!("{what}: {score:?} twin {bare:?} reported {:?}", misfits(&out).first());
         assert!(score.coverage >= 0.99 && score.nees < 6.0, "{what}: {score:?}, twin {bare:?}");
         assert!(score.speed <= 2.0 * bare.speed, "{what}: {score:?}, twin {bare:?}");
-        let last = told(&out).into_iter().rev().take(3).collect::<Vec<_>>();
+        let last = misfits(&out).into_iter().rev().take(3).collect::<Vec<_>>();
         assert!(last.iter().any(|(cause, figure)| expected(cause, *figure)), "{what}: {last:?}");
     }
 }
