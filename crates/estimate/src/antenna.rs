@@ -8,7 +8,7 @@ use windhover_base::msg::{FusionSource, MisfitCause};
 
 use super::blocks::own;
 use super::core::Core;
-use super::own::ARM_SIGMA_M;
+use super::slow::ARM_SIGMA_M;
 
 /// Sigmas of a careful measurement beyond which the place was measured wrongly; what it may be off by then, m.
 const BEYOND: f64 = 3.5;

@@ -124,7 +124,7 @@ pub(crate) mod own {
     pub(crate) const LEN: usize = VELOCITY_DELAY.end();
     pub(crate) const WITH_IMU: usize = FORCE_BIAS.end();
     pub(crate) const WITH_SECOND: usize = SECOND_TILT_ERROR.end();
-    /// What moves by itself, forces and slow errors: the table of `own.rs`.
+    /// What moves by itself, forces and slow errors: the table of `slow.rs`.
     pub(crate) const SLOW: Block<{ WITH_SECOND - RATE.end() }> = Block::after(RATE);
     /// The sensors' slow errors and drag, which outlive a restart.
     pub(crate) const SENSORS: Block<{ DRAG.end() - TRIM.end() }> = Block::after(TRIM);

@@ -13,7 +13,8 @@ use windhover_base::time::MonoTime;
 use super::blocks::{Block, own};
 use super::core::Core;
 use super::models::Models;
-use super::own::{LENS_K1_SIGMA, Own};
+use super::own::Own;
+use super::slow::LENS_K1_SIGMA;
 use super::state::{State, Target};
 
 /// Sigmas of a calibration beyond which it is of another lens; while it is not known whether vehicles sway.

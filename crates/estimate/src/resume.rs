@@ -8,7 +8,8 @@ use windhover_base::time::MonoTime;
 use super::blocks::own;
 use super::fitted::{LEAST, Learning, Learnt, MOST};
 use super::models::Models;
-use super::own::{SENSOR_STATES, Terms};
+use super::own::SENSOR_STATES;
+use super::slow::Terms;
 use super::start::START_HEADING;
 use super::state::State;
 

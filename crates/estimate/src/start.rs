@@ -9,7 +9,8 @@ use super::aid::compass::{down_in_body, true_heading};
 use super::aid::gnss;
 use super::blocks::{Block, own};
 use super::models::Models;
-use super::own::{COMPASS, Own, SECOND, START_DRAG_PER_S, Terms};
+use super::own::{COMPASS, Own, SECOND};
+use super::slow::{START_DRAG_PER_S, Terms};
 use super::state::{Rejections, State};
 
 /// Variance of a position that is about to be read off the receiver, m².

@@ -11,7 +11,8 @@ use nalgebra::{Matrix3, Rotation3, Vector3};
 use crate::blocks::{Layout, own};
 use crate::force::Force;
 use crate::matrix::Grid;
-use crate::own::{Own, SLOW_STATES, Terms};
+use crate::own::{Own, SLOW_STATES};
+use crate::slow::Terms;
 
 /// Vibration and what is finer than a gust straight into velocity, m/s per √s.
 const VELOCITY_WALK: f64 = 0.02;

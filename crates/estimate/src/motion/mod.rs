@@ -1,6 +1,6 @@
 //! How everything moves from one instant to the next, and how uncertainty grows with it.
 //!
-//! The helicopter is in `helicopter.rs`, its sensors' slow errors in the table of `own.rs`; a model of a vehicle's
+//! The helicopter is in `helicopter.rs`, its sensors' slow errors in the table of `slow.rs`; a model of a vehicle's
 //! motion is a file that implements [`VehicleMotion`] and a row of [`Motion`]. Ground features stand still.
 
 mod ackermann;
@@ -17,7 +17,7 @@ use super::blocks::{TARGET, TargetBlock};
 use super::delayed;
 use super::matrix::Grid;
 use super::models::Models;
-use super::own::Terms;
+use super::slow::Terms;
 use super::state::State;
 
 use ackermann::Ackermann;
