@@ -27,6 +27,15 @@ const TELL_MEAN: f64 = 0.7;
 /// Time of observation before anything is reported, s.
 const SEEN_S: f64 = 20.0;
 
+/// Innovations before this time of observation are those of a filter that settles, s.
+const SETTLED_S: f64 = 5.0;
+/// The most that an innovation counts in the correlation, in sigmas.
+const COLOUR_MOST: f64 = 3.0;
+/// The largest correlation that noise is enlarged for.
+const MOST_CORRELATION: f64 = 0.6;
+/// Sigmas from which a correlation counts, and over how many more it comes to count as a whole.
+const SURE: (f64, f64) = (2.0, 1.0);
+
 /// The sources that are looked at.
 pub(crate) const WATCHED: [FusionSource; 8] = [
     FusionSource::GpsPosition,
@@ -51,11 +60,45 @@ pub(crate) struct Fit {
     mean: [f64; 3],
     last: Option<MonoTime>,
     seen_s: f64,
+    colour: Colour,
+}
+
+/// Correlation of a source's successive innovations. Where model and noise are right, they are white.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+struct Colour {
+    /// The innovation before, each component over its sigma.
+    before: [f64; 3],
+    /// Means of the product of successive ones and of the square, of all components.
+    product: f64,
+    square: f64,
+    /// Number of products in the means.
+    count: f64,
+}
+
+impl Colour {
+    /// Takes an innovation, each component over its sigma and less its mean; `window` is the number of products that the means hold.
+    fn take(&mut self, innovation: &[f64], window: f64) {
+        for (one, before) in innovation.iter().zip(&mut self.before) {
+            self.count = (self.count + 1.0).min(window);
+            self.product += (one * *before - self.product) / self.count;
+            self.square += (one * one - self.square) / self.count;
+            *before = *one;
+        }
+    }
+
+    /// The correlation, or zero where it is within two sigmas of it.
+    fn correlation(&self) -> f64 {
+        if self.square <= 0.0 {
+            return 0.0;
+        }
+        let (correlation, sigma) = (self.product / self.square, 1.0 / self.count.sqrt());
+        correlation.min(MOST_CORRELATION) * (correlation / sigma - SURE.0).clamp(0.0, SURE.1) / SURE.1
+    }
 }
 
 impl Default for Fit {
     fn default() -> Self {
-        Self { square: 1.0, mean: [0.0; 3], last: None, seen_s: 0.0 }
+        Self { square: 1.0, mean: [0.0; 3], last: None, seen_s: 0.0, colour: Colour::default() }
     }
 }
 
@@ -77,10 +120,22 @@ impl Fit {
         self.seen_s += since_s;
         let gain = 1.0 - (-since_s / OVER_S).exp();
         self.square += gain * ((squared / m as f64).min(MOST) - self.square);
+        let mut ones = [0.0; 3];
         for i in 0..m.min(3) {
             let one = (innovation[i] / var[i].sqrt()).clamp(-MOST.sqrt(), MOST.sqrt());
             self.mean[i] += gain * (one - self.mean[i]);
+            ones[i] = (one - self.mean[i]).clamp(-COLOUR_MOST, COLOUR_MOST);
         }
+        if self.seen_s > SETTLED_S && since_s > 0.0 {
+            self.colour.take(&ones[..m.min(3)], m.min(3) as f64 * OVER_S / since_s);
+        }
+    }
+
+    /// Factor on the noise of this source by which successive errors that are alike count: `(1 + ρ)/(1 − ρ)`, the ratio of the
+    /// variance of a mean of a first-order autoregressive sequence to that of a white one.
+    pub(crate) fn colour_factor(&self) -> f64 {
+        let correlation = self.colour.correlation();
+        (1.0 + correlation) / (1.0 - correlation)
     }
 
     /// Factor on the reported variances of what this source measures: one where it fits.
@@ -106,6 +161,12 @@ impl Fit {
 }
 
 impl State {
+    /// Factor on the noise of a source whose successive errors are alike; one where they are not.
+    pub(crate) fn colour_factor(&self, source: FusionSource) -> f64 {
+        let fits = WATCHED.iter().zip(&self.fits);
+        fits.filter(|(watched, _)| **watched == source).map(|(_, fit)| fit.colour_factor()).fold(1.0, f64::max)
+    }
+
     /// Factors on the reported variances of position, velocity and attitude: one where their sources fit.
     pub(crate) fn told_factors(&self) -> [f64; 3] {
         let of = |sources: &[FusionSource]| {

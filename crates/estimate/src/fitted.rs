@@ -106,16 +106,18 @@ pub(crate) fn blend_within(value: &mut f64, sample: f64, gain: f64, limits: (f64
 }
 
 /// Moves a measurement's variance toward what its residual after fusion shows:
-/// `E[(z − h)² | data] = (R/S r)² + R (1 − R/S)`.
+/// `E[(z − h)² | data] = (R/S r)² + R (1 − R/S)`. `R` is the variance times the factor by which it counted in the fusion.
 pub(crate) fn blend_noise(
     value: &mut f64,
+    factor: f64,
     residual: f64,
     innovation_var: f64,
     gain: f64,
     limits: (f64, f64),
 ) {
-    let share = *value / innovation_var.max(*value);
-    let sample = (share * residual).powi(2) + *value * (1.0 - share);
+    let used = *value * factor;
+    let share = used / innovation_var.max(used);
+    let sample = (share * residual).powi(2) + used * (1.0 - share);
     blend_within(value, sample, gain, limits);
 }
 

@@ -53,6 +53,11 @@ impl Force {
         }
     }
 
+    /// What the turning of the helicopter changes of it, NED, m/s³: `∂f/∂(attitude error) · R ω`.
+    pub(crate) fn jerk(&self, own: &Own) -> Vector3<f64> {
+        self.d_attitude * (own.ned_from_body * own.rate)
+    }
+
     /// Acceleration in NED.
     pub(crate) fn acceleration(&self) -> Vector3<f64> {
         self.ned + Vector3::new(0.0, 0.0, GRAVITY)

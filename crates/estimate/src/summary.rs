@@ -25,6 +25,9 @@ impl Estimator {
             self.core.state.shake.sigmas().map(|sigma| sigma * self.core.models.camera.fx);
         let targets: Vec<String> =
             l.target_q.iter().map(|q| format!("{:.3}/{:.3}", q[0].sqrt(), q[1].sqrt())).collect();
+        let lags: Vec<String> = self.core.state.fits.iter().take(4).map(|f| format!("{:.2}", f.colour_factor())).collect();
+        format!(
+            "LAG {} {}", lags.join(" "),
         format!(
             "heading bias {:.2}±{:.2} deg, tilt felt {:?} (slope {:.2}) gain {:.2}±{:.2} error {:.2},{:.2}±{:.2} deg \
              bias {:.2},{:.2}±{:.2} deg, trim {:.1},{:.1}±{:.1} deg, wind {:.2},{:.2}±{:.2} m/s2, drag {:.2}±{:.2}, delay {:.0}±{:.0} and {:.0}±{:.0} ms, compass {:.1}±{:.1} ms, camera {:.1} ms, read-out {:.1}±{:.1} ms, shake {:.2} px roll {:.2} px, lens {:.3?} k1 ±{:.3}, arm {:.2},{:.2}±{:.2} m, \
@@ -75,6 +78,6 @@ impl Estimator {
             l.marker_factor,
             l.feature_factor,
             self.core.state.tags_in_words()
-        )
+        ))
     }
 }

@@ -33,7 +33,7 @@ const JUDGED_S: f64 = 1.5;
 /// Energy of the slow filter over that of the fast one: 3 to 5 of such an oscillation, 20 and more of a slide.
 const COMES_BACK: f64 = 12.0;
 /// How much more energy than the filter's own uncertainty explains is not noise.
-const LEAST_RATIO: f64 = 4.0;
+const LEAST_RATIO: f64 = 1.5;
 /// Nothing is taken before a place is known well enough to be expected to move by less than this, m.
 const SETTLED_M: f64 = 0.005;
 /// Displacement below which it is closed, and above which it is opened; the most there is, m.

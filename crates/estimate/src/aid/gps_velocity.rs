@@ -1,5 +1,9 @@
-//! GPS velocity: `z = v + R (ω × l) − a τ`, with the antenna at l, the acceleration a (`force.rs`) and the delay τ, the sum
-//! of that of positions and of what velocity is older still.
+//! GPS velocity: `z = v + R (ω × l) − a (τ + τᵥ) + j (½ τ² + τ τᵥ + τᵥ²)`, with the antenna at l, acceleration a and jerk j
+//! (`force.rs`), the delay τ of positions, and the time constant τᵥ of a first-order low-pass that the receiver applies to velocity:
+//! the series of `exp(−s τ) / (1 + s τᵥ)` to second order.
+//!
+//! Without the second order a receiver that filters over 0.3 s turns heading by a degree in the first seconds: jerk is what
+//! the helicopter turns about its axes, and so is correlated with everything that it sees.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -35,29 +39,32 @@ impl Aid for GpsVelocity {
 
     fn linearise(&self, state: &State, models: &Models, z: &mut Measurement) -> Result<(), Disposition> {
         let own = &state.own;
+        let (delay, low_pass) = (own.gps_delay_s, own.velocity_delay_s);
         let tau = own.velocity_age_s();
+        let second = 0.5 * delay * delay + low_pass * tau;
         let force = Force::of(own);
-        let acceleration = force.acceleration();
+        let (acceleration, jerk) = (force.acceleration(), force.jerk(own));
         let antenna = own.antenna(&models.antenna_at);
-        let expected = own.velocity_of(&antenna) - acceleration * tau;
+        let expected = own.velocity_of(&antenna) - acceleration * tau + jerk * second;
         let swing = own.ned_from_body * own.rate.cross(&antenna);
         z.begin(if self.has_down { 3 } else { 2 });
         z.block(own::VELOCITY, &Matrix3::from_diagonal_element(1.0 + own.drag_per_s * tau));
         z.block(own::ATTITUDE, &(-skew(&swing) - force.d_attitude * tau));
-        z.block(own::RATE, &(-own.rotation() * skew(&antenna)));
+        z.block(own::RATE, &(-own.rotation() * skew(&antenna) + force.d_attitude * own.rotation() * second));
         let d_arm = own.rotation() * skew(&own.rate);
         z.block(own::ARM, &d_arm.fixed_columns::<2>(0).into_owned());
         z.block(own::GUST, &(D_WIND * -tau));
         z.block(own::THRUST, &(force.d_thrust * -tau));
         z.block(own::WIND, &(D_WIND * -tau));
         z.block(own::TRIM, &(force.d_trim * -tau));
-        z.block(own::GPS_DELAY, &-acceleration);
-        z.block(own::VELOCITY_DELAY, &-acceleration);
+        z.block(own::GPS_DELAY, &(jerk * tau - acceleration));
+        z.block(own::VELOCITY_DELAY, &(jerk * (delay + 2.0 * low_pass) - acceleration));
         z.block(own::DRAG, &(force.d_drag * -tau));
+        let colour = state.colour_factor(Self::SOURCE);
         for i in 0..z.m {
             z.residual[i] = self.ned_mps[i] - expected[i];
             let told_var = self.sigma_mps.map_or(0.0, |sigma| sigma[i].powi(2));
-            z.noise[i][i] = models.gps_velocity_var.max(told_var) * state.learnt.gps_velocity_factor;
+            z.noise[i][i] = models.gps_velocity_var.max(told_var) * state.learnt.gps_velocity_factor * colour;
         }
         Ok(())
     }
@@ -66,12 +73,13 @@ impl Aid for GpsVelocity {
 impl GpsVelocity {
     /// Fuses it; after too many outside the gate velocity is what the receiver says, and what features ride on moves.
     pub(crate) fn fuse(&self, core: &mut Core) {
+        let colour = core.state.colour_factor(Self::SOURCE);
         let Some(outcome) = core.fuse_aid(self) else { return };
         core.judge_scale(&outcome);
         core.judge_antenna();
         core.note_velocity_unrest(&outcome);
         if core.teaches(&outcome) {
-            blend_factor(&mut core.state.learnt.gps_velocity_factor, outcome.misfit, SAMPLES, FACTORS);
+            blend_factor(&mut core.state.learnt.gps_velocity_factor, colour * outcome.misfit, SAMPLES, FACTORS);
         }
         let state = &mut core.state;
         state.rejections.gps_velocity = counted(state.rejections.gps_velocity, outcome.ratio);

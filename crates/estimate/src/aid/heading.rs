@@ -36,7 +36,7 @@ impl<const WHICH: usize> Aid for Heading<WHICH> {
         z.block(own::ATTITUDE, &turned);
         z.block(PLACES[WHICH].heading_bias, &Matrix1::new(1.0));
         z.residual[0] = wrap_angle(self.0 - x.y.atan2(x.x) - own.errors_of(WHICH).heading_bias);
-        z.noise[0][0] = state.learnt.heading_var[WHICH];
+        z.noise[0][0] = state.learnt.heading_var[WHICH] * state.colour_factor(Self::SOURCE);
         set_delay(z, WHICH, own, &turned);
         Ok(())
     }
@@ -45,13 +45,14 @@ impl<const WHICH: usize> Aid for Heading<WHICH> {
 impl<const WHICH: usize> Heading<WHICH> {
     /// Fuses it; after too many outside the gate the compass's bias is unknown again.
     pub(crate) fn fuse(&self, core: &mut Core) {
+        let colour = core.state.colour_factor(Self::SOURCE);
         let Some(outcome) = core.fuse_aid(self) else { return };
         if core.teaches(&outcome) {
             let (start, residual) = (core.learning.start.heading_var[WHICH], core.z.residual[0]);
             let gain = SAMPLE_GAIN_S / core.learning.over_s;
             let limits = (LIMITS.0 * start, LIMITS.1 * start);
             let value = &mut core.state.learnt.heading_var[WHICH];
-            blend_noise(value, residual, outcome.innovation_var[0], gain, limits);
+            blend_noise(value, colour, residual, outcome.innovation_var[0], gain, limits);
         }
         let state = &mut core.state;
         state.rejections.heading[WHICH] = counted(state.rejections.heading[WHICH], outcome.ratio);

@@ -109,7 +109,7 @@ impl<const WHICH: usize> TiltReading<WHICH> {
             let value = &mut core.state.learnt.tilt_var[WHICH];
             for (residual, innovation_var) in core.z.residual.into_iter().zip(outcome.innovation_var).take(2)
             {
-                blend_noise(value, residual, innovation_var, gain, limits);
+                blend_noise(value, 1.0, residual, innovation_var, gain, limits);
             }
         }
         let state = &mut core.state;
