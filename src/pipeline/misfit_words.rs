@@ -32,6 +32,12 @@ pub(super) fn words(misfit: &Misfit, rig: &Rig) -> MisfitWords {
             format!("check {} and {}", bias_keys(misfit.source), noise_keys(misfit.source)),
         ),
         MisfitCause::Late => late(misfit),
+        MisfitCause::Filtered => of_source(
+            format!("{figure:.2} s"),
+            format!("the receiver smooths its velocity over {figure:.2} s, so that it is older than its position"),
+            "switch off the receiver's smoothing (its dynamic model or low-speed filter), if it can be; the estimate allows for it"
+                .into(),
+        ),
         MisfitCause::MarkerSize(pair) => marker_size(figure, pair, rig),
         MisfitCause::MarkerPlace(pair) => of_marker(
             pair,
@@ -140,6 +146,7 @@ const fn kind(cause: MisfitCause) -> &'static str {
         MisfitCause::Wanders => "wanders",
         MisfitCause::TargetSlides { .. } => "target_slides",
         MisfitCause::Late => "late",
+        MisfitCause::Filtered => "filtered",
     }
 }
 

@@ -117,8 +117,8 @@ impl Core {
         let outcome = self.fuse(source, gate);
         if let (Some(place), Some(gate)) = (WATCHED.iter().position(|watched| *watched == source), gate) {
             let (z, t) = (&self.z, self.state.t);
-            let squared = outcome.ratio * gate;
-            self.state.fits[place].take(t, squared, &z.residual, &outcome.innovation_var, z.m);
+            let (squared, is_blind) = (outcome.ratio * gate, self.state.is_blind());
+            self.state.fits[place].take(t, squared, &z.residual, &outcome.innovation_var, z.m, is_blind);
         }
         self.report(source, outcome);
         outcome

@@ -86,12 +86,10 @@ impl Colour {
         }
     }
 
-    /// The correlation, or zero where it is within two sigmas of it.
+    /// The correlation, or zero where it is within two sigmas of it. Innovations that are smaller than their sigma correlate by the
+    /// share of their variance that there is.
     fn correlation(&self) -> f64 {
-        if self.square <= 0.0 {
-            return 0.0;
-        }
-        let (correlation, sigma) = (self.product / self.square, 1.0 / self.count.sqrt());
+        let (correlation, sigma) = (self.product / self.square.max(1.0), 1.0 / self.count.max(1.0).sqrt());
         correlation.min(MOST_CORRELATION) * (correlation / sigma - SURE.0).clamp(0.0, SURE.1) / SURE.1
     }
 }
@@ -103,7 +101,8 @@ impl Default for Fit {
 }
 
 impl Fit {
-    /// Takes the innovation of a measurement of `m` components: its normalised square, and each component with its variance.
+    /// Takes the innovation of a measurement of `m` components: its normalised square, and each component with its variance;
+    /// and whether no marker was seen lately.
     pub(crate) fn take(
         &mut self,
         t: MonoTime,
@@ -111,6 +110,7 @@ impl Fit {
         innovation: &[f64; MAX_MEASURED],
         var: &[f64; MAX_MEASURED],
         m: usize,
+        is_blind: bool,
     ) {
         let since_s = self.last.map_or(0.0, |last| (t - last).s().clamp(0.0, LONGEST_S));
         self.last = Some(t);
@@ -126,7 +126,7 @@ impl Fit {
             self.mean[i] += gain * (one - self.mean[i]);
             ones[i] = (one - self.mean[i]).clamp(-COLOUR_MOST, COLOUR_MOST);
         }
-        if self.seen_s > SETTLED_S && since_s > 0.0 {
+        if self.seen_s > SETTLED_S && since_s > 0.0 && !is_blind {
             self.colour.take(&ones[..m.min(3)], m.min(3) as f64 * OVER_S / since_s);
         }
     }
@@ -161,10 +161,16 @@ impl Fit {
 }
 
 impl State {
-    /// Factor on the noise of a source whose successive errors are alike; one where they are not.
+    /// Factor on the noise of a source whose successive errors are alike; one where they are not. Without a marker, innovations
+    /// are correlated by what the filter does not know of tilt and forces: they show nothing of the source then.
     pub(crate) fn colour_factor(&self, source: FusionSource) -> f64 {
+        if self.is_blind() {
+            return 1.0;
+        }
         let fits = WATCHED.iter().zip(&self.fits);
-        fits.filter(|(watched, _)| **watched == source).map(|(_, fit)| fit.colour_factor()).fold(1.0, f64::max)
+        fits.filter(|(watched, _)| **watched == source)
+            .map(|(_, fit)| fit.colour_factor())
+            .fold(1.0, f64::max)
     }
 
     /// Factors on the reported variances of position, velocity and attitude: one where their sources fit.
@@ -216,6 +222,9 @@ impl Core {
 
 #[cfg(test)]
 mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
     use windhover_base::time::Span;
 
     use super::*;
@@ -231,7 +240,7 @@ mod tests {
             innovation[1] = mean + sigma * 2f64.sqrt() * angle.cos();
             let squared = innovation[0].powi(2) + innovation[1].powi(2);
             let t = MonoTime::from_ns(1_000_000_000) + Span::from_s(0.2 * f64::from(k));
-            fit.take(t, squared, &innovation, &[1.0; MAX_MEASURED], 2);
+            fit.take(t, squared, &innovation, &[1.0; MAX_MEASURED], 2, false);
         }
         fit
     }
@@ -254,11 +263,37 @@ mod tests {
         assert!(fed(1.0, 0.0).misfit(4.0).is_some());
     }
 
+    /// Feeds a first-order autoregressive sequence of unit variance with this correlation, at 5 Hz for a minute.
+    fn coloured(correlation: f64) -> Fit {
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        let (mut fit, mut innovation) = (Fit::default(), [0.0; MAX_MEASURED]);
+        for k in 0..300 {
+            for one in &mut innovation[..2] {
+                let new: f64 = StandardNormal.sample(&mut rng);
+                *one = correlation * *one + (1.0 - correlation * correlation).sqrt() * new;
+            }
+            let squared = innovation[0].powi(2) + innovation[1].powi(2);
+            let t = MonoTime::from_ns(1_000_000_000) + Span::from_s(0.2 * f64::from(k));
+            fit.take(t, squared, &innovation, &[1.0; MAX_MEASURED], 2, false);
+        }
+        fit
+    }
+
+    #[test]
+    fn innovations_that_are_alike_enlarge_the_noise_and_white_ones_do_not() {
+        for white in [fed(1.0, 0.0), fed(2.0, 0.0), fed(0.5, -1.0), coloured(0.0), coloured(-0.4)] {
+            assert_eq!(white.colour_factor(), 1.0, "{white:?}");
+        }
+        // (1 + ρ)/(1 − ρ) of 0.4 and of the most that is believed, 0.6.
+        assert!((1.6..3.2).contains(&coloured(0.4).colour_factor()), "{}", coloured(0.4).colour_factor());
+        assert_eq!(coloured(0.95).colour_factor(), 4.0);
+    }
+
     #[test]
     fn a_single_wild_measurement_says_nothing() {
         let mut fit = fed(1.0, 0.0);
         let t = MonoTime::from_ns(62_000_000_000);
-        fit.take(t, 1e9, &[1e4; MAX_MEASURED], &[1.0; MAX_MEASURED], 2);
+        fit.take(t, 1e9, &[1e4; MAX_MEASURED], &[1.0; MAX_MEASURED], 2, false);
         assert!(fit.misfit(1.0).is_none(), "{fit:?}");
     }
 }

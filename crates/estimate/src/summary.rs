@@ -1,5 +1,7 @@
 //! What the filter has found of its sensors and of motion: single figures, and all of it in a line of text.
 
+use windhover_base::msg::FusionSource;
+
 use super::blocks::own;
 use super::filter::Estimator;
 
@@ -25,13 +27,11 @@ impl Estimator {
             self.core.state.shake.sigmas().map(|sigma| sigma * self.core.models.camera.fx);
         let targets: Vec<String> =
             l.target_q.iter().map(|q| format!("{:.3}/{:.3}", q[0].sqrt(), q[1].sqrt())).collect();
-        let lags: Vec<String> = self.core.state.fits.iter().take(4).map(|f| format!("{:.2}", f.colour_factor())).collect();
-        format!(
-            "LAG {} {}", lags.join(" "),
+        let colour = |source| self.core.state.colour_factor(source);
         format!(
             "heading bias {:.2}±{:.2} deg, tilt felt {:?} (slope {:.2}) gain {:.2}±{:.2} error {:.2},{:.2}±{:.2} deg \
              bias {:.2},{:.2}±{:.2} deg, trim {:.1},{:.1}±{:.1} deg, wind {:.2},{:.2}±{:.2} m/s2, drag {:.2}±{:.2}, delay {:.0}±{:.0} and {:.0}±{:.0} ms, compass {:.1}±{:.1} ms, camera {:.1} ms, read-out {:.1}±{:.1} ms, shake {:.2} px roll {:.2} px, lens {:.3?} k1 ±{:.3}, arm {:.2},{:.2}±{:.2} m, \
-             sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} gust {:.2} thrust {:.2} targets {} pixels {:.2?} {:.2} tags {}",
+             sigma heading {:.2} tilt {:.2} deg, walks rate {:.2}/{:.2} gust {:.2} thrust {:.2} targets {} pixels {:.2?} {:.2} tags {}, colour velocity {:.2} heading {:.2}",
             own.heading_bias.to_degrees(),
             cov.sigma(own::HEADING_BIAS, 0).to_degrees(),
             self.core.state.tilt[0].felt,
@@ -77,7 +77,9 @@ impl Estimator {
             targets.join(" "),
             l.marker_factor,
             l.feature_factor,
-            self.core.state.tags_in_words()
-        ))
+            self.core.state.tags_in_words(),
+            colour(FusionSource::GpsVelocity),
+            colour(FusionSource::CompassHeading)
+        )
     }
 }

@@ -40,6 +40,7 @@ impl Core {
             .into_iter()
             .chain(self.clock_misfit())
             .chain(self.antenna_misfit())
+            .chain(self.low_pass_misfit())
             .chain(self.lens_misfit())
             .chain(self.readout_misfit())
             .chain(self.receiver_misfit())

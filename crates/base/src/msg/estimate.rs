@@ -290,6 +290,8 @@ pub enum MisfitCause {
     AntennaPlace,
     /// The times of validity of its measurements are earlier than their stamps. Figure: by how much, s.
     Late,
+    /// The receiver's velocity passes through a low-pass filter that its position does not. Figure: its time constant, s.
+    Filtered,
 }
 
 /// A marker that does not fit, and the marker that shows it: indices in the configuration.

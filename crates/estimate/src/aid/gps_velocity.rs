@@ -2,13 +2,13 @@
 //! (`force.rs`), the delay τ of positions, and the time constant τᵥ of a first-order low-pass that the receiver applies to velocity:
 //! the series of `exp(−s τ) / (1 + s τᵥ)` to second order.
 //!
-//! Without the second order a receiver that filters over 0.3 s turns heading by a degree in the first seconds: jerk is what
-//! the helicopter turns about its axes, and so is correlated with everything that it sees.
+//! The second order matters where a receiver filters over some tenths of a second: jerk comes of the helicopter's turning, so
+//! that what is left out is correlated with what the camera and the compass show (0.3 s: NEES of heading 2.9, with it 1.6).
 
 use nalgebra::{Matrix3, Vector3};
 
 use windhover_base::geo::skew;
-use windhover_base::msg::{Disposition, FusionSource};
+use windhover_base::msg::{Disposition, FusionSource, MisfitCause};
 
 use super::{Aid, counted};
 use crate::blocks::own;
@@ -33,6 +33,11 @@ pub(super) const SAMPLES: f64 = 50.0;
 /// Limits of the factor on the variance of the receiver's noise. What it filters is not white, so little is made of a
 /// small residual.
 pub(super) const FACTORS: (f64, f64) = (0.25, 25.0);
+
+/// A time constant of the receiver's low-pass below this is usual, s; and in how many of its sigmas it must be known to be
+/// reported.
+const LOW_PASS_S: f64 = 0.1;
+const LOW_PASS_SIGMAS: f64 = 4.0;
 
 impl Aid for GpsVelocity {
     const SOURCE: FusionSource = FusionSource::GpsVelocity;
@@ -70,6 +75,16 @@ impl Aid for GpsVelocity {
     }
 }
 
+impl Core {
+    /// The low-pass that the receiver applies to velocity, where it is beyond doubt: its time constant, s.
+    pub(crate) fn low_pass_misfit(&self) -> Option<(FusionSource, MisfitCause, f64)> {
+        let (low_pass_s, sigma_s) =
+            (self.state.own.velocity_delay_s, self.state.cov.sigma(own::VELOCITY_DELAY, 0));
+        let beyond = low_pass_s > LOW_PASS_S.max(LOW_PASS_SIGMAS * sigma_s);
+        beyond.then_some((GpsVelocity::SOURCE, MisfitCause::Filtered, low_pass_s))
+    }
+}
+
 impl GpsVelocity {
     /// Fuses it; after too many outside the gate velocity is what the receiver says, and what features ride on moves.
     pub(crate) fn fuse(&self, core: &mut Core) {
@@ -79,7 +94,12 @@ impl GpsVelocity {
         core.judge_antenna();
         core.note_velocity_unrest(&outcome);
         if core.teaches(&outcome) {
-            blend_factor(&mut core.state.learnt.gps_velocity_factor, colour * outcome.misfit, SAMPLES, FACTORS);
+            blend_factor(
+                &mut core.state.learnt.gps_velocity_factor,
+                colour * outcome.misfit,
+                SAMPLES,
+                FACTORS,
+            );
         }
         let state = &mut core.state;
         state.rejections.gps_velocity = counted(state.rejections.gps_velocity, outcome.ratio);

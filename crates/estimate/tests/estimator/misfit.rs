@@ -339,6 +339,25 @@ fn an_antenna_that_is_elsewhere_is_found_out() {
 }
 
 #[test]
+fn a_receiver_that_filters_its_velocity_is_found_out() {
+    let filtered = |out: &[EstimatorOutput]| {
+        misfits(out).into_iter().rfind(|(cause, _)| *cause == MisfitCause::Filtered)
+    };
+    for fits in ["follow", "circle20", "follow+gps-late=150", "follow+compass-late=60"] {
+        let (_, out) = flown(fits, 30.0, 3);
+        assert_eq!(filtered(&out), None, "{fits}");
+    }
+    for seed in [3, 4, 5] {
+        let (world, out) = flown("follow+velocity-filter=0.3", 30.0, seed);
+        let score = score(&estimates(&out), &world, 6.0);
+        println!("seed {seed}: {score:?}, found {:?}", filtered(&out));
+        assert!(score.nees < 4.5, "{score:?}");
+        let found_s = filtered(&out).expect("it is reported").1;
+        assert!((0.15..0.45).contains(&found_s), "{found_s}");
+    }
+}
+
+#[test]
 fn a_vehicle_that_drives_off_slowly_is_woken() {
     for features in [4, 8] {
         let flight = fly("hover20", 30.0, 9, |scenario| {
