@@ -181,7 +181,7 @@ fn intensities(world: &World, scales_s: &[f64; 6]) -> Intensities {
 const THRUST_TAU_S: f64 = 2.0;
 
 /// The configuration with these intensities and the true noise.
-fn told_the_truth(world: &World, q: &Intensities) -> (Rig, EstimatorConfig) {
+fn configured_with_truth(world: &World, q: &Intensities) -> (Rig, EstimatorConfig) {
     let scenario = world.scenario();
     let mut rig = scenario.rig.clone();
     let mut e = EstimatorConfig::default();
@@ -254,7 +254,7 @@ fn bound(world: &Arc<World>, site: &Site) -> Figures {
     let mut score = BoundScore::default();
     for _ in 0..PASSES {
         let q = intensities(world, &scales_s);
-        score = bound_pass(world, site, &told_the_truth(world, &q), &taken);
+        score = bound_pass(world, site, &configured_with_truth(world, &q), &taken);
         scales_s[..2].copy_from_slice(&score.scales_s(&q));
     }
     score.figures()
@@ -265,8 +265,8 @@ type Taken = Vec<(MonoTime, Sample, Option<FrameObservations>)>;
 /// Iterations of the bound until the time scales agree with it.
 const PASSES: usize = 4;
 
-fn bound_pass(world: &World, site: &Site, told: &(Rig, EstimatorConfig), taken: &Taken) -> BoundScore {
-    let mut bound = Bound::new(&told.0, &told.1, site);
+fn bound_pass(world: &World, site: &Site, configured: &(Rig, EstimatorConfig), taken: &Taken) -> BoundScore {
+    let mut bound = Bound::new(&configured.0, &configured.1, site);
     let mut score = BoundScore::default();
     for (t, sample, seen) in taken {
         // A fix enters at its stamp, with the delay that is to be estimated.
@@ -343,7 +343,7 @@ fn run(scenario: &Scenario, seed: u64, with_bound: bool, verbose: bool) -> Run {
     let rig = &world.scenario().rig;
     let site = Site {
         frame: *world.frame(),
-        ground: Ground::Flat { down_m: scenario.told_ground_down_m().unwrap_or(0.0) },
+        ground: Ground::Flat { down_m: scenario.configured_ground_down_m().unwrap_or(0.0) },
         declination_rad: scenario.rig.compass.declination_deg.unwrap_or(0.0).to_radians(),
     };
     let mut filter = Estimator::new(rig, &EstimatorConfig::default(), &site);

@@ -74,7 +74,7 @@ pub(super) fn run(scenario: Scenario, live: &Live<'_>) -> CliResult {
         score.tilt_max_deg,
         score.lag_ms,
         score.velocity_rms_mps,
-        score.told
+        score.messages
     );
     Ok(())
 }

@@ -471,11 +471,12 @@ mod tests {
         for name in ["format = \"nmea\"", "format = \"ubx\""] {
             assert_eq!(refusal(&[shared, format(name)]), None, "{name}");
         }
-        let told = refusal(&[shared]).expect("a TCM2 is another device");
-        assert!(told.contains("compass.device") && told.contains("tcm2"), "{told}");
+        let message = refusal(&[shared]).expect("a TCM2 is another device");
+        assert!(message.contains("compass.device") && message.contains("tcm2"), "{message}");
         let other_speed = ("baud = 38400\n#", "baud = 9600\n#");
-        let told = refusal(&[shared, format("format = \"ubx\""), other_speed]).expect("one line, two speeds");
-        assert!(told.contains("compass.baud"), "{told}");
+        let message =
+            refusal(&[shared, format("format = \"ubx\""), other_speed]).expect("one line, two speeds");
+        assert!(message.contains("compass.baud"), "{message}");
     }
 
     #[test]
@@ -489,8 +490,8 @@ mod tests {
             (on("#rate_hz = 5.0", "rate_hz = 100.0"), "gps.rate_hz"),
             (on("device = \"/dev/ttyS0\"", "device = \"tcp://gps:2000\""), "gps.configure"),
         ] {
-            let told = refusal(&[ublox, more]).expect(key);
-            assert!(told.contains(key), "{told}");
+            let message = refusal(&[ublox, more]).expect(key);
+            assert!(message.contains(key), "{message}");
         }
         let imu = refusal(&[on("#imu = false", "imu = true")]).expect("a TCM2 has no rates");
         assert!(imu.contains("compass.imu"), "{imu}");

@@ -71,7 +71,7 @@ pub struct GnssDecoder {
 /// A ZDA of another time than the open epoch: it leads the next burst, or only has the date.
 #[derive(Clone, Debug, Default)]
 struct DateAhead {
-    heard: Option<(Report, LineSpan)>,
+    received: Option<(Report, LineSpan)>,
     /// Whether the last one led its burst.
     leads: bool,
 }
@@ -208,7 +208,7 @@ impl Assembler {
             Ok(sentence) => sentence,
             Err(why) => return counts.refuse(why),
         };
-        self.order.heard(sentence.address(), line.span);
+        self.order.received(sentence.address(), line.span);
         let read = if sentence.address().starts_with("PGRM") {
             garmin::read(&sentence)
         } else {
@@ -226,7 +226,7 @@ impl Assembler {
         out: &mut Vec<ReceivedEpoch>,
     ) {
         let address = ubx::address(packet);
-        self.order.heard(&address, span);
+        self.order.received(&address, span);
         self.said(ubx::read(packet), &address, span, counts, out);
     }
 
@@ -271,7 +271,7 @@ impl Assembler {
             self.place_timed(&report, time, span, out)
         } else if report.kind.tells_time() {
             self.place_time_missing(&report, span, out)
-        } else if self.order.leads(address) || (self.date.leads && self.date.heard.is_some()) {
+        } else if self.order.leads(address) || (self.date.leads && self.date.received.is_some()) {
             self.lead(report, span);
             Ok(())
         } else {
@@ -282,7 +282,7 @@ impl Assembler {
     /// TIM-TP has a date, for the next pulse; it belongs to no epoch.
     fn place_pulse(&mut self, report: &Report, span: LineSpan) {
         if let Some((time, date)) = report.time_of_day_ns.zip(report.date) {
-            self.calendar.told(time, date, self.draft.as_ref().map(Draft::has_fix), span.t_first);
+            self.calendar.reported(time, date, self.draft.as_ref().map(Draft::has_fix), span.t_first);
         }
     }
 
@@ -332,7 +332,7 @@ impl Assembler {
         }
         if let Some(date) = report.date {
             let has_fix = self.draft.as_ref().map(Draft::has_fix);
-            self.calendar.told(time, date, has_fix, span.t_first);
+            self.calendar.reported(time, date, has_fix, span.t_first);
         }
         if self.is_done(time) {
             self.order.same_burst();
@@ -341,12 +341,12 @@ impl Assembler {
         if self.date.leads {
             self.close(out);
         }
-        self.date.heard = Some((report, span));
+        self.date.received = Some((report, span));
     }
 
     /// The ZDA that led the burst of this time, if there was one.
     fn date_of_burst(&mut self, time: i64) -> Option<(Report, LineSpan)> {
-        let (report, span) = self.date.heard.take()?;
+        let (report, span) = self.date.received.take()?;
         self.date.leads = report.time_of_day_ns == Some(time) && self.order.is_of_this_burst(span);
         self.date.leads.then_some((report, span))
     }
@@ -360,7 +360,7 @@ impl Assembler {
         out: &mut Vec<ReceivedEpoch>,
     ) -> Result<(), Refusal> {
         let open = self.draft.as_ref();
-        if !self.is_told_again(report.kind, span) {
+        if !self.repeats_after_silence(report.kind, span) {
             if open.is_some_and(|draft| draft.time_of_day_ns == Some(time) || draft.awaits(report.kind)) {
                 self.order.same_burst();
                 self.merge(report, span, out);
@@ -484,13 +484,13 @@ impl Assembler {
     /// Outputs the GLL that was kept apart, unless it has the time of the new epoch.
     fn close_aside(&mut self, time: Option<i64>, out: &mut Vec<ReceivedEpoch>) {
         if let Some(aside) = self.aside.take_if(|aside| time.is_none() || aside.time_of_day_ns != time) {
-            out.push(heard(&aside, &mut self.calendar));
+            out.push(received(&aside, &mut self.calendar));
         }
     }
 
     fn give_out(&mut self, out: &mut Vec<ReceivedEpoch>) {
         if let Some(draft) = self.draft.take() {
-            out.push(heard(&draft, &mut self.calendar));
+            out.push(received(&draft, &mut self.calendar));
             let (time_of_day_ns, t_last) = (draft.time_of_day_ns, draft.end.t_last);
             self.done = Some(Done { time_of_day_ns, kinds: draft.kinds, t_last });
         }
@@ -516,7 +516,7 @@ impl Assembler {
 
     /// Whether a sentence that the last epoch already has comes after a silence: this is a new burst, whatever its
     /// time. A receiver that learns of a leap second repeats a second.
-    fn is_told_again(&self, kind: Kind, span: LineSpan) -> bool {
+    fn repeats_after_silence(&self, kind: Kind, span: LineSpan) -> bool {
         let last = match (&self.draft, &self.done) {
             (Some(draft), _) => Some((&draft.kinds, draft.end.t_last)),
             (None, Some(done)) => Some((&done.kinds, done.t_last)),
@@ -533,7 +533,7 @@ impl Draft {
     }
 }
 
-fn heard(draft: &Draft, calendar: &mut Calendar) -> ReceivedEpoch {
+fn received(draft: &Draft, calendar: &mut Calendar) -> ReceivedEpoch {
     ReceivedEpoch {
         epoch: draft.finish(calendar),
         t_first_byte: draft.begin.t_first,

@@ -202,12 +202,12 @@ pub(super) async fn serve(
     for to in to {
         senders.spawn(send(to, tls.clone(), events.clone()));
     }
-    let mut told = BTreeMap::new();
+    let mut reported = BTreeMap::new();
     let mut tick = tokio::time::interval(EVERY);
     tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     loop {
         tick.tick().await;
-        for event in reports(&view, &mut told) {
+        for event in reports(&view, &mut reported) {
             // There may be no receiver.
             let _ = events.send(event.into());
         }
@@ -215,7 +215,7 @@ pub(super) async fn serve(
 }
 
 /// The reports of all states that are newer than the last reports.
-fn reports(view: &Mutex<View>, told: &mut BTreeMap<String, i64>) -> Vec<String> {
+fn reports(view: &Mutex<View>, reported: &mut BTreeMap<String, i64>) -> Vec<String> {
     let now = Instant::now();
     // UTC by this computer's clock, which may have been set since the program started.
     let utc = UtcTime::from_unix_ns(HostClock::start().now().ns());
@@ -223,7 +223,7 @@ fn reports(view: &Mutex<View>, told: &mut BTreeMap<String, i64>) -> Vec<String> 
         let view = lock(view);
         (view.vehicles(now), view.helicopters(now))
     };
-    let mut is_new = |name: String, t: i64| told.insert(name, t) != Some(t);
+    let mut is_new = |name: String, t: i64| reported.insert(name, t) != Some(t);
     let mut all = Vec::new();
     for vehicle in &vehicles {
         let t = host_time(vehicle.state.timestamp.as_ref()).ns();

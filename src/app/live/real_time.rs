@@ -95,7 +95,7 @@ pub struct LiveFlight {
     gps: PtyLine,
     compass: PtyLine,
     to_daemon: PtyLine,
-    heard: MavlinkFrames,
+    from_daemon: MavlinkFrames,
     camera: FrameRenderer,
     system_id: u8,
     moments: Vec<Moment>,
@@ -144,7 +144,7 @@ impl LiveFlight {
             gps,
             compass,
             to_daemon,
-            heard: MavlinkFrames::default(),
+            from_daemon: MavlinkFrames::default(),
             camera,
             system_id,
             moments: Vec::new(),
@@ -173,11 +173,11 @@ impl LiveFlight {
         let Some(last) = self.moments.last() else { return String::new() };
         let away = (last.own.position_ned_m - last.vehicle.origin()).xy().norm();
         let recent = self.moments.iter().rev().take(1_000);
-        let told = recent.filter(|moment| moment.told.is_some()).count();
+        let messages = recent.filter(|moment| moment.received.is_some()).count();
         let behind_ms = (self.clock.now() - self.flight.now()).ms();
         let v = last.vehicle.speed_mps;
         format!(
-            "{now_s:.0} s: {away:.2} m from the vehicle, which drives {v:.2} m/s; {told} messages received in 5 s; simulation {behind_ms:.0} ms behind"
+            "{now_s:.0} s: {away:.2} m from the vehicle, which drives {v:.2} m/s; {messages} messages received in 5 s; simulation {behind_ms:.0} ms behind"
         )
     }
 
@@ -203,13 +203,13 @@ impl LiveFlight {
         let mut said = Vec::new();
         let now = self.flight.now();
         self.autopilot.says(&self.world, now, &mut said);
-        let told = self.hear(now, &mut said);
+        let received = self.hear(now, &mut said);
         self.to_daemon.send(&said);
         events.iter().for_each(|event| self.deliver(event));
         self.flight.exposed().into_iter().for_each(|frame| self.camera.draw(frame));
         let t_s = self.world.seconds(now);
         let (own, vehicle) = (self.world.ownship(now), self.world.vehicle(0, now));
-        self.moments.push(Moment { t_s, own, vehicle, told });
+        self.moments.push(Moment { t_s, own, vehicle, received });
         Ok(())
     }
 
@@ -224,19 +224,19 @@ impl LiveFlight {
     /// Handles the daemon's messages to the autopilot: time requests are answered, the vehicle is followed.
     fn hear(&mut self, now: MonoTime, said: &mut Vec<u8>) -> Option<windhover_simulate::FollowTarget> {
         let mut frames = Vec::new();
-        self.heard.push(&self.to_daemon.receive(), &mut frames);
+        self.from_daemon.push(&self.to_daemon.receive(), &mut frames);
         let scenario = self.world.scenario();
         let origin_msl_m = scenario.origin.height_m - scenario.geoid_m;
-        let mut told = None;
+        let mut received = None;
         for frame in &frames {
             self.autopilot.hears(&self.world, frame, self.clock.now(), said);
             let target = follow_target(&frame.bytes, self.system_id, self.world.frame(), origin_msl_m);
-            told = target.or(told);
+            received = target.or(received);
         }
-        if let (Some(told), Flown::Follower(follower)) = (&told, &mut self.flown) {
-            follower.hear(told, now);
+        if let (Some(received), Flown::Follower(follower)) = (&received, &mut self.flown) {
+            follower.hear(received, now);
         }
-        told
+        received
     }
 }
 

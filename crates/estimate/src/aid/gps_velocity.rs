@@ -56,8 +56,8 @@ impl Aid for GpsVelocity {
         z.block(own::DRAG, &(force.d_drag * -tau));
         for i in 0..z.m {
             z.residual[i] = self.ned_mps[i] - expected[i];
-            let told_var = self.sigma_mps.map_or(0.0, |sigma| sigma[i].powi(2));
-            z.noise[i][i] = models.gps_velocity_var.max(told_var) * state.learnt.gps_velocity_factor;
+            let reported_var = self.sigma_mps.map_or(0.0, |sigma| sigma[i].powi(2));
+            z.noise[i][i] = models.gps_velocity_var.max(reported_var) * state.learnt.gps_velocity_factor;
         }
         Ok(())
     }

@@ -180,9 +180,9 @@ fn the_order_of_arrival_does_not_matter() {
     let after = |inputs: &[Input]| -> Ownship {
         let (mut filter, mut out) = (flight.filter(), Vec::new());
         inputs.iter().chain([&last]).for_each(|h| h.give(&mut filter, &mut out));
-        let told =
+        let state =
             out.iter().rev().find_map(|o| if let EstimatorOutput::Ownship(s) = o { Some(*s) } else { None });
-        told.expect("a frame tells the helicopter's state")
+        state.expect("a frame tells the helicopter's state")
     };
     // From the same start: everything in order of validity and received at once, compared with the order of arrival.
     let mut in_order = flight.inputs.clone();
@@ -194,7 +194,7 @@ fn the_order_of_arrival_does_not_matter() {
 }
 
 #[test]
-fn too_old_and_too_new_are_refused_and_told() {
+fn too_old_and_too_new_are_refused_and_reported() {
     let flight = fly("follow", 5.0, 6, |_| {});
     let (mut filter, mut out) = (flight.filter(), Vec::new());
     flight.inputs.iter().for_each(|h| h.give(&mut filter, &mut out));
@@ -219,9 +219,9 @@ fn a_vehicle_seen_before_there_is_a_fix_waits() {
     let frames: Vec<_> = flight.inputs.iter().filter(|h| matches!(h, Input::Frame(_))).collect();
     let (mut filter, mut out) = (flight.filter(), Vec::new());
     frames.iter().for_each(|h| h.give(&mut filter, &mut out));
-    let told = estimates(&out);
-    assert_eq!(told.len(), frames.len());
-    assert!(told.iter().all(|e| e.status == TrackStatus::Lost && e.state.is_none()));
+    let reported = estimates(&out);
+    assert_eq!(reported.len(), frames.len());
+    assert!(reported.iter().all(|e| e.status == TrackStatus::Lost && e.state.is_none()));
 }
 
 #[test]
