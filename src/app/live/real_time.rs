@@ -4,6 +4,7 @@
 use std::net::UdpSocket;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use nalgebra::Vector3;
@@ -24,6 +25,8 @@ use windhover_simulate::{ClosedFlight, FlightError, Follower, FollowerTuning, Sc
 const NAP: Duration = Duration::from_millis(2);
 /// Period of the progress messages.
 const SAID_EVERY_S: f64 = 5.0;
+/// Time after which the filter has settled: the score begins then, in a short flight at its half.
+const SETTLED_S: f64 = 15.0;
 
 /// Why a live simulation ended early.
 #[derive(Debug, thiserror::Error)]
@@ -151,11 +154,11 @@ impl LiveFlight {
         })
     }
 
-    /// Flies for the scenario's length, with progress messages to `say`.
-    pub fn run(mut self, mut say: impl FnMut(String)) -> Result<Score, LiveError> {
+    /// Flies for the scenario's length or until `stop` is set, with progress messages to `say`.
+    pub fn run(mut self, stop: &AtomicBool, mut say: impl FnMut(String)) -> Result<Score, LiveError> {
         let end = self.world.time(self.world.scenario().duration_s);
         let mut next_s = SAID_EVERY_S;
-        while self.flight.now() < end {
+        while self.flight.now() < end && !stop.load(Ordering::Relaxed) {
             while self.flight.now() + World::STEP <= self.clock.now() && self.flight.now() < end {
                 self.step()?;
             }
@@ -166,7 +169,8 @@ impl LiveFlight {
             }
             std::thread::sleep(NAP);
         }
-        Ok(Score::of(&self.moments, self.world.scenario().duration_s.min(15.0)))
+        let flown_s = self.world.seconds(self.flight.now());
+        Ok(Score::of(&self.moments, SETTLED_S.min(0.5 * flown_s)))
     }
 
     fn words(&self, now_s: f64) -> String {
