@@ -6,7 +6,7 @@ Each row (default: all of ROWS) is simulated for each seed beside a twin of the 
 default target/misfit, and made once), both are replayed and held against the truth from 6 s on. A line a row, over its
 seeds: root mean squares of heading, speed and yaw rate over the twins', and of heading over that of the paper's estimator
 in the same flights; NEES of the three together (3 is right) and each; NEES of position (2 is right); share of frames with
-an estimate; what misfits were told, and how many of the flights told it. `--with NAME=FIGURE` as a ROW flies that
+an estimate; what misfits were reported, and how many of the flights reported it. `--with NAME=FIGURE` as a ROW flies that
 deviation. Needs nothing beyond Python's library.
 """
 import argparse
@@ -86,7 +86,7 @@ def flight(options, what, seed):
 
 
 def figures(options, capture, change):
-    """Figures of the filter, the paper's heading error, and the misfits told."""
+    """Figures of the filter, the paper's heading error, and the misfits reported."""
     truth = rendered.rows(capture.with_name(f"{capture.stem}.truth.csv"))
     with tempfile.TemporaryDirectory() as scratch:
         config, out = pathlib.Path(scratch, "config.toml"), pathlib.Path(scratch, "flight.mcap")
@@ -99,8 +99,8 @@ def figures(options, capture, change):
         rendered.run(options.binary, "export", out, "--format", "csv", "--out", scratch)
         estimates = [e for e in rendered.rows(pathlib.Path(scratch, "estimates.csv")) if e["target"] == "ugv"]
         paper = rendered.rows(pathlib.Path(scratch, "paper.csv"))
-    told = re.findall(r"event=model_misfit.*?source=(\S+)", done.stderr + done.stdout)
-    return rendered.score(estimates, truth), paper_heading_deg(paper, truth), sorted(set(told))
+    reported = re.findall(r"event=model_misfit.*?source=(\S+)", done.stderr + done.stdout)
+    return rendered.score(estimates, truth), paper_heading_deg(paper, truth), sorted(set(reported))
 
 
 def paper_heading_deg(paper, truth):
@@ -119,12 +119,12 @@ def squares(values):
 
 
 def row(options, name, what, twin, change):
-    flown, twins, paper, told = [], [], [], collections.Counter()
+    flown, twins, paper, reported = [], [], [], collections.Counter()
     for seed in options.seeds:
         mine, theirs, misfits = figures(options, flight(options, what, seed), None)
         flown.append(mine)
         paper.append(theirs)
-        told.update(misfits)
+        reported.update(misfits)
         key = (twin, seed, change)
         if key not in options.twins:
             options.twins[key] = figures(options, flight(options, twin, seed), change)[0]
@@ -134,7 +134,7 @@ def row(options, name, what, twin, change):
     mean = lambda i: sum(mine[i]) / len(mine[i])
     cells = [f"{r:.2g}" if r < 10 else f"{r:.0f}" for r in ratios + [squares(mine[2]) / squares(paper)]]
     cells += [f"{mean(i):.1f}" for i in (5, 6, 7, 8, 9)] + [f"{mean(10):.3f}"]
-    cells.append(", ".join(f"{source} {count}" for source, count in sorted(told.items())) or "–")
+    cells.append(", ".join(f"{source} {count}" for source, count in sorted(reported.items())) or "–")
     print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
 
 
@@ -154,7 +154,7 @@ def main():
     chosen = {name: ROWS[name] for name in options.rows or ([] if options.others else ROWS)}
     chosen |= {what: (what, "", None) for what in options.others}
     print(f"| what is not as configured | heading × | speed × | yaw rate × | heading, of the paper's | NEES of the three "
-          "| heading | speed | yaw rate | position NEES | coverage | misfits told |\n|" + "---|" * 12)
+          "| heading | speed | yaw rate | position NEES | coverage | misfits reported |\n|" + "---|" * 12)
     for name, (what, twin, change) in chosen.items():
         row(options, name, what, twin, change)
 

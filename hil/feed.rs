@@ -145,18 +145,18 @@ fn first_pulse(capture: &str) -> Result<Option<MonoTime>, Trouble> {
     let path = Path::new(capture);
     let config = attached_config(path)?.ok_or("the capture has no configuration")?;
     let latency = Span::from_ms(Config::parse(&config)?.gps.latency_ms);
-    let heard = CaptureReader::open(path)?.filter_map(|item| item.event).filter_map(|event| {
+    let arrivals = CaptureReader::open(path)?.filter_map(|item| item.event).filter_map(|event| {
         let EventBody::Bytes { source: Source::Gps, data: bytes } = &event.body else { return None };
         let text = String::from_utf8_lossy(bytes);
         let seconds: f64 = text.split_once("RMC,")?.1.split(',').next()?.get(4..)?.parse().ok()?;
         Some(event.t_recv - Span::from_s(seconds.fract()))
     });
     let second = |t: &MonoTime| t.ns().rem_euclid(1_000_000_000);
-    let heard: Vec<MonoTime> = heard.take(SENTENCES).collect();
-    let Some(begin) = heard.first().copied() else { return Ok(None) };
+    let arrivals: Vec<MonoTime> = arrivals.take(SENTENCES).collect();
+    let Some(begin) = arrivals.first().copied() else { return Ok(None) };
     let late =
         |t: &MonoTime| (second(t) - second(&begin) + 1_500_000_000).rem_euclid(1_000_000_000) - 500_000_000;
-    let earliest = heard.iter().map(late).min().unwrap_or(0);
+    let earliest = arrivals.iter().map(late).min().unwrap_or(0);
     Ok(Some(begin + Span::from_ns(earliest) - latency))
 }
 

@@ -1,4 +1,4 @@
-"""The machine in flight: booted, fed, heard by a ground station, its daemon ready."""
+"""The machine in flight: booted, fed, received by a ground station, its daemon ready."""
 
 import json
 import re

@@ -79,7 +79,7 @@ def landing(flight):
 
 
 def unplug(flight):
-    """Each device goes away and comes back; each is told, none ends the daemon."""
+    """Each device goes away and comes back; each change is reported, none ends the daemon."""
     machine = flight.machine
     with same_daemon(machine) as pid:
         for part in ("gps", "compass"):
@@ -227,7 +227,7 @@ def card_absent(flight):
 
 
 def card_full(flight):
-    """The card fills up: that is told, estimates go on; room on it, and recording goes on."""
+    """The card fills up: that is reported, estimates go on; room on it, and recording goes on."""
     machine = flight.machine
     with same_daemon(machine):
         # What an operator marks is not deleted to make room.

@@ -24,8 +24,8 @@ fn read(choice: u8, stream: &[u8]) {
         decoder.push(read, MonoTime::default(), &mut out);
     }
     decoder.flush(&mut out);
-    for heard in out {
-        assert!(heard.reading.heading_deg.is_none_or(|deg| (0.0..=360.0).contains(&deg)));
-        assert!(heard.bytes > 0);
+    for received in out {
+        assert!(received.reading.heading_deg.is_none_or(|deg| (0.0..=360.0).contains(&deg)));
+        assert!(received.bytes > 0);
     }
 }

@@ -26,9 +26,9 @@ fn read(pace: u8, stream: &[u8]) {
     decoder.flush(&mut out);
     // The shortest epoch is one sentence of fifteen bytes.
     assert!(out.len() <= stream.len() / 15 + 1);
-    for heard in out {
-        assert!(heard.epoch.lat_deg.is_none_or(|lat| (-90.0..=90.0).contains(&lat)));
-        assert!(heard.epoch.lon_deg.is_none_or(|lon| (-180.0..=180.0).contains(&lon)));
-        assert!(heard.t_last_byte >= heard.t_first_byte);
+    for received in out {
+        assert!(received.epoch.lat_deg.is_none_or(|lat| (-90.0..=90.0).contains(&lat)));
+        assert!(received.epoch.lon_deg.is_none_or(|lon| (-180.0..=180.0).contains(&lon)));
+        assert!(received.t_last_byte >= received.t_first_byte);
     }
 }

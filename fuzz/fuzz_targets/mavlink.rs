@@ -9,8 +9,8 @@ use windhover_decode::AutopilotDecoder;
 fuzz_target!(|data: &[u8]| {
     assert!(verify(data, &SigningKey([7; 32])).is_err());
     let _ = std::str::from_utf8(data).map(SigningKey::from_hex);
-    let (mut decoder, mut heard) = (AutopilotDecoder::new(Some(1)), Vec::new());
+    let (mut decoder, mut received) = (AutopilotDecoder::new(Some(1)), Vec::new());
     for (k, part) in data.chunks(64).enumerate() {
-        decoder.push(part, MonoTime::from_ns(k as i64 * 10_000_000), &mut heard);
+        decoder.push(part, MonoTime::from_ns(k as i64 * 10_000_000), &mut received);
     }
 });

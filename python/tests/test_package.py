@@ -38,43 +38,43 @@ class Package(unittest.TestCase):
     def test_states_are_those_of_the_csv(self):
         self.assertEqual((self.flight.targets, self.flight.warnings), (["ugv"], []))
         for kind, name in (("filtered", "estimates"), ("smoothed", "smoothed"), ("paper", "paper")):
-            states, told = self.flight.states("ugv", kind), self.table(name)
+            states, table = self.flight.states("ugv", kind), self.table(name)
             self.assertGreater(len(states), 20, kind)
-            np.testing.assert_array_equal(states.index, told.time_ns)
-            self.assertEqual(list(states.status), list(told.status))
+            np.testing.assert_array_equal(states.index, table.time_ns)
+            self.assertEqual(list(states.status), list(table.status))
             columns = ["frame", "north_m", "east_m", "heading_rad", "speed_mps", "yaw_rate_radps", "lat_deg", "lon_deg"]
-            np.testing.assert_allclose(states[columns], told[columns], atol=1e-6, rtol=0)
+            np.testing.assert_allclose(states[columns], table[columns], atol=1e-6, rtol=0)
             if kind != "paper":
-                upper = told[[c for c in told if c.startswith("p_")]].to_numpy()
+                upper = table[[c for c in table if c.startswith("p_")]].to_numpy()
                 rows, columns = np.triu_indices(5)
                 covariance = self.flight.covariance("ugv", kind)
                 np.testing.assert_allclose(covariance[:, rows, columns], upper, rtol=1e-9)
                 np.testing.assert_array_equal(covariance, covariance.transpose(0, 2, 1))
-                np.testing.assert_allclose(self.flight.sigmas("ugv", kind).north_m ** 2, told.p_nn, rtol=1e-9)
+                np.testing.assert_allclose(self.flight.sigmas("ugv", kind).north_m ** 2, table.p_nn, rtol=1e-9)
 
     def test_own_state_and_detections_are_those_of_the_csv(self):
-        own, told = self.flight.ownship, self.table("ownship")
-        np.testing.assert_array_equal(own.index, told.time_ns)
-        np.testing.assert_array_equal(own.frame, told.frame.fillna(-1))
-        columns = [c for c in told if c not in ("time_ns", "frame")]
-        np.testing.assert_allclose(own[columns], told[columns], atol=1e-4, rtol=0)
+        own, table = self.flight.ownship, self.table("ownship")
+        np.testing.assert_array_equal(own.index, table.time_ns)
+        np.testing.assert_array_equal(own.frame, table.frame.fillna(-1))
+        columns = [c for c in table if c not in ("time_ns", "frame")]
+        np.testing.assert_allclose(own[columns], table[columns], atol=1e-4, rtol=0)
         self.assertTrue((np.linalg.eigvalsh(self.flight.ownship_covariance[-1]) > 0).all())
-        seen, told = self.flight.detections, self.table("detections")
-        np.testing.assert_array_equal(seen.index, told.time_ns)
+        seen, table = self.flight.detections, self.table("detections")
+        np.testing.assert_array_equal(seen.index, table.time_ns)
         columns = ["id", "hamming", "center_u", "u0", "v3"]
-        np.testing.assert_allclose(seen[columns], told[columns], atol=1e-4)
+        np.testing.assert_allclose(seen[columns], table[columns], atol=1e-4)
         np.testing.assert_allclose(self.flight.datum, self.table("datum").iloc[0], atol=1e-4)
         self.assertEqual(self.flight.config["target"][0]["name"], "ugv")
 
     def test_refined_states_are_those_of_the_csv(self):
         rig.windhover("refine", self.path, "--out", self.at / "refined.mcap")
         rig.windhover("export", self.at / "refined.mcap", "--format", "csv", "--out", self.at / "refined")
-        flight, told = Flight(self.at / "refined.mcap"), pd.read_csv(self.at / "refined/refined.csv")
+        flight, table = Flight(self.at / "refined.mcap"), pd.read_csv(self.at / "refined/refined.csv")
         states = flight.states("ugv", "refined")
         self.assertGreater(len(states), 50)
-        np.testing.assert_array_equal(states.index, told.time_ns)
-        np.testing.assert_allclose(states[["north_m", "heading_rad", "lat_deg"]], told[["north_m", "heading_rad", "lat_deg"]], atol=1e-6, rtol=0)
-        upper = told[[c for c in told if c.startswith("p_")]].to_numpy()
+        np.testing.assert_array_equal(states.index, table.time_ns)
+        np.testing.assert_allclose(states[["north_m", "heading_rad", "lat_deg"]], table[["north_m", "heading_rad", "lat_deg"]], atol=1e-6, rtol=0)
+        upper = table[[c for c in table if c.startswith("p_")]].to_numpy()
         rows, columns = np.triu_indices(5)
         np.testing.assert_allclose(flight.covariance("ugv", "refined")[:, rows, columns], upper, rtol=1e-9)
         self.assertGreater(len(flight.ownship_refined), 50)
@@ -131,8 +131,8 @@ class Package(unittest.TestCase):
         shapes = ellipses.main(self.path)["features"]
         self.assertTrue(4 <= len(shapes) <= 7, len(shapes))
         lon, lat = np.mean(shapes[-1]["geometry"]["coordinates"][0][:-1], axis=0)
-        told = self.table("estimates")
-        last = told[told.time_ns >= told.time_ns.iloc[-1] - 10**9]
+        table = self.table("estimates")
+        last = table[table.time_ns >= table.time_ns.iloc[-1] - 10**9]
         self.assertTrue(last.lat_deg.min() - 1e-7 <= lat <= last.lat_deg.max() + 1e-7)
         self.assertTrue(shapes[0]["properties"]["utc"].startswith("2026-11"), shapes[0]["properties"])
 

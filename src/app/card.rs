@@ -231,8 +231,8 @@ mod tests {
             (Some(Span::from_s(5.0)), None),
             "too short to tell"
         );
-        let told = pace.take(&store(20_000_000), at(21.0));
-        assert_eq!(told, (Some(Span::from_s(20.0)), Some(Span::from_s(1_000.0))));
+        let reported = pace.take(&store(20_000_000), at(21.0));
+        assert_eq!(reported, (Some(Span::from_s(20.0)), Some(Span::from_s(1_000.0))));
         // Another flight starts from zero.
         assert_eq!(pace.take(&store(10), at(22.0)), (Some(Span::ZERO), None));
     }

@@ -173,14 +173,14 @@ async fn send_mavlink(downlink: Downlink, status: SharedStatus, clock: HostClock
             Some(names) => blocking(move || mavlink::look_up(names)).await,
             None => Vec::new(),
         };
-        let told = downlink.lines().mavlink.as_mut().map(|mavlink| {
+        let changes = downlink.lines().mavlink.as_mut().map(|mavlink| {
             mavlink.found(found);
             mavlink.send(clock.now());
             let mut words: Vec<String> = mavlink.stations().iter().map(Station::words).collect();
             words.extend(mavlink.counts().words());
             (mavlink.news(), words.join("; "))
         });
-        if let Some((news, words)) = told {
+        if let Some((news, words)) = changes {
             news.iter().for_each(tell_mavlink);
             status.with(|status| status.figures.mavlink = words);
         }

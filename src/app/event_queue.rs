@@ -56,11 +56,11 @@ struct Lanes {
     /// Whether the oldest frame is next, as soon as the reads before it are handled.
     pinned: bool,
     /// Whether lost frames were reported since the last frame.
-    told: bool,
+    loss_reported: bool,
     /// Since when more frames wait than the configured length; reset when all are taken.
     crowded: Option<MonoTime>,
     /// Arrival of the newest event of any kind.
-    heard: Option<MonoTime>,
+    newest: Option<MonoTime>,
     /// Arrival of the newest event when a frame was last taken.
     taken: Option<MonoTime>,
     dropped: PerSource<u32>,
@@ -87,7 +87,7 @@ impl EventQueue {
             lanes.dropped[source] += 1;
         }
         lanes.reads.push_back((t_recv, body));
-        lanes.heard = lanes.heard.max(Some(t_recv));
+        lanes.newest = lanes.newest.max(Some(t_recv));
         drop(lanes);
         self.filled.notify_one();
     }
@@ -96,7 +96,7 @@ impl EventQueue {
     pub fn put_frame(&self, t_recv: MonoTime, frame: FramePayload) {
         let mut lanes = self.lock();
         lanes.frames.push_back((t_recv, frame));
-        lanes.heard = lanes.heard.max(Some(t_recv));
+        lanes.newest = lanes.newest.max(Some(t_recv));
         if lanes.frames.len() > self.frames {
             let since = *lanes.crowded.get_or_insert(t_recv);
             let most = if t_recv - since < CATCH_UP { self.frames.max(BURST) } else { self.frames };
@@ -153,7 +153,7 @@ impl Lanes {
 
     /// Whether a frame that arrived at `t` is too late.
     fn is_stale(&self, t: MonoTime) -> bool {
-        let since = |earlier: MonoTime| self.heard.map_or(Span::ZERO, |heard| heard - earlier);
+        let since = |earlier: MonoTime| self.newest.map_or(Span::ZERO, |newest| newest - earlier);
         let starving = self.taken.is_none_or(|taken| since(taken) >= STARVING);
         since(t) > if starving { LATEST } else { FRESH }
     }
@@ -177,17 +177,17 @@ impl Lanes {
         let frame_is_next = frame.is_some_and(|t| read.is_none_or(|read| t < read));
         self.pinned = frame.is_some();
         // Losses are reported before the events that remain; lost frames together with the next frame, not one by one.
-        let frames_due = frame.is_none() || (frame_is_next && !self.told);
+        let frames_due = frame.is_none() || (frame_is_next && !self.loss_reported);
         let due = |source: Source| source != Source::Camera || frames_due;
         let lost = Source::ALL.iter().copied().find(|&source| self.dropped[source] > 0 && due(source));
         if let Some(source) = lost {
             let count = std::mem::take(&mut self.dropped[source]);
-            self.told |= source == Source::Camera;
+            self.loss_reported |= source == Source::Camera;
             return Some(self.number(earliest, EventBody::Dropped { source, count }));
         }
         if frame_is_next {
             let (t, frame) = self.frames.pop_front()?;
-            (self.pinned, self.told, self.taken) = (false, false, self.heard);
+            (self.pinned, self.loss_reported, self.taken) = (false, false, self.newest);
             if self.frames.is_empty() {
                 self.crowded = None;
             }
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn the_newest_frames_win_and_the_loss_is_told() {
+    fn the_newest_frames_win_and_the_loss_is_reported() {
         // Given frames that nobody takes for longer than the longest burst.
         let queue = EventQueue::new(2);
         for ms in [10, 20, 30, 40, 600] {
@@ -336,8 +336,11 @@ mod tests {
         }
         // Then it still reaches a frame, after the reads before it, and the losses are reported with it, once.
         let frames = taken.iter().filter(|e| matches!(e.body, EventBody::Frame(_))).count();
-        let told = taken.iter().filter(|e| matches!(e.body, EventBody::Dropped { .. })).count();
-        assert!(frames >= 3 && told <= frames, "{frames} frames, losses reported {told} times: {taken:?}");
+        let losses = taken.iter().filter(|e| matches!(e.body, EventBody::Dropped { .. })).count();
+        assert!(
+            frames >= 3 && losses <= frames,
+            "{frames} frames, losses reported {losses} times: {taken:?}"
+        );
     }
 
     /// Feeds a queue for a minute: a read every 10 ms and a frame every 100 ms, and a pipeline that takes the given

@@ -397,8 +397,8 @@ mod tests {
             advice: "measure it".into(),
         };
         let (t, kind, detail) = (MonoTime::from_ns(NS_PER_S), NoticeKind::ModelMisfit, misfit.to_string());
-        let told = Notice { t, kind, source: None, target: None, detail, misfit: Some(misfit) };
-        let text = lines_of(|| notice(&told));
+        let reported = Notice { t, kind, source: None, target: None, detail, misfit: Some(misfit) };
+        let text = lines_of(|| notice(&reported));
         let fields = "level=warn event=model_misfit msg=\"measure it\" source=\"ugv tag 1\" figure=\"-5.0 %\" \
                       cause=\"tag 1 is 5.0 % smaller than configured\"";
         assert!(text.contains(fields) && text.starts_with("time=1970-01-01T00:00:01"), "{text}");

@@ -243,10 +243,11 @@ mod tests {
     fn the_flight_gets_what_the_line_tells() {
         let card = CardFigures { state: "ok".into(), free_mb: Some(812.0), ..CardFigures::default() };
         let figures = Figures { card, latency_p99: Some(Span::from_ms(31.0)), ..Figures::default() };
-        let told = figures.by_name();
-        let numbers: Vec<(&str, f64)> = told.figures.iter().map(|(name, value)| (&**name, *value)).collect();
+        let by_name = figures.by_name();
+        let numbers: Vec<(&str, f64)> =
+            by_name.figures.iter().map(|(name, value)| (&**name, *value)).collect();
         assert_eq!(numbers, [("card_free_mb", 812.0), ("latency_p99_ms", 31.0)]);
-        assert_eq!(told.words.iter().map(|(a, b)| (&**a, &**b)).collect::<Vec<_>>(), [("card", "ok")]);
+        assert_eq!(by_name.words.iter().map(|(a, b)| (&**a, &**b)).collect::<Vec<_>>(), [("card", "ok")]);
         let line = HealthLine::new(&config());
         let text = lines_of(|| line.emit(&Health::default(), Some(&figures)));
         assert!(text.contains("latency_p99_ms=31.0 card=ok card_free_mb=812"), "{text}");

@@ -116,8 +116,8 @@ mod tests {
         latencies.push(Span::from_s(60.0));
         let all = latencies.of_flight().expect("frames");
         assert_eq!((all.frames, all.longest), (10_001, Span::from_s(60.0)));
-        for (told, truth_ms) in [(all.p50, 50.0), (all.p99, 99.0)] {
-            assert!((1.0..=GROWTH).contains(&(told.ms() / truth_ms)), "{told:?} for {truth_ms} ms");
+        for (reported, truth_ms) in [(all.p50, 50.0), (all.p99, 99.0)] {
+            assert!((1.0..=GROWTH).contains(&(reported.ms() / truth_ms)), "{reported:?} for {truth_ms} ms");
         }
     }
 }

@@ -29,12 +29,12 @@ pub async fn run(address: SocketAddr, latest: LatestHealth, context: TaskContext
 }
 
 async fn serve(address: SocketAddr, latest: &LatestHealth, heartbeat: &Heartbeat) {
-    let mut told = false;
+    let mut reported = false;
     let listener = loop {
         match TcpListener::bind(address).await {
             Ok(listener) => break listener,
             Err(error) => {
-                if !std::mem::replace(&mut told, true) {
+                if !std::mem::replace(&mut reported, true) {
                     let words = format!("cannot listen on {address}: {error}; tried again");
                     OperatorEvent::LinkFault.emit("metrics", words);
                 }
@@ -79,6 +79,7 @@ async fn answer(mut stream: TcpStream, latest: &LatestHealth) -> std::io::Result
 
 fn text(latest: &LatestHealth) -> String {
     let health = latest.get();
-    let told = health.iter().map(|health| PayloadMetrics { payload: "", health, age_s: None, link: None });
-    openmetrics::render(&told.collect::<Vec<_>>())
+    let payloads =
+        health.iter().map(|health| PayloadMetrics { payload: "", health, age_s: None, link: None });
+    openmetrics::render(&payloads.collect::<Vec<_>>())
 }

@@ -30,9 +30,9 @@ pub fn recording(flight: &Flight) -> Recording {
 
 /// All inputs for a refinement of the whole flight.
 pub fn whole(flight: &Flight) -> windhover_refine::Recording {
-    let mut heard: BTreeMap<u32, MonoTime> = BTreeMap::new();
+    let mut arrivals: BTreeMap<u32, MonoTime> = BTreeMap::new();
     for (number, arrival) in flight.frames.iter().enumerate() {
-        heard.insert(number as u32, arrival.t_recv);
+        arrivals.insert(number as u32, arrival.t_recv);
     }
     let frame = |d: &wh::Detections| {
         let t_valid = host_time(d.timestamp.as_ref());
@@ -43,7 +43,7 @@ pub fn whole(flight: &Flight) -> windhover_refine::Recording {
         });
         let markers = d.markers.iter().filter_map(marker).collect();
         // Where the frame itself is not in the recording, its detections were made at about this time.
-        let t_recv = heard.get(&d.frame).copied().filter(|t| *t >= t_valid).unwrap_or(t_valid + LOOKED_AT);
+        let t_recv = arrivals.get(&d.frame).copied().filter(|t| *t >= t_valid).unwrap_or(t_valid + LOOKED_AT);
         let value = FrameObservations { frame: d.frame, markers, features: features.collect() };
         Stamped { t_valid, t_recv, seq: 0, value }
     };
@@ -60,8 +60,8 @@ pub fn whole(flight: &Flight) -> windhover_refine::Recording {
 /// Time from a frame's exposure to its detection, where that is not recorded.
 const LOOKED_AT: Span = Span::from_ns(60_000_000);
 
-fn stamped<T>(t: &Option<Timestamp>, heard: &Option<Timestamp>, value: T) -> Stamped<T> {
-    Stamped { t_valid: host_time(t.as_ref()), t_recv: host_time(heard.as_ref()), seq: 0, value }
+fn stamped<T>(t: &Option<Timestamp>, received: &Option<Timestamp>, value: T) -> Stamped<T> {
+    Stamped { t_valid: host_time(t.as_ref()), t_recv: host_time(received.as_ref()), seq: 0, value }
 }
 
 fn epoch(e: &wh::GnssEpoch) -> GnssEpoch {

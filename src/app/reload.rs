@@ -157,7 +157,7 @@ mod tests {
     use crate::config::LogLevel;
 
     #[test]
-    fn what_can_change_changes_and_the_rest_is_told() {
+    fn what_can_change_changes_and_the_rest_is_reported() {
         let text = include_str!("../../config/windhover.toml");
         let running = Config::parse(text).expect("valid");
         let mut read = running.clone();
@@ -166,14 +166,14 @@ mod tests {
         read.target[0].marker[1].id = Some(7);
         read.power.low_voltage_v = Some(10.5);
         read.camera.exposure_us = Some(800.0);
-        let told = differences(&running, &read);
+        let found = differences(&running, &read);
         let now = [
             "camera.exposure_us: unset → 800.0",
             "log.level: \"info\" → \"debug\"",
             "power.low_voltage_v: unset → 10.5",
         ];
-        assert_eq!(told.now, now);
-        assert_eq!(told.restart, ["gps.baud: 38400 → 4800", "target[0].marker[1].id: 1 → 7"]);
+        assert_eq!(found.now, now);
+        assert_eq!(found.restart, ["gps.baud: 38400 → 4800", "target[0].marker[1].id: 1 → 7"]);
         let merged = merged(&running, &read);
         assert!(differences(&merged, &read).now.is_empty());
         assert_eq!(merged.gps.baud, running.gps.baud);

@@ -135,7 +135,7 @@ mod tests {
         let text = "frame,time_ns,lat_deg,lon_deg,heading_rad,speed_mps,yaw_rate_radps\n\
                     3,5,30.1,-85.2,0.5,1.5,\n";
         let truth = Truth::parse(text).expect("well formed");
-        let row = truth.at(3).expect("told");
+        let row = truth.at(3).expect("a row");
         assert_eq!((row.lat_deg, row.heading_rad, row.yaw_rate_radps), (30.1, Some(0.5), None));
         assert!(truth.at(4).is_none());
     }

@@ -224,14 +224,14 @@ impl Watch {
             Err(error) => OperatorEvent::ReloadRefused
                 .emit("", format!("{error}; the previous configuration stays in use")),
             Ok(read) => {
-                let told = reload::differences(&self.config, &read);
-                let changes = match told.now.as_slice() {
+                let differences = reload::differences(&self.config, &read);
+                let changes = match differences.now.as_slice() {
                     [] => "no key that can change in flight has changed".to_owned(),
                     changes => changes.join(", "),
                 };
                 OperatorEvent::Reloaded.emit("", changes);
-                if !told.restart.is_empty() {
-                    OperatorEvent::NeedsRestart.emit("", told.restart.join(", "));
+                if !differences.restart.is_empty() {
+                    OperatorEvent::NeedsRestart.emit("", differences.restart.join(", "));
                 }
                 self.config = reload::merged(&self.config, &read);
                 self.log.set_level(self.config.log.level);

@@ -168,9 +168,9 @@ fn utc_text(epoch: &GnssEpoch) -> Option<String> {
 fn decode_gps(bytes: &[u8], args: &GpsArgs, out: &mut impl Write) -> std::io::Result<DecodeCounts> {
     let (json, required) = (args.json, !args.checksum_optional);
     let decoder = GnssDecoder::patient().of_format(args.format.into());
-    let (mut decoder, mut heard) = (decoder.checksums_required(required), Vec::new());
-    decoder.push(bytes, MonoTime::default(), &mut heard);
-    decoder.flush(&mut heard);
+    let (mut decoder, mut received) = (decoder.checksums_required(required), Vec::new());
+    decoder.push(bytes, MonoTime::default(), &mut received);
+    decoder.flush(&mut received);
     if !json {
         writeln!(
             out,
@@ -190,7 +190,7 @@ fn decode_gps(bytes: &[u8], args: &GpsArgs, out: &mut impl Write) -> std::io::Re
             "hdop"
         )?;
     }
-    for ReceivedEpoch { epoch, .. } in &heard {
+    for ReceivedEpoch { epoch, .. } in &received {
         if json {
             let line = serde_json::to_string(&EpochJson::of(epoch)).map_err(std::io::Error::other)?;
             writeln!(out, "{line}")?;
@@ -243,7 +243,7 @@ struct ReadingJson {
 
 fn decode_compass(bytes: &[u8], args: &CompassArgs, out: &mut impl Write) -> std::io::Result<DecodeCounts> {
     let (json, required) = (args.json, !args.checksum_optional);
-    let (heard, counts) = match args.format {
+    let (received, counts) = match args.format {
         Some(format) => decode_as(bytes, format, required),
         None => likeliest(bytes, required),
     };
@@ -254,7 +254,9 @@ fn decode_compass(bytes: &[u8], args: &CompassArgs, out: &mut impl Write) -> std
             "heading_deg", "pitch_deg", "roll_deg", "true", "valid"
         )?;
     }
-    for ReceivedAttitude { reading, .. } in heard.iter().filter(|heard| !heard.reading.is_inertial_only()) {
+    for ReceivedAttitude { reading, .. } in
+        received.iter().filter(|received| !received.reading.is_inertial_only())
+    {
         let CompassReading { heading_deg, pitch_deg, roll_deg, heading_is_true, .. } = *reading;
         let valid = reading.is_valid();
         if json {
@@ -270,19 +272,19 @@ fn decode_compass(bytes: &[u8], args: &CompassArgs, out: &mut impl Write) -> std
 }
 
 fn decode_as(bytes: &[u8], format: CompassFormat, required: bool) -> (Vec<ReceivedAttitude>, DecodeCounts) {
-    let (mut decoder, mut heard) = (CompassDecoder::new(format).checksums_required(required), Vec::new());
-    decoder.push(bytes, MonoTime::default(), &mut heard);
-    decoder.flush(&mut heard);
-    (heard, decoder.counts().clone())
+    let (mut decoder, mut received) = (CompassDecoder::new(format).checksums_required(required), Vec::new());
+    decoder.push(bytes, MonoTime::default(), &mut received);
+    decoder.flush(&mut received);
+    (received, decoder.counts().clone())
 }
 
 /// The decoding in the format that decodes most: first by complete attitudes, then by any readings. A device's own
 /// format takes precedence over plain NMEA.
 fn likeliest(bytes: &[u8], required: bool) -> (Vec<ReceivedAttitude>, DecodeCounts) {
     let own = CompassFormat::ALL.into_iter().filter(|format| *format != CompassFormat::Nmea);
-    let understood = |heard: &[ReceivedAttitude]| {
+    let understood = |received: &[ReceivedAttitude]| {
         let angles = |r: &CompassReading| [r.heading_deg, r.pitch_deg, r.roll_deg].iter().flatten().count();
-        heard.iter().map(|heard| angles(&heard.reading)).sum::<usize>()
+        received.iter().map(|received| angles(&received.reading)).sum::<usize>()
     };
     let mut best = decode_as(bytes, CompassFormat::Nmea, required);
     for format in own {
@@ -319,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn a_leap_second_is_told_as_the_receiver_does() {
+    fn a_leap_second_is_printed_as_the_receiver_reports_it() {
         let epoch = GnssEpoch {
             utc: Some(UtcTime::from_unix_ns(1_483_228_800_500_000_000)),
             time_of_day_ns: Some(86_400_500_000_000),

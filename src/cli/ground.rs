@@ -42,6 +42,9 @@ pub(super) struct Args {
     /// Address of the web page; other addresses than loopback require a token
     #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:8080")]
     web: SocketAddr,
+    /// Open the page in this desktop's browser
+    #[arg(long, conflicts_with = "no_web")]
+    open: bool,
     /// Serve no web page
     #[arg(long)]
     no_web: bool,
@@ -140,6 +143,7 @@ pub(super) fn run(args: &Args) -> CliResult {
         },
         out: args.out.clone(),
         web: (!args.no_web).then_some(args.web),
+        open: args.open,
         token: args.token.clone(),
         tiles: args.tiles.clone(),
         position: args.position,

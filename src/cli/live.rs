@@ -2,8 +2,11 @@
 
 use std::path::Path;
 use std::process::{Child, Command};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use rustix::process::{Pid, Signal, kill_process};
+use tokio::signal::unix::{SignalKind, signal};
 
 use super::{CliError, CliResult, place};
 use crate::app::live::{LiveFlight, LiveFolder, LoopSettings};
@@ -53,17 +56,18 @@ pub(super) fn run(scenario: Scenario, live: &Live<'_>) -> CliResult {
         LiveFlight::open(&folder, scenario, live.seed, &settings, live.driver).map_err(CliError::failed)?;
     let keys = folder.0.join("keys");
     note!(
-        "lines, camera and configuration in {}\nthe page: windhover ground --connect {LINK_AT} --authority {keys}/authority.pem --certificate {keys}/station-demo.pem",
+        "lines, camera and configuration in {}\nthe page: windhover ground --open --connect {LINK_AT} --authority {keys}/authority.pem --certificate {keys}/station-demo.pem",
         folder.0.display(),
         keys = keys.display()
     );
+    let ended = ended_by_signal()?;
     let daemon = if live.no_daemon {
         note!("start the daemon: windhover run --config {}", file.display());
         None
     } else {
         Some(start(&file)?)
     };
-    let score = flight.run(|words| note!("{words}"));
+    let score = flight.run(&ended, |words| note!("{words}"));
     daemon.map_or(Ok(()), stop)?;
     let score = score.map_err(CliError::failed)?;
     note!(
@@ -74,7 +78,7 @@ pub(super) fn run(scenario: Scenario, live: &Live<'_>) -> CliResult {
         score.tilt_max_deg,
         score.lag_ms,
         score.velocity_rms_mps,
-        score.told
+        score.messages
     );
     Ok(())
 }
@@ -96,6 +100,27 @@ fn with_link(config: &mut Config, keys: &Path) -> CliResult {
     config.link.certificate = path("payload-demo.pem");
     config.link.key = path("payload-demo.key");
     Ok(())
+}
+
+/// A flag that SIGINT and SIGTERM set: the flight ends then, and its daemon with it.
+fn ended_by_signal() -> Result<Arc<AtomicBool>, CliError> {
+    let ended = Arc::new(AtomicBool::new(false));
+    let flag = Arc::clone(&ended);
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let signals = runtime.block_on(async {
+        Ok::<_, std::io::Error>((signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?))
+    });
+    let (mut interrupted, mut terminated) = signals?;
+    std::thread::Builder::new().name("signals".into()).spawn(move || {
+        runtime.block_on(async {
+            tokio::select! {
+                _ = interrupted.recv() => {}
+                _ = terminated.recv() => {}
+            }
+        });
+        flag.store(true, Ordering::Relaxed);
+    })?;
+    Ok(ended)
 }
 
 fn start(config: &Path) -> Result<Child, CliError> {

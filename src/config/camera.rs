@@ -79,8 +79,8 @@ mod tests {
             ("gain = 1.5", "gain"),
             ("trigger_line = { chip = \"/dev/gpiochip0\" }", "line"),
         ] {
-            let told = refusal(refused).unwrap_or_default();
-            assert!(told.contains(key), "{refused}: {told}");
+            let message = refusal(refused).unwrap_or_default();
+            assert!(message.contains(key), "{refused}: {message}");
         }
     }
 }

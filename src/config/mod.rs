@@ -8,7 +8,9 @@ mod check;
 mod daemon;
 mod link;
 mod log;
+mod sensors;
 mod store;
+mod targets;
 mod video;
 
 pub use check::ConfigError;

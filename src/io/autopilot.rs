@@ -215,25 +215,26 @@ impl AutopilotLink<'_> {
     /// Bytes are passed on unchanged; with a key, only frames that are signed with it.
     fn take(&mut self, bytes: &[u8], answers: &mut Vec<Vec<u8>>) {
         let t = self.clock.now();
-        let mut heard = Vec::new();
-        self.frames.push(bytes, &mut heard);
+        let mut received = Vec::new();
+        self.frames.push(bytes, &mut received);
         if let Some(key) = &self.settings.key {
-            let before = heard.len();
-            heard.retain(|frame| packet::verify(&frame.bytes, key).is_ok());
-            if heard.len() < before {
+            let before = received.len();
+            received.retain(|frame| packet::verify(&frame.bytes, key).is_ok());
+            if received.len() < before {
                 let words = "frames that are not signed with mavlink.signing_key are refused".to_owned();
-                (self.reports)(Report::Note(NoteKind::Autopilot, (before - heard.len()) as u32, words));
+                (self.reports)(Report::Note(NoteKind::Autopilot, (before - received.len()) as u32, words));
             }
         }
         let mut its = false;
-        for frame in &heard {
-            its |= self.companion.heard(frame, t, answers);
+        for frame in &received {
+            its |= self.companion.receive(frame, t, answers);
         }
         if its {
             self.port.answer_there();
         }
-        let whole = |heard: &[MavlinkFrame]| heard.iter().flat_map(|frame| frame.bytes.clone()).collect();
-        let believed: Vec<u8> = if self.settings.key.is_some() { whole(&heard) } else { bytes.to_vec() };
+        let whole =
+            |received: &[MavlinkFrame]| received.iter().flat_map(|frame| frame.bytes.clone()).collect();
+        let believed: Vec<u8> = if self.settings.key.is_some() { whole(&received) } else { bytes.to_vec() };
         if !believed.is_empty() {
             (self.reports)(Report::Bytes(t, believed));
         }
@@ -269,7 +270,7 @@ mod tests {
             key,
             signing_link_id: 1,
         };
-        let (sender, mut told) = mpsc::unbounded_channel();
+        let (sender, mut given) = mpsc::unbounded_channel();
         let reports = move |report| drop(sender.send(report));
         let outgoing = ToAutopilot::default();
         let flying = async {
@@ -290,17 +291,17 @@ mod tests {
             all
         };
         let clock = HostClock::start();
-        let heard = tokio::select! {
+        let received = tokio::select! {
             never = run(&settings, &outgoing, clock, &reports) => match never {},
-            heard = flying => heard,
+            received = flying => received,
         };
         let mut all = Vec::new();
-        while let Ok(report) = told.try_recv() {
+        while let Ok(report) = given.try_recv() {
             if !matches!(report, Report::Beat) {
                 all.push(report);
             }
         }
-        (all, heard)
+        (all, received)
     }
 
     fn bytes(reports: &[Report]) -> Vec<Vec<u8>> {
@@ -310,18 +311,20 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_is_heard_goes_on_as_it_came_and_its_time_is_asked_for() {
+    async fn frames_are_passed_on_unchanged_and_their_time_is_requested() {
         let beat = packet::encode(0, SENDER, &heartbeat(), None);
-        let (reports, heard) = served(None, vec![beat.clone()]).await;
+        let (reports, received) = served(None, vec![beat.clone()]).await;
         assert_eq!(bytes(&reports), [beat]);
         assert!(
-            heard.iter().any(|frame| matches!(&frame.message, MavMessage::TIMESYNC(sync) if sync.tc1 == 0))
+            received
+                .iter()
+                .any(|frame| matches!(&frame.message, MavMessage::TIMESYNC(sync) if sync.tc1 == 0))
         );
-        assert!(heard.iter().all(|frame| (frame.system, frame.component) == (1, 191)));
+        assert!(received.iter().all(|frame| (frame.system, frame.component) == (1, 191)));
     }
 
     #[tokio::test]
-    async fn with_a_key_only_what_is_signed_with_it_is_heard() {
+    async fn with_a_key_only_frames_signed_with_it_are_used() {
         let (key, wrong) = (SigningKey([1; 32]), SigningKey([2; 32]));
         let signed = |key, time_stamp| {
             let signature = Signature { key, link_id: 0, time_stamp };

@@ -308,7 +308,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn errors_are_told_apart() {
+    fn errors_are_distinguished() {
         for (errno, kind) in [
             (rustix::io::Errno::NOENT, FaultKind::Missing),
             (rustix::io::Errno::BUSY, FaultKind::Busy),

@@ -52,7 +52,7 @@ mod tests {
     #[test]
     fn a_frame_is_missing_after_three_frame_times_and_never_before_half_a_second() {
         let mut pace = FramePace::new(30.0);
-        assert_eq!(pace.missing_after(at(100.0)), None, "none was heard yet");
+        assert_eq!(pace.missing_after(at(100.0)), None, "none was received yet");
         pace.frame(at(0.0), 7);
         assert_eq!((pace.missing_after(at(0.5)), pace.missing_after(at(0.6))), (None, Some(7)));
         // A camera slower than configured is accepted as it is.

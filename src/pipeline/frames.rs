@@ -40,7 +40,7 @@ impl Pipeline {
         let (width, height) = (self.settings.rig.camera.width, self.settings.rig.camera.height);
         match decoded.and_then(|d| pixels::check_size(&d, width, height).map(|()| d)) {
             Ok(decoded) => {
-                self.monitor.heard(Source::Camera, t, out);
+                self.monitor.delivered(Source::Camera, t, out);
                 let prediction = self.estimators.as_mut().map(|e| {
                     e.joint.predict(t_valid, &mut self.prediction);
                     &self.prediction

@@ -24,8 +24,8 @@ pub(super) struct Misfits {
 struct Found {
     misfit: Misfit,
     last: MonoTime,
-    told: MonoTime,
-    told_figure: f64,
+    reported: MonoTime,
+    reported_figure: f64,
 }
 
 impl Misfits {
@@ -40,16 +40,16 @@ impl Misfits {
         match self.found.iter_mut().find(|found| same(&found.misfit, misfit)) {
             Some(found) => {
                 (found.misfit, found.last) = (*misfit, now);
-                let moved = (misfit.figure - found.told_figure).abs();
-                let off = (found.told_figure - where_it_fits(misfit.cause)).abs();
-                if now - found.told < AGAIN || moved <= CHANGED * off {
+                let moved = (misfit.figure - found.reported_figure).abs();
+                let off = (found.reported_figure - where_it_fits(misfit.cause)).abs();
+                if now - found.reported < AGAIN || moved <= CHANGED * off {
                     return None;
                 }
-                (found.told, found.told_figure) = (now, misfit.figure);
+                (found.reported, found.reported_figure) = (now, misfit.figure);
             }
             None => {
-                let (last, told, told_figure) = (now, now, misfit.figure);
-                self.found.push(Found { misfit: *misfit, last, told, told_figure });
+                let (last, reported, reported_figure) = (now, now, misfit.figure);
+                self.found.push(Found { misfit: *misfit, last, reported, reported_figure });
             }
         }
         Some(words(misfit, &self.rig))
@@ -119,21 +119,21 @@ mod tests {
     }
 
     #[test]
-    fn it_is_told_once_again_where_it_changes_and_is_over_when_it_is_not_found() {
+    fn it_is_reported_once_again_where_it_changes_and_is_over_when_it_is_not_found() {
         let mut misfits = Misfits::new(&rig());
         let noise = |figure| misfit(FusionSource::GpsVelocity, MisfitCause::Noise, figure);
-        let told: Vec<f64> = (0..40)
+        let reports: Vec<f64> = (0..40)
             .map(f64::from)
             .filter(|s| misfits.take(&noise(if *s < 20.0 { 3.0 } else { 4.0 }), at(*s)).is_some())
             .collect();
-        assert_eq!(told, [0.0, 20.0], "found every second for forty");
+        assert_eq!(reports, [0.0, 20.0], "found every second for forty");
         assert_eq!(misfits.now(at(49.0)).len(), 1);
         assert!(misfits.now(at(49.5)).is_empty(), "not found for more than ten seconds");
         assert!(misfits.take(&noise(4.0), at(60.0)).is_some(), "it is news again");
     }
 
     #[test]
-    fn every_source_and_marker_is_told_for_itself() {
+    fn every_source_and_marker_is_reported_for_itself() {
         let mut misfits = Misfits::new(&rig());
         let size = |marker| MisfitCause::MarkerSize(MarkerPair { target: 0, marker, against: 1 - marker });
         for one in [

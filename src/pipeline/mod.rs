@@ -188,8 +188,8 @@ impl Pipeline {
 
     /// Outputs the helicopter's own state, with or without frames.
     fn ownship(&mut self, t: MonoTime, out: &mut Vec<Output>) {
-        let told = self.estimators.as_mut().and_then(|estimators| estimators.joint.ownship(t));
-        out.extend(told.map(|own| Output::Estimator(EstimatorOutput::Ownship(own))));
+        let ownship = self.estimators.as_mut().and_then(|estimators| estimators.joint.ownship(t));
+        out.extend(ownship.map(|own| Output::Estimator(EstimatorOutput::Ownship(own))));
     }
 
     fn event(
@@ -278,7 +278,7 @@ impl Pipeline {
         let Some(line) = self.lines.samples(source) else { return };
         let stamped = line.stamp(sample, event.t_recv, event.seq);
         let refused = line.refused();
-        self.heard_or_refused(source, event.t_recv, stamped.is_some(), refused, out);
+        self.delivered_or_refused(source, event.t_recv, stamped.is_some(), refused, out);
         if let (Some(sample), Some(estimators)) = (stamped, &mut self.estimators) {
             fuse(&mut estimators.joint, &sample, &mut self.estimated);
         }

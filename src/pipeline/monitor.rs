@@ -21,7 +21,7 @@ struct SourceCount {
     at_last_health: u64,
     last: Option<MonoTime>,
     refused: u64,
-    refused_told: u64,
+    refused_reported: u64,
     dropped: u64,
     silent: bool,
 }
@@ -153,7 +153,7 @@ impl Monitor {
     }
 
     /// A source delivered data that can be used.
-    pub(super) fn heard(&mut self, source: Source, t: MonoTime, out: &mut Vec<Output>) {
+    pub(super) fn delivered(&mut self, source: Source, t: MonoTime, out: &mut Vec<Output>) {
         let count = &mut self.sources[source];
         count.total += 1;
         if count.silent {
@@ -176,9 +176,10 @@ impl Monitor {
     ) {
         let count = &mut self.sources[source];
         count.refused = total;
-        if total > count.refused_told {
-            let detail = format!("{} refused from the {}: {why}", total - count.refused_told, source.name());
-            count.refused_told = total;
+        if total > count.refused_reported {
+            let detail =
+                format!("{} refused from the {}: {why}", total - count.refused_reported, source.name());
+            count.refused_reported = total;
             out.push(notice(t, NoticeKind::BytesRefused, Some(source), detail));
         }
     }
@@ -310,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fix_goes_with_the_receiver_that_told_it() {
+    fn a_fix_goes_with_the_receiver_that_reported_it() {
         let config = Config::parse(include_str!("../../config/windhover.toml")).expect("valid");
         let mut monitor = Monitor::new(vec![Source::Gps], &config.rig());
         let at = |s: f64| MonoTime::from_ns(0) + Span::from_s(s);
@@ -319,7 +320,7 @@ mod tests {
         let value =
             GnssEpoch { fix: FixKind::ThreeD, sats: Some(9), hdop: Some(0.9), ..GnssEpoch::default() };
         let epoch = Stamped { t_valid: at(1.0), t_recv: at(1.0), seq: 0, value };
-        monitor.heard(Source::Gps, at(1.0), &mut out);
+        monitor.delivered(Source::Gps, at(1.0), &mut out);
         monitor.fix(at(1.0), &epoch, None, &mut out);
         for s in 1..30 {
             monitor.advance(at(f64::from(s) + 0.5), &mut out);
@@ -330,8 +331,8 @@ mod tests {
         });
         for (t, fix, sats) in healths.filter(|(t, ..)| *t > at(1.0)) {
             let is_there = t - at(1.0) < Source::Gps.silent_after();
-            let told = if is_there { (FixKind::ThreeD, Some(9)) } else { (FixKind::None, None) };
-            assert_eq!((fix, sats), told, "at {:.1} s", (t - at(0.0)).s());
+            let expected = if is_there { (FixKind::ThreeD, Some(9)) } else { (FixKind::None, None) };
+            assert_eq!((fix, sats), expected, "at {:.1} s", (t - at(0.0)).s());
         }
     }
 
@@ -345,7 +346,7 @@ mod tests {
         monitor.advance(at(0.0), &mut out);
         // When only frames arrive.
         for n in 1..=40 {
-            monitor.heard(Source::Camera, at(0.1 * f64::from(n)), &mut out);
+            monitor.delivered(Source::Camera, at(0.1 * f64::from(n)), &mut out);
             monitor.advance(at(0.1 * f64::from(n)), &mut out);
         }
         // Then the receiver's silence is reported once, and health names both sources.

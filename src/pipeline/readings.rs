@@ -14,23 +14,23 @@ use super::{Estimators, Pipeline};
 const HELD_MAX: usize = 512;
 
 impl Pipeline {
-    pub(super) fn heard_or_refused(
+    pub(super) fn delivered_or_refused(
         &mut self,
         source: Source,
         t: MonoTime,
-        heard: bool,
+        usable: bool,
         refused: u64,
         out: &mut Vec<Output>,
     ) {
-        match heard {
-            true => self.monitor.heard(source, t, out),
+        match usable {
+            true => self.monitor.delivered(source, t, out),
             false => self.monitor.refused(source, t, refused, "values that cannot be", out),
         }
     }
 
     pub(super) fn take_readings(&mut self, source: Source, t: MonoTime, out: &mut Vec<Output>) {
         for reading in std::mem::take(&mut self.readings) {
-            self.monitor.heard(source, t, out);
+            self.monitor.delivered(source, t, out);
             match reading {
                 SensorReading::Gnss(epoch) => self.gnss(&epoch, t, out),
                 SensorReading::Attitude(sample) => self.attitude(&sample, out),

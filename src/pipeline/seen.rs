@@ -13,12 +13,12 @@ const AGAIN: Span = Span::from_ns(10_000_000_000);
 pub(super) struct SeenMarkers {
     rig: Rig,
     /// Markers seen twice, and when each was last reported.
-    told: Vec<(MarkerId, MonoTime)>,
+    reported: Vec<(MarkerId, MonoTime)>,
 }
 
 impl SeenMarkers {
     pub(super) fn new(rig: &Rig) -> Self {
-        Self { rig: rig.clone(), told: Vec::new() }
+        Self { rig: rig.clone(), reported: Vec::new() }
     }
 
     /// Index of the target that a detection belongs to.
@@ -62,14 +62,14 @@ impl SeenMarkers {
     }
 
     fn is_news(&mut self, marker: MarkerId, now: MonoTime) -> bool {
-        match self.told.iter_mut().find(|(of, _)| *of == marker) {
-            Some((_, told)) if now - *told < AGAIN => false,
-            Some((_, told)) => {
-                *told = now;
+        match self.reported.iter_mut().find(|(of, _)| *of == marker) {
+            Some((_, last)) if now - *last < AGAIN => false,
+            Some((_, last)) => {
+                *last = now;
                 true
             }
             None => {
-                self.told.push((marker, now));
+                self.reported.push((marker, now));
                 true
             }
         }
@@ -98,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn a_marker_at_two_places_is_told_every_ten_seconds() {
+    fn a_marker_at_two_places_is_reported_every_ten_seconds() {
         let config = Config::parse(include_str!("../../config/windhover.toml")).expect("valid");
         let mut seen = SeenMarkers::new(&config.rig());
         let at = |s: f64| MonoTime::from_ns(0) + Span::from_s(s);

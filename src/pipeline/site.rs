@@ -46,7 +46,7 @@ pub(super) struct SiteFinder {
 #[derive(Default)]
 struct Unused {
     count: usize,
-    told: usize,
+    reported: usize,
     why: Option<&'static str>,
 }
 
@@ -62,10 +62,10 @@ impl Unused {
     /// The report that is due at this time, once.
     fn word(&mut self) -> Option<&'static str> {
         let (first, then) = UNUSED_WORD;
-        let due = self.count != self.told
+        let due = self.count != self.reported
             && self.count.checked_sub(first).is_some_and(|more| more.is_multiple_of(then));
         if due {
-            self.told = self.count;
+            self.reported = self.count;
         }
         self.why.filter(|_| due)
     }
@@ -424,7 +424,7 @@ mod tests {
     }
 
     #[test]
-    fn why_there_is_no_datum_is_told() {
+    fn the_reason_for_a_missing_datum_is_reported() {
         for (epoch, why) in [
             (GnssEpoch { fix: FixKind::TwoD, ..fix(38.7, -9.2) }, NO_HEIGHT),
             (GnssEpoch { fix: FixKind::TwoD, alt_msl_m: None, ..fix(38.7, -9.2) }, NO_ALTITUDE),

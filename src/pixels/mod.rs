@@ -346,7 +346,7 @@ mod tests {
     }
 
     #[test]
-    fn short_and_damaged_frames_are_told() {
+    fn short_and_damaged_frames_are_reported() {
         let short = payload(FrameEncoding::Grey, 640, 480, 640, vec![0; 100]);
         assert!(decode(&short, false).unwrap_err().to_string().contains("100 bytes are not 640x480"));
         for encoding in [FrameEncoding::Jpeg, FrameEncoding::Png, FrameEncoding::Unknown] {

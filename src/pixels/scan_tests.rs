@@ -68,10 +68,10 @@ fn random_blocks(count: usize, rng: &mut ChaCha8Rng, out: &mut Vec<u8>) {
     writer.finish();
 }
 
-/// A code for the value's size together with `told`, and the value's bits.
-fn write_value(writer: &mut Writer<'_>, told: u8, value: i32, code: impl Fn(u8) -> Option<(u32, u32)>) {
+/// A code for the value's size together with `high_bits`, and the value's bits.
+fn write_value(writer: &mut Writer<'_>, high_bits: u8, value: i32, code: impl Fn(u8) -> Option<(u32, u32)>) {
     let size = 32 - value.unsigned_abs().leading_zeros();
-    writer.write(code(told | size as u8).expect("in the standard's table"));
+    writer.write(code(high_bits | size as u8).expect("in the standard's table"));
     if size > 0 {
         let bits = if value < 0 { value - 1 + (1 << size) } else { value };
         writer.write((bits as u32, size));

@@ -87,8 +87,8 @@ class Imports(unittest.TestCase):
             np.testing.assert_allclose([fix.lat * 1e-7, fix.lon * 1e-7], place[:2], atol=1e-7)
             self.assertAlmostEqual(fix.alt * 1e-3, place[2], delta=0.011)
             self.assertEqual((fix.fix_type, fix.satellites_visible), (3, sats))
-            told = [attitude.q1, attitude.q2, attitude.q3, attitude.q4]
-            self.assertAlmostEqual(abs(np.dot(told, quaternion(*angles))), 1, delta=1e-6)
+            converted = [attitude.q1, attitude.q2, attitude.q3, attitude.q4]
+            self.assertAlmostEqual(abs(np.dot(converted, quaternion(*angles))), 1, delta=1e-6)
             np.testing.assert_allclose([imu.xgyro, imu.ygyro, imu.zgyro], rates, atol=1e-6)
             np.testing.assert_allclose([imu.xacc, imu.yacc, imu.zacc], forces, atol=1e-6)
         if utc:
@@ -142,8 +142,8 @@ class Imports(unittest.TestCase):
             fix = self.of(packets, "GPS_RAW_INT")[0][1]
             self.assertEqual((fix.h_acc, fix.v_acc, fix.vel, fix.cog), (700, 1100, 500, 30687))
             self.assertEqual(fix.alt_ellipsoid - fix.alt, 47000)
-            told = [imu.zacc for _, imu in self.of(packets, "HIGHRES_IMU")]
-            np.testing.assert_array_equal(np.float32(told), theirs["sensor_combined"]["accelerometer_m_s2[2]"])
+            converted = [imu.zacc for _, imu in self.of(packets, "HIGHRES_IMU")]
+            np.testing.assert_array_equal(np.float32(converted), theirs["sensor_combined"]["accelerometer_m_s2[2]"])
         whole = path.read_bytes()
         path.write_bytes(whole[: len(whole) * 2 // 3])
         self.assertTrue(len(self.capture("--log", path)[0]) > 30)

@@ -129,8 +129,8 @@ class Rosbag2(unittest.TestCase):
         for message in odometry:
             row, state = rows[stamp(message.header)], states[stamp(message.header)]
             position, q, v = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
-            told = [float(row[name]) for name in ("east_m", "north_m", "down_m")]
-            np.testing.assert_allclose([position.x, position.y, -position.z], told, atol=1e-3)
+            expected = [float(row[name]) for name in ("east_m", "north_m", "down_m")]
+            np.testing.assert_allclose([position.x, position.y, -position.z], expected, atol=1e-3)
             ned_from_body = rotation([float(row[name]) for name in ("qw", "qx", "qy", "qz")])
             expected = ENU_FROM_NED @ ned_from_body @ FLU_FROM_FRD
             np.testing.assert_allclose(rotation([q.w, q.x, q.y, q.z]), expected, atol=1e-8)

@@ -63,7 +63,7 @@ fn a_port_that_another_program_holds_is_taken_when_it_is_free() {
 }
 
 #[test]
-fn a_receiver_without_a_fix_is_heard_and_not_used() {
+fn a_receiver_without_a_fix_is_decoded_and_not_used() {
     // Given a receiver under a roof, then its sentences are counted and no fix is reported.
     let bench = Bench::new();
     let (gps, compass) = bench.lines();
@@ -86,7 +86,7 @@ fn a_receiver_without_a_fix_is_heard_and_not_used() {
 }
 
 #[test]
-fn a_compass_that_falls_silent_is_told_and_heard_again() {
+fn a_compass_that_falls_silent_is_reported_and_used_again() {
     let bench = Bench::new();
     let (gps, compass) = bench.lines();
     let daemon = bench.start();

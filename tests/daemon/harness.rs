@@ -142,7 +142,7 @@ impl Garmin {
         let stop = Arc::new(AtomicBool::new(false));
         let asked = stop.clone();
         let thread = std::thread::spawn(move || {
-            let (mut heard, mut buffer) = (String::new(), [0u8; 256]);
+            let (mut received, mut buffer) = (String::new(), [0u8; 256]);
             while !asked.load(Ordering::Acquire) {
                 let wait = Timespec { tv_sec: 0, tv_nsec: 50_000_000 };
                 let mut ready = [PollFd::new(&line, PollFlags::IN)];
@@ -154,8 +154,8 @@ impl Garmin {
                     std::thread::sleep(Duration::from_millis(50));
                     continue;
                 };
-                heard.push_str(&String::from_utf8_lossy(&buffer[..count]));
-                while let Some((one, rest)) = heard.split_once("\r\n") {
+                received.push_str(&String::from_utf8_lossy(&buffer[..count]));
+                while let Some((one, rest)) = received.split_once("\r\n") {
                     let body = one.strip_prefix('$').and_then(|one| one.split_once('*'));
                     // A sentence with a wrong checksum is ignored.
                     let body =
@@ -163,7 +163,7 @@ impl Garmin {
                     if let Some(answer) = body.and_then(&answer) {
                         let _ = line.write_all(sentence(&answer).as_bytes());
                     }
-                    heard = rest.to_owned();
+                    received = rest.to_owned();
                 }
             }
         });
@@ -339,7 +339,7 @@ impl Daemon {
     /// Whether the process has taken over these signals.
     pub fn catches(&self, signals: &[Signal]) -> bool {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("it runs");
-        let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:")).expect("told by /proc");
+        let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:")).expect("a line of /proc");
         let caught = u64::from_str_radix(caught.trim(), 16).expect("a mask");
         signals.iter().all(|signal| caught & (1 << (signal.as_raw() - 1)) != 0)
     }

@@ -98,7 +98,7 @@ fn the_configuration_is_read_again() {
 }
 
 #[test]
-fn failing_power_is_told() {
+fn failing_power_is_reported() {
     let bench = Bench::new();
     let battery = bench.path("sys/class/power_supply/BAT0");
     std::fs::create_dir_all(&battery).expect("created");

@@ -35,7 +35,7 @@ impl Manager {
                 Err(error) if error.kind() == ErrorKind::Interrupted => continue,
                 Err(error) => panic!("no {line}: {error}"),
             };
-            if String::from_utf8_lossy(&buffer[..length]).lines().any(|told| told == line) {
+            if String::from_utf8_lossy(&buffer[..length]).lines().any(|text| text == line) {
                 return;
             }
         }
@@ -77,7 +77,7 @@ fn a_hang_up_before_the_configuration_is_read_ends_nothing() {
 }
 
 #[test]
-fn the_watchdog_is_stroked_and_the_end_heard_while_slow_files_are_read() {
+fn the_watchdog_is_stroked_and_the_end_handled_while_slow_files_are_read() {
     let bench = Bench::new();
     let manager = Manager::new(&bench.path("manager"));
     let text = std::fs::read_to_string(bench.config()).expect("written by the bench");

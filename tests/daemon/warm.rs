@@ -86,9 +86,9 @@ fn a_restart_in_flight_tracks_within_two_seconds_and_replays() {
     // And the state of card and computer is in the flight, and in its report.
     let flight = flights[1].to_string_lossy().into_owned();
     let healths: Vec<wh::Health> = of(&second, topic::HEALTH);
-    let told = healths.last().expect("once a second");
-    assert!(told.figures["card_free_mb"] > 0.0 && told.figures["mem_mb"] > 0.0, "{:?}", told.figures);
-    assert!(told.words.contains_key("card"), "{:?}", told.words);
+    let health = healths.last().expect("once a second");
+    assert!(health.figures["card_free_mb"] > 0.0 && health.figures["mem_mb"] > 0.0, "{:?}", health.figures);
+    assert!(health.words.contains_key("card"), "{:?}", health.words);
     bench.command(&["report", &flight, "--out", "report.html"]);
     let page = std::fs::read_to_string(bench.path("report.html")).expect("the report");
     assert!(page.contains("card free mb") && page.contains("card sync p99 ms"), "card and link are reported");
@@ -105,7 +105,7 @@ fn a_restart_in_flight_tracks_within_two_seconds_and_replays() {
 }
 
 #[test]
-fn a_card_that_does_not_tell_what_was_known_is_told_and_not_waited_for() {
+fn a_card_without_a_known_state_is_reported_and_not_waited_for() {
     // Given a card whose index another program holds.
     let bench = Bench::new();
     let held = Index::open(&bench.path("card").join(INDEX)).expect("a new index");

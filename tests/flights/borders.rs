@@ -230,7 +230,7 @@ fn a_recording_names_no_pipe_and_no_folder_names_what_lies_outside() {
 }
 
 #[test]
-fn a_segment_that_is_none_is_skipped_and_told() {
+fn a_file_that_is_no_segment_is_skipped_and_reported() {
     let dir = scratch();
     let flight = flight_dir(dir.path());
     std::fs::write(flight.join("._000000.mcap"), "resource fork").unwrap();

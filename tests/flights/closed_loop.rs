@@ -65,29 +65,30 @@ fn a_vehicle_on_a_circle_is_followed_on_the_estimate_as_on_the_truth() {
     let truth = LoopSettings { truth: true, ..late() };
     let truth = scored("truth", &fly(quick(duration_s), 1, |_| {}, truth), from_s);
     let moments = fly(quick(duration_s), 1, listening, late());
-    let told = scored("told", &moments, from_s);
+    let followed = scored("estimates", &moments, from_s);
     // Stamps are the autopilot's own, which was started 100 s before.
-    let stamps = moments.iter().filter(|m| m.t_s >= from_s).filter_map(|m| Some((m.t_s, m.told?.stamp.s())));
+    let stamps =
+        moments.iter().filter(|m| m.t_s >= from_s).filter_map(|m| Some((m.t_s, m.received?.stamp.s())));
     let worst = stamps.map(|(t_s, stamp_s)| (stamp_s - 100.0 - t_s).abs()).fold(0.0, f64::max);
     assert!(worst <= 1e-3, "stamps are off by {worst} s");
-    assert!(told.told > 55, "{told:?}");
-    assert!(told.follow_rms_m < 1.5 * truth.follow_rms_m.max(0.2), "{told:?} {truth:?}");
-    assert!(told.velocity_rms_mps < 0.15, "{told:?}");
+    assert!(followed.messages > 55, "{followed:?}");
+    assert!(followed.follow_rms_m < 1.5 * truth.follow_rms_m.max(0.2), "{followed:?} {truth:?}");
+    assert!(followed.velocity_rms_mps < 0.15, "{followed:?}");
 }
 
 #[test]
-fn a_covered_tag_ends_what_is_told_and_the_helicopter_stops() {
+fn a_covered_tag_ends_the_messages_and_the_helicopter_stops() {
     let mut scenario = quick(13.0);
     scenario.camera.hidden = (0..2)
         .map(|marker| HiddenMarker { target: 0, marker, from_s: 6.0, to_s: 11.0, share: 1.0 })
         .collect();
     let moments = fly(scenario, 2, |_| {}, LoopSettings { threads: 2, ..LoopSettings::default() });
-    let told = |from: f64, to: f64| {
-        moments.iter().filter(|m| (from..to).contains(&m.t_s) && m.told.is_some()).count()
+    let messages = |from: f64, to: f64| {
+        moments.iter().filter(|m| (from..to).contains(&m.t_s) && m.received.is_some()).count()
     };
-    assert!(told(5.0, 6.0) >= 9, "{}", told(5.0, 6.0));
-    assert_eq!(told(7.2, 11.0), 0, "silent from coast_s after the last sight on");
-    assert!(told(12.0, 13.0) >= 8, "{} within a second of the tag", told(12.0, 13.0));
+    assert!(messages(5.0, 6.0) >= 9, "{}", messages(5.0, 6.0));
+    assert_eq!(messages(7.2, 11.0), 0, "silent from coast_s after the last sight on");
+    assert!(messages(12.0, 13.0) >= 8, "{} within a second of the tag", messages(12.0, 13.0));
     let covered: Vec<Moment> = moments.into_iter().filter(|m| m.t_s < 11.0).collect();
     let score = scored("covered", &covered, 6.0);
     assert!(score.speed_max_mps < 1.2 * 1.5, "{score:?}");
@@ -98,26 +99,26 @@ fn an_autopilot_stands_in_for_receiver_and_compass() {
     let alone = |config: &mut Config| {
         listening(config);
         (config.gps, config.compass) = (GpsConfig::default(), CompassConfig::default());
-        config.autopilot = config.autopilot.take().map(|heard| AutopilotConfig {
+        config.autopilot = config.autopilot.take().map(|autopilot| AutopilotConfig {
             uses: vec![AutopilotUse::Attitude, AutopilotUse::Imu, AutopilotUse::Gps],
-            ..heard
+            ..autopilot
         });
         config.check().expect("valid");
     };
     let settings = LoopSettings { threads: 2, ..LoopSettings::default() };
     let score = scored("alone", &fly(quick(10.0), 6, alone, settings), 6.0);
-    assert!(score.told >= 38 && score.follow_rms_m < 0.4 && score.velocity_rms_mps < 0.15, "{score:?}");
+    assert!(score.messages >= 38 && score.follow_rms_m < 0.4 && score.velocity_rms_mps < 0.15, "{score:?}");
 }
 
 #[test]
-fn a_dead_camera_ends_what_is_told() {
+fn a_dead_camera_ends_the_messages() {
     let settings = LoopSettings { camera_dies_s: Some(5.0), threads: 2, ..LoopSettings::default() };
     let moments = fly(quick(9.0), 3, |_| {}, settings);
-    let told = |from: f64, to: f64| {
-        moments.iter().filter(|m| (from..to).contains(&m.t_s) && m.told.is_some()).count()
+    let messages = |from: f64, to: f64| {
+        moments.iter().filter(|m| (from..to).contains(&m.t_s) && m.received.is_some()).count()
     };
-    assert!(told(4.0, 5.0) >= 9, "{}", told(4.0, 5.0));
-    assert_eq!(told(6.1, 9.0), 0);
+    assert!(messages(4.0, 5.0) >= 9, "{}", messages(4.0, 5.0));
+    assert_eq!(messages(6.1, 9.0), 0);
 }
 
 /// An autopilot that restarts in flight, on a line that it shares with another helicopter's, half a kilometre away.
@@ -131,9 +132,9 @@ fn an_autopilot_that_restarts_is_followed_and_another_one_changes_nothing() {
     };
     let moments = fly(quick(11.0), 7, listening, settings);
     let score = scored("restarted", &moments, 6.0);
-    assert!(score.told >= 48 && score.follow_rms_m < 0.4 && score.velocity_rms_mps < 0.15, "{score:?}");
+    assert!(score.messages >= 48 && score.follow_rms_m < 0.4 && score.velocity_rms_mps < 0.15, "{score:?}");
     // Within two seconds its new clock is known by an exchange.
-    let off = |m: &Moment| Some((m.told?.stamp.s() - (m.t_s - 7.0)).abs());
+    let off = |m: &Moment| Some((m.received?.stamp.s() - (m.t_s - 7.0)).abs());
     let worst = moments.iter().filter(|m| m.t_s > 9.0).filter_map(off).fold(0.0, f64::max);
     assert!(worst <= 1e-3, "stamps are off by {worst} s");
 }
@@ -145,7 +146,7 @@ fn a_vehicle_that_drives_off_over_bare_ground_is_followed() {
     scenario.vehicles[0].speed = SpeedPlan::FromRest { rest_s: 10.0, speed_mps: 1.5 };
     let bare = |config: &mut Config| config.detector.ground_features = 0;
     let moments = fly(scenario, 8, bare, LoopSettings { threads: 2, ..LoopSettings::default() });
-    let wrong = |m: &Moment| Some((m.told?.velocity_mps.norm() - m.vehicle.speed_mps.abs()).abs());
+    let wrong = |m: &Moment| Some((m.received?.velocity_mps.norm() - m.vehicle.speed_mps.abs()).abs());
     let worst = |from_s: f64, to_s: f64| {
         let within = moments.iter().filter(|m| (from_s..to_s).contains(&m.t_s));
         within.filter_map(wrong).fold(0.0, f64::max)
@@ -175,8 +176,9 @@ fn proof_a_covered_tag_never_makes_the_helicopter_run() {
         let off = |m: &Moment| (m.own.position_ned_m.xy().norm() - 12.5).abs();
         let farthest = covered.iter().filter(|m| m.t_s >= 10.0).map(off).fold(0.0, f64::max);
         assert!(farthest < 3.0, "{farthest} m from the vehicle's path");
-        let told = moments.iter().filter(|m| m.t_s > until_s && m.told.is_some()).map(|m| m.t_s - until_s);
-        let after = told.fold(f64::INFINITY, f64::min);
+        let messages =
+            moments.iter().filter(|m| m.t_s > until_s && m.received.is_some()).map(|m| m.t_s - until_s);
+        let after = messages.fold(f64::INFINITY, f64::min);
         println!("back after {after} s, {farthest} m from the path");
         assert!(covered_s > 10.0 || after < 1.0, "back after {after} s");
     }
@@ -208,29 +210,34 @@ fn proof_the_bars_of_following() {
         };
         let truth = LoopSettings { truth: true, ..late() };
         let truth = scored(&format!("{name}, truth"), &fly(scenario(), 3, |_| {}, truth), 12.0);
-        for (how, heard) in [("alone", false), ("autopilot heard", true)] {
+        for (how, with_autopilot) in [("alone", false), ("autopilot received", true)] {
             let configure = |config: &mut Config| {
-                if heard {
+                if with_autopilot {
                     listening(config)
                 }
             };
             let moments = fly(scenario(), 3, configure, late());
-            let told = scored(&format!("{name}, {how}"), &moments, 12.0);
+            let followed = scored(&format!("{name}, {how}"), &moments, 12.0);
             if name == "stop and go" {
                 // It drives off at 30 s.
                 let error =
-                    |m: &Moment| Some((m.told?.velocity_mps.norm() - m.vehicle.speed_mps.abs()).abs());
+                    |m: &Moment| Some((m.received?.velocity_mps.norm() - m.vehicle.speed_mps.abs()).abs());
                 let after = moments.iter().filter(|m| (30.5..32.0).contains(&m.t_s)).filter_map(error);
                 let worst = after.fold(0.0, f64::max);
-                println!("{name}, {how}: driving off told wrong by {worst} m/s at most from 0.5 s on");
+                println!(
+                    "{name}, {how}: the speed sent while driving off is wrong by {worst} m/s at most from 0.5 s on"
+                );
                 assert!(worst <= 0.15, "{name}, {how}: {worst}");
             }
             assert!(
-                told.follow_rms_m <= 1.5 * truth.follow_rms_m.max(0.2),
-                "{name}, {how}: {told:?} {truth:?}"
+                followed.follow_rms_m <= 1.5 * truth.follow_rms_m.max(0.2),
+                "{name}, {how}: {followed:?} {truth:?}"
             );
-            assert!(told.tilt_rms_deg <= 1.5 * truth.tilt_rms_deg, "{name}, {how}: {told:?} {truth:?}");
-            assert!(told.velocity_rms_mps <= 0.15, "{name}, {how}: {told:?}");
+            assert!(
+                followed.tilt_rms_deg <= 1.5 * truth.tilt_rms_deg,
+                "{name}, {how}: {followed:?} {truth:?}"
+            );
+            assert!(followed.velocity_rms_mps <= 0.15, "{name}, {how}: {followed:?}");
         }
     }
 }
@@ -238,7 +245,7 @@ fn proof_the_bars_of_following() {
 /// The autopilot's receiver 2 m from ours, and the ground configured 5 m too low.
 #[test]
 #[ignore = "minutes"]
-fn proof_two_receivers_and_a_wrong_elevation_cost_nothing_where_the_autopilot_is_heard() {
+fn proof_two_receivers_and_a_wrong_elevation_cost_nothing_where_the_autopilot_is_received() {
     let settings = || LoopSettings { receiver_m: Vector3::new(1.4, -1.4, 0.0), ..late() };
     let wrong = |config: &mut Config| {
         listening(config);

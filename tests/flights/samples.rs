@@ -21,8 +21,9 @@ fn record(path: &Path) -> Config {
     let mut config = Config::parse(&text).unwrap();
     config.imu = Some(ImuConfig { roll_deg: 180.0, force_noise_mps2: 3.0, ..ImuConfig::default() });
     config.attitude = Some(AttitudeConfig { tilt_noise_deg: 10.0, ..AttitudeConfig::default() });
-    let heard = CaptureReader::open(&whole).unwrap().filter_map(|item| item.event);
-    let mut events: Vec<Event> = heard.filter(|e| !matches!(e.body, EventBody::Frame(_))).collect();
+    let events_of_capture = CaptureReader::open(&whole).unwrap().filter_map(|item| item.event);
+    let mut events: Vec<Event> =
+        events_of_capture.filter(|e| !matches!(e.body, EventBody::Frame(_))).collect();
     let (first, last) = (events[0].t_recv, events[events.len() - 1].t_recv);
     let inertial = InertialSample { rate_rps: Some(Vector3::zeros()), force_mps2: Some(Vector3::z() * 9.8) };
     let tilt = Some(Tilt { pitch: 0.0, roll: 0.0 });

@@ -51,7 +51,7 @@ fn targets_coast_and_are_lost_without_a_frame() {
     assert!((1.8..2.4).contains(&since(lost)), "lost after {} s", since(lost));
     assert!((0.3..0.7).contains(&since(&predicted[0])), "first after {} s", since(&predicted[0]));
     assert!((11..19).contains(&predicted.len()), "{} predictions", predicted.len());
-    let sigma = |e: &TargetEstimate| e.state.and_then(|state| state.relative_sigma_m).expect("told");
+    let sigma = |e: &TargetEstimate| e.state.and_then(|state| state.relative_sigma_m).expect("reported");
     for pair in predicted.windows(2) {
         assert_eq!(pair[1].status, TrackStatus::Coasting);
         assert!(

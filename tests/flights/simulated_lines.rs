@@ -133,15 +133,15 @@ fn every_compass_format_is_read_as_it_was_sent() {
         assert!(attitudes.len() >= 235, "{format:?}: {} readings", attitudes.len());
         let declination = world.scenario().declination_deg.to_radians();
         // Late enough for the fit to have settled to well within half a period.
-        for heard in attitudes.iter().filter(|a| a.t_valid > world.time(4.0)) {
-            let (t_true, sent) = nearest(&readings, heard.t_valid - off);
-            assert!((heard.t_valid - off - *t_true).abs() < Span::from_ms(10.0), "{format:?}");
-            if let Some(heading) = heard.value.heading {
-                let magnetic = if heard.value.heading_is_true { heading - declination } else { heading };
+        for sample in attitudes.iter().filter(|a| a.t_valid > world.time(4.0)) {
+            let (t_true, sent) = nearest(&readings, sample.t_valid - off);
+            assert!((sample.t_valid - off - *t_true).abs() < Span::from_ms(10.0), "{format:?}");
+            if let Some(heading) = sample.value.heading {
+                let magnetic = if sample.value.heading_is_true { heading - declination } else { heading };
                 let wrong = wrap_angle(magnetic - sent.heading.expect("valid")).to_degrees();
                 assert!(wrong.abs() < 0.06, "{format:?}: heading {wrong} degrees off");
             }
-            if let (Some(tilt), Some(sent)) = (heard.value.tilt, sent.tilt) {
+            if let (Some(tilt), Some(sent)) = (sample.value.tilt, sent.tilt) {
                 let wrong = (tilt.pitch - sent.pitch).hypot(tilt.roll - sent.roll).to_degrees();
                 assert!(wrong < 0.09, "{format:?}: tilt {wrong} degrees off");
             }

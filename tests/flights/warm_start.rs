@@ -45,9 +45,9 @@ fn flown() -> (Vec<Event>, WarmState) {
     let mut pipeline = Pipeline::new((&config()).into());
     assert!(pipeline.warm_state().is_none(), "nothing is settled before the first event");
     outputs(&mut pipeline, before);
-    let told =
+    let text =
         serde_json::to_string(&pipeline.warm_state().expect("the site is settled")).expect("plain values");
-    (after.to_vec(), serde_json::from_str(&told).expect("what was written is read"))
+    (after.to_vec(), serde_json::from_str(&text).expect("what was written is read"))
 }
 
 /// The events of a run that begins with a state.

@@ -68,6 +68,7 @@ fn alone(keys: &Keys, web: SocketAddr) -> GroundSettings {
         link: station_settings(keys.files(Role::Station, "base"), Some(([127, 0, 0, 1], 9).into())),
         out: keys.path().join("out"),
         web: Some(web),
+        open: false,
         token: None,
         tiles: None,
         position: None,

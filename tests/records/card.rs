@@ -104,7 +104,7 @@ fn say(handle: &StoreHandle, t_recv: MonoTime, words: &str) {
 }
 
 /// The recorded events, flight by flight.
-fn heard(card: &Path) -> Vec<String> {
+fn recorded(card: &Path) -> Vec<String> {
     let mut names = flight::flight_names(card).unwrap();
     names.sort();
     let lines = names.iter().flat_map(|name| CaptureReader::open(&card.join(FLIGHTS).join(name)).unwrap());
@@ -228,15 +228,18 @@ fn a_device_that_refuses_writes_stops_recording_and_the_same_card_comes_back() {
     }
     say(&handle, clock.now(), "after");
     store.stop();
-    let heard = heard(&card);
-    assert!(heard.contains(&"before".to_owned()) && heard.contains(&"after".to_owned()), "{heard:?}");
+    let recorded = recorded(&card);
+    assert!(
+        recorded.contains(&"before".to_owned()) && recorded.contains(&"after".to_owned()),
+        "{recorded:?}"
+    );
     let (flights, errors) = inspect::list(&card).unwrap();
     assert!(errors.is_empty() && !flights.is_empty(), "{errors:?}");
 }
 
 /// The store under another user: root may write everywhere.
 #[test]
-fn a_card_of_somebody_else_is_told_and_used_once_it_is_handed_over() {
+fn a_card_of_somebody_else_is_reported_and_used_once_it_is_handed_over() {
     let Some(mount) = CardMount::new() else { return };
     let tests = std::env::current_exe().unwrap();
     let built = tests.parent().and_then(Path::parent).unwrap().join("examples/store_load");
@@ -267,7 +270,7 @@ fn a_card_of_somebody_else_is_told_and_used_once_it_is_handed_over() {
     let stopped = said.lines().find(|l| l.starts_with("recording_stopped")).expect(&said);
     assert!(stopped.contains("Permission denied"), "{stopped}");
     assert!(said.contains("recording_resumed"), "{said}");
-    assert!(!heard(&mount.path()).is_empty(), "{said}");
+    assert!(!recorded(&mount.path()).is_empty(), "{said}");
 }
 
 #[test]
@@ -293,7 +296,7 @@ fn a_full_card_stops_recording_until_space_appears() {
     handle.put_state("warm", vec![2]);
     store.stop();
     assert_eq!(flight::flight_names(&card).unwrap().len(), 1, "the same flight continues");
-    assert_eq!(heard(&card), ["before", "after"]);
+    assert_eq!(recorded(&card), ["before", "after"]);
     // A restart finds the state that the flight saved last, after it continued.
     let (store, _) = start(&card, clock);
     assert_eq!(store.handle().state("warm", Duration::from_secs(30)), Some(vec![2]));
@@ -301,7 +304,7 @@ fn a_full_card_stops_recording_until_space_appears() {
 }
 
 #[test]
-fn a_read_only_card_is_told_and_used_once_it_can_be_written() {
+fn a_read_only_card_is_reported_and_used_once_it_can_be_written() {
     let Some(mount) = CardMount::new() else { return };
     mount.remount("ro");
     let (card, clock) = (mount.path(), HostClock::start());
@@ -312,7 +315,7 @@ fn a_read_only_card_is_told_and_used_once_it_can_be_written() {
     expect(&notices, "recording_resumed");
     say(&store.handle(), clock.now(), "written");
     store.stop();
-    assert_eq!(heard(&card), ["written"]);
+    assert_eq!(recorded(&card), ["written"]);
 }
 
 #[test]
@@ -334,7 +337,7 @@ fn a_card_taken_out_is_missed_and_the_next_one_used() {
     say(&handle, clock.now(), "on the second");
     expect(&notices, "index_ready");
     store.stop();
-    assert_eq!(heard(&card), ["on the second"]);
+    assert_eq!(recorded(&card), ["on the second"]);
 }
 
 #[test]
@@ -362,7 +365,7 @@ fn a_clock_before_1980_records_like_any_other() {
         say(&handle, MonoTime::from_ns(second * 1_000_000_000), words);
     }
     store.stop();
-    assert_eq!(heard(dir.path()), ["1969", "1970", "1970", "1979"]);
+    assert_eq!(recorded(dir.path()), ["1969", "1970", "1970", "1979"]);
     let info = flight::flight_info(dir.path(), "boot-1").unwrap();
     assert!(info.closed);
     let gps = info.topics["/gps/serial"];

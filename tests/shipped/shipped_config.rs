@@ -37,10 +37,10 @@ fn every_key_is_there() {
 
 #[test]
 fn a_fisheye_has_four_terms() {
-    let told = "distortion = [-0.17892, 0.13875, -0.00128, 0.0056, 0.0]";
+    let line = "distortion = [-0.17892, 0.13875, -0.00128, 0.0056, 0.0]";
     let with = |terms: &str| {
         let text = shipped().replace("#model = \"brown\"", "model = \"fisheye\"");
-        Config::parse(&text.replace(told, &format!("distortion = {terms}")))
+        Config::parse(&text.replace(line, &format!("distortion = {terms}")))
     };
     let lens = with("[-0.01, 0.002, 0.0, 0.001]").unwrap().camera.intrinsics;
     assert_eq!((lens.model, lens.distortion), (LensModel::Fisheye, [-0.01, 0.002, 0.0, 0.001, 0.0]));
@@ -51,7 +51,7 @@ fn a_fisheye_has_four_terms() {
 }
 
 #[test]
-fn unknown_and_absurd_values_are_told_by_name() {
+fn unknown_and_absurd_values_are_reported_by_name() {
     let text = shipped().replace("[gps]", "[gps]\ntypo = 1");
     let error = Config::parse(&text).unwrap_err().to_string();
     assert!(error.contains("typo") && error.contains("line"), "{error}");

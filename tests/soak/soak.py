@@ -1,5 +1,5 @@
 """Everything that goes wrong at once, for an hour: hostile strangers, readers that read nothing, devices and a card that come
-and go, a station that is killed. Memory stays flat, nothing is lost but what is told.
+and go, a station that is killed. Memory stays flat, nothing is lost but what is reported.
 
 `make soak` runs it; `make soak SOAK_S=120` for two minutes.
 """
@@ -218,10 +218,10 @@ class Soak:
             # Numbers that the payload no longer has are shown on the page as lost on board.
             print(f"{flight}: {len(found)} records of {max(found) + 1}")
         events = re.findall(r"event=(\w+)", self.daemon.text())
-        print("told:", {name: events.count(name) for name in sorted(set(events)) if name != "health"})
+        print("reported:", {name: events.count(name) for name in sorted(set(events)) if name != "health"})
         for name in ("task_failed", "task_silent"):
             if name in events:
-                wrong.append(f"{name} was told")
+                wrong.append(f"{name} was reported")
         if not numbers:
             wrong.append("the station kept nothing")
         return wrong

@@ -34,9 +34,9 @@ class Browser:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        told = profile / "DevToolsActivePort"
-        rig.until(lambda: told.exists() and told.read_text().count("\n"), 60, lambda: "chromium does not start")
-        port = told.read_text().split()[0]
+        port_file = profile / "DevToolsActivePort"
+        rig.until(lambda: port_file.exists() and port_file.read_text().count("\n"), 60, lambda: "chromium does not start")
+        port = port_file.read_text().split()[0]
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
             page = next(p for p in json.load(answer) if p["type"] == "page")
         self.socket = websocket.create_connection(page["webSocketDebuggerUrl"], timeout=60)

@@ -85,15 +85,15 @@ class Fleet(unittest.TestCase):
     def test_live_latest_past_and_past_after_a_restart(self):
         # Given: a client that listens to everything.
         station, client = self.configured()
-        heard = []
+        received = []
         listening = client.declare_subscriber(
-            "windhover/**", lambda s: heard.append((str(s.key_expr), bytes(s.payload), s.timestamp, str(s.encoding)))
+            "windhover/**", lambda s: received.append((str(s.key_expr), bytes(s.payload), s.timestamp, str(s.encoding)))
         )
         keys = {STATE, "windhover/alpha/health", "windhover/alpha/ownship/state"}
-        enough = lambda: keys <= {k for k, *_ in heard} and len(heard) > 100  # noqa: E731
-        rig.until(enough, 90, lambda: f"heard {len(heard)} on {set(k for k, *_ in heard)}")
+        enough = lambda: keys <= {k for k, *_ in received} and len(received) > 100  # noqa: E731
+        rig.until(enough, 90, lambda: f"received {len(received)} on {set(k for k, *_ in received)}")
         listening.undeclare()
-        live = list(heard)
+        live = list(received)
         states = [s for s in live if s[0] == STATE]
         self.assertEqual({s[3] for s in states}, {"application/protobuf;windhover.TargetState"})
         # Then: the latest is one of each key, not older than what was received.
@@ -105,9 +105,9 @@ class Fleet(unittest.TestCase):
         # And: the past holds everything that was received, once.
         past, errors = ask(client, "windhover/alpha/**?_time=[now(-1h)..]")
         self.assertEqual(errors, 0)
-        told = distinct(past)
-        self.assertEqual(len(told), len(past), "none twice")
-        self.assertEqual(len(distinct(live) - told), 0, "all that came live")
+        stored = distinct(past)
+        self.assertEqual(len(stored), len(past), "none twice")
+        self.assertEqual(len(distinct(live) - stored), 0, "all that came live")
         # And: a span is a span, and what is none is an error.
         middle = states[len(states) // 2][2].get_time().strftime("%Y-%m-%dT%H:%M:%S.%fZ")
         some, _ = ask(client, f"{STATE}?_time=[{middle}..]")
@@ -121,16 +121,16 @@ class Fleet(unittest.TestCase):
         _, client = self.configured()
         # Then: its files tell the same past.
         again, _ = ask(client, "windhover/alpha/**?_time=[now(-1h)..]")
-        self.assertEqual(len(told - distinct(again)), 0, "the same after a restart")
+        self.assertEqual(len(stored - distinct(again)), 0, "the same after a restart")
         client.close()
 
     def test_a_station_calls_a_router(self):
         router = session("router", listen=self.endpoint)
         self.addCleanup(router.close)
-        heard = []
-        router.declare_subscriber(STATE, lambda sample: heard.append(time.monotonic()))
+        received = []
+        router.declare_subscriber(STATE, lambda sample: received.append(time.monotonic()))
         self.station(self.endpoint)
-        rig.until(lambda: len(heard) > 20, 90, lambda: f"heard {len(heard)}")
+        rig.until(lambda: len(received) > 20, 90, lambda: f"received {len(received)}")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ use windhover_base::time::{MonoTime, Span};
 /// Passes over the flights: each linearises about the result of the previous one.
 const PASSES: usize = 3;
 /// A parameter counts as determined where its sigma is below this share of the prior's.
-const TOLD: f64 = 0.5;
+const DETERMINED: f64 = 0.5;
 /// Lower limit of the sigma of the compass's lateness: attitude between samples is a model, s.
 const LATENESS_FLOOR_S: f64 = 1e-3;
 /// Shorter flights are refused, seconds.
@@ -76,7 +76,7 @@ pub struct Finding {
     /// One-sigma before the flights.
     pub prior: f64,
     /// Whether the flights determined it.
-    pub told: bool,
+    pub determined: bool,
 }
 
 /// An estimated marker.
@@ -174,8 +174,8 @@ fn prior_of(rig: &Rig) -> (Parameters, DVector<f64>) {
     ];
     let mut sigma =
         DVector::from_iterator(PARAMETERS, NAMES.iter().map(|(_, _, prior, factor)| prior / factor));
-    let told = rig.compass.heading_bias_sigma_deg.max(0.1).to_radians();
-    sigma[6] = told;
+    let configured = rig.compass.heading_bias_sigma_deg.max(0.1).to_radians();
+    sigma[6] = configured;
     sigma[10] = (rig.gps.latency_sigma_ms * 1e-3).max(1e-3);
     (start, sigma)
 }
@@ -326,7 +326,7 @@ impl Pass {
                 value: self.parameters[k] * factor,
                 sigma: sigma(k) * factor,
                 prior: prior[k] * factor,
-                told: sigma(k) < TOLD * prior[k],
+                determined: sigma(k) < DETERMINED * prior[k],
             })
             .collect();
         let together = [("yaw", 0, 6), ("pitch", 1, 7), ("roll", 2, 8)];
@@ -342,7 +342,7 @@ impl Pass {
                     value: (self.parameters[*mount] - self.parameters[*zero]).to_degrees(),
                     sigma: sigma.to_degrees(),
                     prior: wide.to_degrees(),
-                    told: sigma < TOLD * wide,
+                    determined: sigma < DETERMINED * wide,
                 }
             })
             .collect();
@@ -360,7 +360,8 @@ impl Pass {
 impl Boresight {
     /// Advice on flying so that the remaining parameters are determined; empty where all are.
     pub fn advice(&self) -> Vec<String> {
-        let untold = |names: &[&str]| self.parameters.iter().any(|p| !p.told && names.contains(&p.name));
+        let undetermined =
+            |names: &[&str]| self.parameters.iter().any(|p| !p.determined && names.contains(&p.name));
         let blurred = |name: &str| self.camera_to_compass.iter().any(|p| p.name == name && !(p.sigma < 0.2));
         let mut advice = Vec::new();
         if blurred("yaw") {
@@ -372,28 +373,28 @@ impl Boresight {
                  marker, twice, at constant height.",
             );
         }
-        if untold(&["mount yaw", "compass yaw", "compass pitch zero", "compass roll zero"]) {
+        if undetermined(&["mount yaw", "compass yaw", "compass pitch zero", "compass roll zero"]) {
             advice.push(
                 "Mount and compass zeros are determined only together; for positions only their difference \
                  matters. To separate yaw, bank steeply (15° and more) to both sides over the marker; to separate \
                  tilt, level the compass on the bench.",
             );
         }
-        if untold(&["lever arm forward", "lever arm right"]) {
+        if undetermined(&["lever arm forward", "lever arm right"]) {
             advice.push(
                 "The lever arm is not determined: turn on the spot over the marker, at 5 m and again at 15 m.",
             );
         }
-        if untold(&["lever arm down"]) {
+        if undetermined(&["lever arm down"]) {
             advice
                 .push("The lever arm's height cannot be separated from GPS height: measure it with a ruler.");
         }
-        if untold(&["compass late by"]) {
+        if undetermined(&["compass late by"]) {
             advice.push(
                 "The compass's lateness is not determined: yaw quickly left and right (30° a second) over the marker.",
             );
         }
-        if untold(&["gps late by"]) {
+        if undetermined(&["gps late by"]) {
             advice.push(
                 "The GPS's lateness is not determined: fly past the marker fast, in opposite directions.",
             );

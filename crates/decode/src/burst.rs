@@ -25,12 +25,12 @@ const VOTES_LEADING: i8 = 2;
 #[derive(Clone, Debug, Default)]
 pub(super) struct BurstOrder {
     votes: Vec<(Address, i8)>,
-    since: Vec<Heard>,
+    since: Vec<Arrival>,
     last: Option<LineSpan>,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Heard {
+struct Arrival {
     address: Address,
     silence_before: Span,
     span: LineSpan,
@@ -46,12 +46,12 @@ fn key(address: &str) -> Address {
 
 impl BurstOrder {
     /// Takes a valid sentence of any kind, in order of arrival.
-    pub(super) fn heard(&mut self, address: &str, span: LineSpan) {
+    pub(super) fn received(&mut self, address: &str, span: LineSpan) {
         let silence_before = self.last.map_or(Span::ZERO, |last| span.t_first - last.t_last);
         if self.since.len() == SINCE_MAX {
             self.since.remove(0);
         }
-        self.since.push(Heard { address: key(address), silence_before, span });
+        self.since.push(Arrival { address: key(address), silence_before, span });
         self.last = Some(span);
     }
 
@@ -64,24 +64,24 @@ impl BurstOrder {
     /// be of the same burst.
     pub(super) fn new_burst(&mut self, earlier: Option<LineSpan>) -> LineSpan {
         self.vote();
-        let known = earlier.and_then(|span| self.since.iter().position(|heard| heard.span == span));
+        let known = earlier.and_then(|span| self.since.iter().position(|arrival| arrival.span == span));
         let first_known = known.unwrap_or(self.since.len().saturating_sub(1));
         let leaders = self.since[..first_known]
             .iter()
             .rev()
-            .take_while(|heard| self.votes_of(heard.address) >= VOTES_LEADING)
+            .take_while(|arrival| self.votes_of(arrival.address) >= VOTES_LEADING)
             .count();
-        let first = self.since.get(first_known - leaders).map(|heard| heard.span);
+        let first = self.since.get(first_known - leaders).map(|arrival| arrival.span);
         self.since.clear();
         first.or(self.last).unwrap_or_default()
     }
 
     /// Whether an earlier sentence is nearer to the last one than to the one before it.
     pub(super) fn is_of_this_burst(&self, span: LineSpan) -> bool {
-        let Some(at) = self.since.iter().position(|heard| heard.span == span) else {
+        let Some(at) = self.since.iter().position(|arrival| arrival.span == span) else {
             return false;
         };
-        let after = self.since[at + 1..].iter().map(|heard| heard.silence_before).max();
+        let after = self.since[at + 1..].iter().map(|arrival| arrival.silence_before).max();
         after.is_none_or(|after| after <= self.since[at].silence_before)
     }
 
@@ -95,21 +95,21 @@ impl BurstOrder {
     }
 
     fn vote(&mut self) {
-        let longest = self.since.iter().enumerate().max_by_key(|(_, heard)| heard.silence_before);
-        let Some((gap, longest)) = longest.map(|(index, heard)| (index, heard.silence_before)) else {
+        let longest = self.since.iter().enumerate().max_by_key(|(_, arrival)| arrival.silence_before);
+        let Some((gap, longest)) = longest.map(|(index, arrival)| (index, arrival.silence_before)) else {
             return;
         };
         let others = self.since.iter().enumerate().filter(|(index, _)| *index != gap);
-        let second = others.map(|(_, heard)| heard.silence_before).max().unwrap_or(Span::ZERO);
+        let second = others.map(|(_, arrival)| arrival.silence_before).max().unwrap_or(Span::ZERO);
         if longest < SILENCE_MIN || longest.ns() < 2 * second.ns() {
             return;
         }
-        for (index, heard) in self.since.iter().enumerate() {
+        for (index, arrival) in self.since.iter().enumerate() {
             let vote = if index < gap { -1 } else { 1 };
             let room = self.votes.len() < ADDRESSES_MAX;
-            match self.votes.iter_mut().find(|(known, _)| *known == heard.address) {
+            match self.votes.iter_mut().find(|(known, _)| *known == arrival.address) {
                 Some((_, votes)) => *votes = (*votes + vote).clamp(-VOTES_MAX, VOTES_MAX),
-                None if room => self.votes.push((heard.address, vote)),
+                None if room => self.votes.push((arrival.address, vote)),
                 None => {}
             }
         }
@@ -190,10 +190,10 @@ mod tests {
         let mut begins = Vec::new();
         for burst in 0..4 {
             let t = burst * 200;
-            order.heard("GPVTG", span(t));
-            order.heard("GPRMC", span(t + 10));
+            order.received("GPVTG", span(t));
+            order.received("GPRMC", span(t + 10));
             begins.push(order.new_burst(None).t_first.ns() / 1_000_000);
-            order.heard("GPGSV", span(t + 20));
+            order.received("GPGSV", span(t + 20));
         }
         // Then VTG is known to lead after two silences, and the burst begins with it
         assert!(order.leads("GPVTG") && !order.leads("GPGSV"));
@@ -206,9 +206,9 @@ mod tests {
         for burst in 0..6 {
             let t = burst * 200;
             let stall = if burst == 4 { 170 } else { 0 };
-            order.heard("GPRMC", span(t));
+            order.received("GPRMC", span(t));
             order.new_burst(None);
-            order.heard("PGRMV", span(t + 10 + stall));
+            order.received("PGRMV", span(t + 10 + stall));
         }
         assert!(!order.leads("PGRMV"));
     }

@@ -68,7 +68,13 @@ impl Calendar {
 
     /// A sentence outside of epochs reported date and time, while the receiver had a fix or not (`None`: as at the last
     /// epoch).
-    pub(super) fn told(&mut self, time_of_day_ns: i64, date: Date, has_fix: Option<bool>, t_recv: MonoTime) {
+    pub(super) fn reported(
+        &mut self,
+        time_of_day_ns: i64,
+        date: Date,
+        has_fix: Option<bool>,
+        t_recv: MonoTime,
+    ) {
         if has_fix.unwrap_or(self.had_fix)
             && let Some(utc) = self.dated(date, time_of_day_ns, t_recv)
         {
@@ -90,8 +96,8 @@ impl Calendar {
 }
 
 /// The time of day on the day that is nearest to `last` plus the time since.
-fn nearest((last, heard): (UtcTime, MonoTime), time_of_day_ns: i64, t_recv: MonoTime) -> UtcTime {
-    let expected = last.unix_ns().saturating_add((t_recv - heard).ns());
+fn nearest((last, received): (UtcTime, MonoTime), time_of_day_ns: i64, t_recv: MonoTime) -> UtcTime {
+    let expected = last.unix_ns().saturating_add((t_recv - received).ns());
     let midnight = expected.div_euclid(DAY_NS) * DAY_NS;
     let days = [-1, 0, 1].map(|day| midnight + day * DAY_NS + time_of_day_ns);
     let nearest = days.into_iter().min_by_key(|ns| (ns - expected).abs());
@@ -226,13 +232,13 @@ mod tests {
     }
 
     #[test]
-    fn a_date_told_beside_the_epochs_counts_like_theirs() {
+    fn a_date_reported_beside_the_epochs_counts_like_theirs() {
         let (mut calendar, t) = (Calendar::new(true), MonoTime::from_ns(HOST_S * NS_PER_S));
         let date = Date::new(2026, 11, 18).expect("a day");
-        let told = 54_247 * NS_PER_S;
-        calendar.told(told, date, None, t);
+        let time_of_day_ns = 54_247 * NS_PER_S;
+        calendar.reported(time_of_day_ns, date, None, t);
         assert_eq!(at("150405", &mut calendar, None, HOST_S), "none", "there was no fix yet");
-        calendar.told(told, date, None, t);
+        calendar.reported(time_of_day_ns, date, None, t);
         assert_eq!(at("150405", &mut calendar, None, HOST_S), "2026-11-18T15:04:05.000Z");
     }
 

@@ -25,7 +25,7 @@ pub(super) struct Draft {
     void: bool,
     confirmed: bool,
     epoch: GnssEpoch,
-    fix_told: Option<FixKind>,
+    fix_reported: Option<FixKind>,
     solution: Option<Solution>,
     sats_listed: Option<u32>,
     ranks: Ranks,
@@ -53,7 +53,7 @@ impl Draft {
             void: false,
             confirmed: false,
             epoch: GnssEpoch::default(),
-            fix_told: None,
+            fix_reported: None,
             solution: None,
             sats_listed: None,
             ranks: Ranks {
@@ -81,7 +81,7 @@ impl Draft {
         self.date = self.date.or(report.date);
         self.void |= report.valid == Some(false);
         self.confirmed |= report.valid == Some(true) || report.fix > Some(FixKind::None);
-        self.fix_told = self.fix_told.max(report.fix);
+        self.fix_reported = self.fix_reported.max(report.fix);
         if let Some(listed) = report.sats_listed {
             self.sats_listed = Some(self.sats_listed.unwrap_or(0) + listed);
         }
@@ -179,8 +179,8 @@ impl Draft {
         if self.void || !self.confirmed || self.epoch.lat_deg.is_none() {
             return FixKind::None;
         }
-        let told = self.fix_told;
-        let flat_or_not = told.unwrap_or(match self.epoch.alt_msl_m {
+        let reported = self.fix_reported;
+        let flat_or_not = reported.unwrap_or(match self.epoch.alt_msl_m {
             Some(_) => FixKind::ThreeD,
             None => FixKind::TwoD,
         });

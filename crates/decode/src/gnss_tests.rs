@@ -52,15 +52,15 @@ fn an_epoch_holds_its_own_second_only() {
     for decoder in [GnssDecoder::new(), GnssDecoder::patient()] {
         let (epochs, counts) = decode(decoder, &text);
         assert_eq!(epochs.len(), 6, "{counts}");
-        for (index, heard) in epochs.iter().enumerate() {
-            let (epoch, value) = (heard.epoch, index as f64 + 1.5);
+        for (index, received) in epochs.iter().enumerate() {
+            let (epoch, value) = (received.epoch, index as f64 + 1.5);
             assert_eq!(
                 (epoch.fix, epoch.alt_msl_m, epoch.hpe_m),
                 (FixKind::ThreeD, Some(value), Some(value))
             );
             let velocity = epoch.vel_ned_mps.expect("PGRMV has it");
             assert_eq!((velocity.x, velocity.y, velocity.z), (-1.0, value, -0.5));
-            assert!(epoch.vel_has_down && heard.opens_burst);
+            assert!(epoch.vel_has_down && received.opens_burst);
         }
         assert_eq!(epochs[0].epoch.utc.expect("dated").to_string(), "2026-02-01T10:11:01.000Z");
     }
@@ -128,7 +128,7 @@ fn a_cycle_that_begins_with_gll_is_one_epoch() {
     let text: String = (1..=6).map(burst).collect();
     let (epochs, counts) = decode(GnssDecoder::new(), &text);
     assert_eq!(seconds(&epochs), [1, 2, 3, 4, 5, 6].map(Some), "{counts}");
-    assert!(epochs.iter().all(|heard| heard.opens_burst && heard.epoch.alt_msl_m == Some(14.7)));
+    assert!(epochs.iter().all(|received| received.opens_burst && received.epoch.alt_msl_m == Some(14.7)));
 }
 
 #[test]
@@ -194,9 +194,9 @@ const HOST_NS: i64 = 1_769_940_660_000_000_000;
 /// The order of sentences in a burst, and whether its ZDA is of the same second, of later ones, or leads.
 fn dated(second: u32, ahead: i64, leads: bool) -> String {
     let time = format!("1011{second:02}");
-    let told = format!("1011{:02}", i64::from(second) + ahead);
+    let reported = format!("1011{:02}", i64::from(second) + ahead);
     let fix = gga(&time, "3030.00000", "43.0") + &line("GPGSA,A,3,02,04,05,09,,,,,,,,,1.6,0.9,1.3");
-    if leads { zda(&told) + &fix } else { fix + &zda(&told) }
+    if leads { zda(&reported) + &fix } else { fix + &zda(&reported) }
 }
 
 #[test]
@@ -208,25 +208,29 @@ fn a_zda_dates_and_never_opens_an_epoch() {
         for (which, (epochs, counts)) in ways.iter().enumerate() {
             let what = format!("ahead {ahead}, leads {leads}, way {which}: {counts}");
             assert_eq!((epochs.len(), counts.refused_total()), (20, 0), "{what}");
-            assert!(epochs.iter().all(|heard| heard.epoch.fix == FixKind::ThreeD), "{what}");
-            assert!(epochs.iter().all(|heard| heard.epoch.hdop == Some(0.9)), "{what}");
+            assert!(epochs.iter().all(|received| received.epoch.fix == FixKind::ThreeD), "{what}");
+            assert!(epochs.iter().all(|received| received.epoch.hdop == Some(0.9)), "{what}");
             let dated = epochs.iter().skip(2).enumerate();
-            for (index, heard) in dated {
-                let utc = heard.epoch.utc.map(|utc| utc.to_string());
+            for (index, received) in dated {
+                let utc = received.epoch.utc.map(|utc| utc.to_string());
                 assert_eq!(utc, Some(format!("2026-02-01T10:11:{}.000Z", index + 12)), "{what}");
             }
         }
         // Its burst begins with the ZDA only where the ZDA leads it.
-        let begins = |heard: &ReceivedEpoch| (heard.t_first_byte.ns() - HOST_NS) % 1_000_000_000 / 1_000_000;
+        let begins =
+            |received: &ReceivedEpoch| (received.t_first_byte.ns() - HOST_NS) % 1_000_000_000 / 1_000_000;
         let late = if leads && ahead != 0 { 20 } else { 0 };
         let settled = live(&bursts).0;
         assert!(
-            settled[5..].iter().all(|heard| begins(heard) == late || begins(heard) == 0),
+            settled[5..].iter().all(|received| begins(received) == late || begins(received) == 0),
             "ahead {ahead}"
         );
         if ahead == 0 || !leads {
             // Before the first burst it is not known to which burst its first sentence belongs.
-            assert!(settled[1..].iter().all(|heard| begins(heard) == 0), "ahead {ahead}, leads {leads}");
+            assert!(
+                settled[1..].iter().all(|received| begins(received) == 0),
+                "ahead {ahead}, leads {leads}"
+            );
         }
     }
 }
@@ -241,13 +245,16 @@ fn a_date_without_a_fix_is_none() {
     for date in ["050180", "060180", "220899", "181126"] {
         let text = cold(date);
         for (epochs, _) in [live(std::slice::from_ref(&text)), decode(GnssDecoder::patient(), &text)] {
-            assert!(!epochs.is_empty() && epochs.iter().all(|heard| heard.epoch.utc.is_none()), "{date}");
+            assert!(
+                !epochs.is_empty() && epochs.iter().all(|received| received.epoch.utc.is_none()),
+                "{date}"
+            );
         }
     }
     // The date comes with the fix, and the zeros before it are dropped.
     let bursts = [cold("060180"), cold("060180"), garmin(20), garmin(21)];
     let (epochs, _) = live(&bursts);
-    let utc: Vec<_> = epochs.iter().map(|heard| heard.epoch.utc.map(|utc| utc.to_string())).collect();
+    let utc: Vec<_> = epochs.iter().map(|received| received.epoch.utc.map(|utc| utc.to_string())).collect();
     assert_eq!(
         utc[utc.len() - 2..],
         ["2026-02-01T10:11:20.000Z", "2026-02-01T10:11:21.000Z"].map(|t| Some(t.into()))
@@ -255,19 +262,21 @@ fn a_date_without_a_fix_is_none() {
 }
 
 #[test]
-fn a_second_told_twice_is_two_epochs() {
+fn a_second_reported_twice_is_two_epochs() {
     let bursts: Vec<String> = [10, 11, 12, 13, 14, 14, 15, 16].map(garmin).to_vec();
     let (epochs, counts) = live(&bursts);
     assert_eq!(seconds(&epochs), [10, 11, 12, 13, 14, 14, 15, 16].map(Some), "{counts}");
 }
 
 #[test]
-fn a_receiver_without_time_or_fix_is_heard() {
+fn a_receiver_without_time_or_fix_is_decoded() {
     let burst =
         line("GPRMC,,V,,,,,,,260810,1.0,E,N") + &line("GPGGA,,,,,,0,00,,,M,,M,,") + &line("PGRME,,M,,M,,M");
     let (epochs, _) = decode(GnssDecoder::new(), &burst.repeat(5));
     assert_eq!(epochs.len(), 5);
-    assert!(epochs.iter().all(|heard| heard.epoch.fix == FixKind::None && heard.epoch.utc.is_none()));
+    assert!(
+        epochs.iter().all(|received| received.epoch.fix == FixKind::None && received.epoch.utc.is_none())
+    );
 }
 
 #[test]
@@ -279,8 +288,8 @@ fn a_receiver_of_rmc_and_gns_alone_has_altitude() {
     let text: String = (0..5).map(burst).collect();
     let (epochs, counts) = decode(GnssDecoder::new(), &text);
     assert_eq!((epochs.len(), counts.refused_total()), (5, 0), "{counts}");
-    for heard in epochs {
-        let epoch = heard.epoch;
+    for received in epochs {
+        let epoch = received.epoch;
         assert_eq!((epoch.fix, epoch.alt_msl_m, epoch.sats), (FixKind::RtkFixed, Some(50.1), Some(14)));
     }
 }
@@ -316,7 +325,7 @@ fn a_fix_of_no_satellites_needs_another_witness() {
 }
 
 #[test]
-fn rtk_is_told_by_quality_or_modes() {
+fn rtk_is_found_by_quality_or_modes() {
     let gga = |quality: u32| {
         line(&format!("GNGGA,101101,3030.00000,N,08530.00000,W,{quality},19,0.5,10.0,M,-27.0,M,1.0,0001"))
     };
@@ -374,8 +383,8 @@ proptest! {
     ) {
         let text: String = bodies.iter().map(|body| line(body)).collect();
         let (epochs, _) = decode(GnssDecoder::new(), &text);
-        for heard in epochs {
-            let epoch = heard.epoch;
+        for received in epochs {
+            let epoch = received.epoch;
             prop_assert!(epoch.lat_deg.is_none_or(|lat| (-90.0..=90.0).contains(&lat)));
             prop_assert!(epoch.lon_deg.is_none_or(|lon| (-180.0..=180.0).contains(&lon)));
             prop_assert!(epoch.alt_msl_m.is_none_or(f64::is_finite));
@@ -401,7 +410,7 @@ proptest! {
             cut.push(read, MonoTime::default(), &mut in_pieces);
             rest = after;
         }
-        let epochs = |heard: &[ReceivedEpoch]| heard.iter().map(|h| h.epoch).collect::<Vec<_>>();
+        let epochs = |received: &[ReceivedEpoch]| received.iter().map(|h| h.epoch).collect::<Vec<_>>();
         prop_assert_eq!(epochs(&at_once), epochs(&in_pieces));
         prop_assert_eq!(whole.counts(), cut.counts());
     }

@@ -92,12 +92,12 @@ fn sentences_beside_it_are_of_the_same_epoch() {
         let bytes: Vec<u8> = (5..12).flat_map(burst).collect();
         let (epochs, counts) = decode(GpsFormat::Auto, &bytes);
         assert_eq!((epochs.len(), counts.used, counts.refused_total()), (7, 21, 0), "{counts}");
-        for heard in &epochs {
-            assert_eq!((heard.epoch.hdop, heard.epoch.hpe_m), (Some(0.6), Some(0.8)));
-            assert!((heard.epoch.lat_deg.expect("given") - 38.703_333_3).abs() < 1e-9);
+        for received in &epochs {
+            assert_eq!((received.epoch.hdop, received.epoch.hpe_m), (Some(0.6), Some(0.8)));
+            assert!((received.epoch.lat_deg.expect("given") - 38.703_333_3).abs() < 1e-9);
         }
         let (of_text, counts) = decode(GpsFormat::Nmea, &bytes);
-        assert!(of_text.iter().all(|heard| heard.epoch.hpe_m.is_none()), "{counts}");
+        assert!(of_text.iter().all(|received| received.epoch.hpe_m.is_none()), "{counts}");
         assert_eq!(decode(GpsFormat::Ubx, &bytes).0.len(), 7);
     }
 }
@@ -129,7 +129,7 @@ fn the_seventh_generation_is_read() {
 }
 
 #[test]
-fn accuracies_and_rtk_are_told() {
+fn accuracies_and_rtk_are_reported() {
     let epoch = |packets: &[Vec<u8>]| decode(GpsFormat::Auto, &packets.concat()).0[0].epoch;
     let with = |flags: u8, speed_accuracy_mm: u32| {
         let mut payload = pvt(5, 0, 3, flags)[6..98].to_vec();
@@ -137,7 +137,7 @@ fn accuracies_and_rtk_are_told() {
         ubx_framed(1, 7, &payload)
     };
     let alone = epoch(&[with(1, 120)]);
-    let of = |v: Option<Vector3<f64>>| v.expect("told");
+    let of = |v: Option<Vector3<f64>>| v.expect("reported");
     assert_eq!(of(alone.position_sigma_m), Vector3::new(0.8, 0.8, 1.2));
     assert_eq!(of(alone.velocity_sigma_mps), Vector3::repeat(0.12));
     assert_eq!(epoch(&[with(1, 0)]).velocity_sigma_mps, None, "zero is no accuracy");
@@ -186,8 +186,8 @@ fn covariances_of_a_stream_are_of_their_epochs() {
         }
         decoder.flush(&mut out);
         assert_eq!((out.len(), decoder.counts().refused_total()), (25, 0), "{}", decoder.counts());
-        for (second, heard) in (5..30).zip(&out) {
-            let sigma = heard.epoch.position_sigma_m.expect("told").x;
+        for (second, received) in (5..30).zip(&out) {
+            let sigma = received.epoch.position_sigma_m.expect("reported").x;
             assert!((sigma - f64::from(second).sqrt()).abs() < 1e-6, "{second}: {sigma}");
         }
     }
@@ -224,8 +224,9 @@ fn sentences_of_errors_are_of_their_epoch_and_open_none() {
     let gst = "GNGST,TIME,1.2,1.5,0.9,30,0.8,0.9,1.7";
     let bytes = [at(5, gga), at(5, gst), at(6, gga), at(9, gst), at(7, gga), at(7, gst)].concat();
     let (epochs, counts) = decode(GpsFormat::Nmea, &bytes);
-    let told: Vec<bool> = epochs.iter().map(|heard| heard.epoch.position_sigma_m.is_some()).collect();
-    assert_eq!((told, counts.refused(Refusal::NoTime)), (vec![true, false, true], 1), "{counts}");
+    let reported: Vec<bool> =
+        epochs.iter().map(|received| received.epoch.position_sigma_m.is_some()).collect();
+    assert_eq!((reported, counts.refused(Refusal::NoTime)), (vec![true, false, true], 1), "{counts}");
     assert_eq!(epochs[0].epoch.position_sigma_m, Some(Vector3::new(0.8, 0.9, 1.7)));
     for gst in ["GNGST,TIME,,,,,,,", "GNGST,TIME,1,,,,0.0,0.0,0.0", "GNGST,TIME,1,,,,x,1,1"] {
         let (epochs, counts) = decode(GpsFormat::Nmea, &[at(5, gga), at(5, gst)].concat());
@@ -246,11 +247,11 @@ proptest! {
             payload.resize(length, 0xFF);
         }
         let bytes = ubx_framed(class, identity, &payload);
-        for heard in decode(GpsFormat::Auto, &bytes).0 {
-            prop_assert!(heard.epoch.lat_deg.is_none_or(|lat| (-90.0..=90.0).contains(&lat)));
-            let sigmas = [heard.epoch.position_sigma_m, heard.epoch.velocity_sigma_mps];
+        for received in decode(GpsFormat::Auto, &bytes).0 {
+            prop_assert!(received.epoch.lat_deg.is_none_or(|lat| (-90.0..=90.0).contains(&lat)));
+            let sigmas = [received.epoch.position_sigma_m, received.epoch.velocity_sigma_mps];
             prop_assert!(sigmas.iter().flatten().flatten().all(|sigma| sigma.is_finite() && *sigma > 0.0));
-            prop_assert!(heard.epoch.course_deg.is_none_or(|course| (0.0..=360.0).contains(&course)));
+            prop_assert!(received.epoch.course_deg.is_none_or(|course| (0.0..=360.0).contains(&course)));
         }
     }
 

@@ -102,7 +102,7 @@ const FRACTIONS_IN_PARTS: [(u16, Where); 2] = [(56, Where::LightChanges), (116, 
 /// And where white is over-exposed: it spreads into the border from both sides and leaves little of it dark.
 const FRACTION_SATURATED: u16 = 195;
 
-/// Smallest edge in a level at which a border can be told from its surroundings, pixels.
+/// Smallest edge in a level at which a border can be distinguished from its surroundings, pixels.
 const LEAST_EDGE_IN_LEVEL: f32 = 12.0;
 
 /// Where weak contrast is divided.
@@ -238,7 +238,7 @@ impl Detector {
         let is_sparse = self.runs_of_level * AREA_OF_PRINT <= self.bits.width * self.bits.height;
         let is_print = looks[0].is_print() && (is_sparse || self.found.len() >= TAGS_OF_PRINT);
         // What touches others by a corner comes last: what is found without needs no second look. While tracking a region
-        // is foretold, and has to be searched fast.
+        // is predicted, and has to be searched fast.
         if rim == Rim::Kept {
             for n in (first..=last).rev() {
                 let look = if is_print { looks[n - first] } else { looks[n - first].of_ground() };

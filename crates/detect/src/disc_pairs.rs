@@ -77,8 +77,8 @@ impl DiscPairs {
         })
     }
 
-    /// Appends the discs that can be told from all others. While tracking they are looked for where they are
-    /// foretold, and only there; else in the whole frame.
+    /// Appends the discs that can be distinguished from all others. While tracking they are looked for where they are
+    /// predicted, and only there; else in the whole frame.
     pub fn find(
         &mut self,
         image: ImageView<'_>,
@@ -181,7 +181,7 @@ impl DiscPairs {
         }
     }
 
-    /// The disc of a pair whose other one is covered: where it is foretold, while nothing there can be the
+    /// The disc of a pair whose other one is covered: where it is predicted, while nothing there can be the
     /// other.
     fn left_over(
         &self,

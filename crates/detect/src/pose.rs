@@ -2,7 +2,7 @@
 //!
 //! Seen from afar a square looks the same tilted one way or the other. From the homography comes one pose;
 //! the other is its mirror image across the plane square to the line of sight. Both are refined by
-//! Gauss–Newton on the pixels of the corners, and the better is told from the worse by its residual
+//! Gauss–Newton on the pixels of the corners, and the better is distinguished from the worse by its residual
 //! (Schweighofer and Pinz 2006; Collins and Bartoli 2014).
 
 use nalgebra::{Isometry3, Matrix2, Matrix3, Matrix6, Rotation3, SMatrix, Translation3, UnitQuaternion};
@@ -31,7 +31,7 @@ pub struct TagPoses {
     pub best: TagPose,
     /// The other, where there is another minimum.
     pub other: Option<TagPose>,
-    /// Error of the best over that of the other: near 1 the two cannot be told apart; 0 without another.
+    /// Error of the best over that of the other: near 1 the two cannot be distinguished; 0 without another.
     pub ambiguity: f64,
 }
 

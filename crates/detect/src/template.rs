@@ -23,7 +23,7 @@ const BLOCKS: usize = SIDE / BLOCK;
 const STEPS: usize = 12;
 /// Weight of the predicted matrix: residuals of four grey levels against a hundredth of its elements. A disc does not
 /// show its turn, and a corner hardly shows its scale.
-const FORETOLD: f32 = 4.0 * 4.0 * 1e4;
+const MATRIX_WEIGHT: f32 = 4.0 * 4.0 * 1e4;
 /// Farthest a patch may be from the initial guess, pixels.
 const FARTHEST: f32 = 3.0;
 
@@ -166,9 +166,9 @@ impl Template {
             f64::from(dot(&steepest[i], &steepest[j]))
         });
         let place = hessian.cholesky()?.inverse().fixed_view::<2, 2>(0, 0).into_owned();
-        let foretold =
-            SVector::<f64, PARAMETERS>::from_fn(|i, _| if i < 2 { 0.0 } else { f64::from(FORETOLD) });
-        let inverse = (hessian + SMatrix::from_diagonal(&foretold)).cholesky()?.inverse();
+        let prior =
+            SVector::<f64, PARAMETERS>::from_fn(|i, _| if i < 2 { 0.0 } else { f64::from(MATRIX_WEIGHT) });
+        let inverse = (hessian + SMatrix::from_diagonal(&prior)).cholesky()?.inverse();
         let spread = place.symmetric_eigenvalues().max() as f32;
         if !(spread.is_finite() && spread > 0.0) {
             return None;
@@ -204,8 +204,8 @@ impl Template {
             }
             let astray = warp.apart(&guess)?;
             let pull = SVector::<f32, PARAMETERS>::from_fn(|i, _| {
-                let foretold = i.checked_sub(2).map_or(0.0, |i| FORETOLD * astray[i]);
-                dot(&self.steepest[i], &seen) / gain + foretold
+                let prior = i.checked_sub(2).map_or(0.0, |i| MATRIX_WEIGHT * astray[i]);
+                dot(&self.steepest[i], &seen) / gain + prior
             });
             let step = self.inverse * pull;
             warp = warp.less(&step)?;

@@ -86,10 +86,10 @@ impl FrameDetector {
         }
         self.occupied.clear();
         self.occupied.extend(prediction.iter().flat_map(|p| &p.occupied));
-        // A vehicle where it is foretold is covered by its own circle.
-        let foretold = prediction.map_or(&[][..], |p| &p.occupied);
+        // A vehicle where it is predicted is covered by its own circle.
+        let predicted = prediction.map_or(&[][..], |p| &p.occupied);
         let ours =
-            |m: &MarkerDetection| foretold.iter().any(|(at, radius)| (m.center_px - at).norm() < *radius);
+            |m: &MarkerDetection| predicted.iter().any(|(at, radius)| (m.center_px - at).norm() < *radius);
         let reach = &self.reach;
         let covered = |m: &MarkerDetection| {
             let sizes = if ours(m) { 1.0 } else { reach_of(reach, m.marker) };

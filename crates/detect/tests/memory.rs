@@ -115,7 +115,7 @@ fn full_frame(n: usize) -> (GrayImage, RgbImage) {
 }
 
 /// The prediction for everything in a frame.
-fn foretold(n: usize) -> FramePrediction {
+fn predicted(n: usize) -> FramePrediction {
     let tag = |id, u: usize, v: usize, cell: usize| MarkerPrediction {
         marker: MarkerId::Tag { family: TagFamily::Tag36h11, id },
         center_px: Vector2::new((u + 5 * cell) as f64, (v + 5 * cell) as f64),
@@ -140,7 +140,7 @@ fn foretold(n: usize) -> FramePrediction {
 #[test]
 fn whole_frames_with_discs_and_features_take_none_either() {
     let frames = [full_frame(0), full_frame(1), full_frame(2)];
-    let predictions = [foretold(0), foretold(1), foretold(2)];
+    let predictions = [predicted(0), predicted(1), predicted(2)];
     let mut detector = detector_of_all();
     let mut seen = FrameObservations::default();
     let mut pass = |detector: &mut FrameDetector| {

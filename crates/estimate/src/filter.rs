@@ -337,7 +337,7 @@ impl Estimator {
     fn tell_tilt(&mut self, out: &mut Vec<EstimatorOutput>) {
         let tilt = &self.core.state.tilt[0];
         let (Some(t), Some(felt)) = (tilt.decided, tilt.found()) else { return };
-        if self.decided.is_none_or(|told| t > told) {
+        if self.decided.is_none_or(|reported| t > reported) {
             self.decided = Some(t);
             out.push(EstimatorOutput::TiltFelt { felt, slope: tilt.slope() });
         }

@@ -174,7 +174,7 @@ impl State {
     }
 
     /// Factors on the reported variances of position, velocity and attitude: one where their sources fit.
-    pub(crate) fn told_factors(&self) -> [f64; 3] {
+    pub(crate) fn misfit_factors(&self) -> [f64; 3] {
         let of = |sources: &[FusionSource]| {
             let fits = WATCHED.iter().zip(&self.fits).filter(|(source, _)| sources.contains(source));
             fits.map(|(_, fit)| fit.inflation()).fold(1.0, f64::max)
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_and_bias_are_told_with_their_figures() {
+    fn noise_and_bias_are_reported_with_their_figures() {
         let noisy = fed(2.0, 0.0);
         let (cause, figure) = noisy.misfit(1.0).expect("twice the noise");
         assert!(cause == MisfitCause::Noise && (3.0..4.2).contains(&figure), "{figure}");

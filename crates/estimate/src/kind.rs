@@ -423,7 +423,7 @@ mod tests {
         let mut watch = TiltWatch::new(TiltKind::Auto);
         for k in 0..100 {
             let t = MonoTime::from_ns(1_000_000_000) + Span::from_s(0.2 * f64::from(k));
-            // Heard once a second only, and a velocity that leaps.
+            // Received once a second only, and a velocity that leaps.
             if k % 5 == 0 {
                 watch.reading(t, 0.0, &Vector3::z());
             }

@@ -94,8 +94,8 @@ impl State {
             blend(&mut l.tilt_rate_q, rate_q, gain, s.tilt_rate_q);
             blend(&mut l.gust_var, gust_var, gain, s.gust_var);
             blend(&mut l.thrust_var, squares[5], gain, s.thrust_var);
-            let told = self.senses.tilt_error_var;
-            let limits = (LEAST_TILT_ERROR_VAR.min(told), told);
+            let modelled = self.senses.tilt_error_var;
+            let limits = (LEAST_TILT_ERROR_VAR.min(modelled), modelled);
             let error_var = 0.5 * (squares[6] + squares[7]);
             blend_within(&mut l.tilt_error_var, error_var, gain, limits);
         }

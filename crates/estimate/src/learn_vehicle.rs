@@ -55,7 +55,7 @@ impl State {
         }
         let (value, var) = copy.filtered[i][k];
         let found = var - copy.cov.at(row, row);
-        if found < LEAST_TOLD * var {
+        if found < LEAST_FOUND * var {
             return;
         }
         let due = found * (1.0 + more_than_found(memory_s, age_s, frame_s));
@@ -140,7 +140,7 @@ const LAG: f64 = 2.0;
 /// Fewest memories over which it is fitted: values nearer to each other have the same information.
 const MEMORIES: f64 = 4.0;
 /// Least share of a variance that must have been found out since.
-const LEAST_TOLD: f64 = 0.2;
+const LEAST_FOUND: f64 = 0.2;
 /// By what share more than a smoother finds out an honest estimate of a memory of `memory_s` turns out to
 /// be off after `age_s`: nothing where motion is a walk. Where it is smooth the estimate trails, which no
 /// later noise takes part in: of a target whose acceleration lasts for a few memories
@@ -277,7 +277,7 @@ mod tests {
             let ((_, found), (_, ever)) = (filter.excess(frames(LAG)), filter.excess(frames(8.0)));
             println!("T {:.2} frames: {found:.3} of {ever:.3}", filter.memory());
             assert!(found > 0.93 * ever, "{found} of {ever}");
-            assert!(ever < 0.76 && found > LEAST_TOLD, "{found} of {ever}");
+            assert!(ever < 0.76 && found > LEAST_FOUND, "{found} of {ever}");
         }
     }
 }

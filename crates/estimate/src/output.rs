@@ -88,7 +88,7 @@ impl State {
         let blocks = [own::POSITION, own::VELOCITY, own::ATTITUDE];
         let column = |i: usize| blocks[i / 3].column(i % 3);
         // Where a source does not fit its configured accuracy, what it measures is less certain than in the model.
-        let grown = self.told_factors().map(f64::sqrt);
+        let grown = self.misfit_factors().map(f64::sqrt);
         let cov = |i, j| self.cov.at(column(i), column(j)) * grown[i / 3] * grown[j / 3];
         Ownship {
             t_valid: t,

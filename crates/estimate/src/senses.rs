@@ -33,11 +33,11 @@ impl Senses {
     }
 
     /// Takes variances of bias and noise from the quality of a fix, and from the errors the receiver states, if any:
-    /// `told_m`, one sigma. These replace what is configured, down to what a fix of its kind reaches.
+    /// `stated_m`, one sigma. These replace what is configured, down to what a fix of its kind reaches.
     pub(crate) fn of_fix(
         &mut self,
         fix: FixKind,
-        told_m: Option<Vector3<f64>>,
+        stated_m: Option<Vector3<f64>>,
         fitted: f64,
         models: &Models,
     ) {
@@ -49,7 +49,7 @@ impl Senses {
         let share = (bias_m.powi(2) / models.gps_bias_var.x).min(1.0);
         let usual = models.gps_bias_var * share;
         let reached = usual.map(|var| var.min(CODE_M.powi(2)));
-        let bias = told_m.map_or(usual, |told| told.component_mul(&told).sup(&reached));
+        let bias = stated_m.map_or(usual, |stated| stated.component_mul(&stated).sup(&reached));
         self.fix = fix;
         self.gps_bias_var = (bias * fitted).into();
         // What is noisier as a whole is noisier from fix to fix.
@@ -67,9 +67,9 @@ impl Senses {
         let fade = (-2.0 * (t - self.gps_bias_held_at).s().max(0.0) / tau_s).exp();
         self.gps_bias_held_at = t;
         std::array::from_fn(|i| {
-            let (told, held) = (self.gps_bias_var[i], &mut self.gps_bias_held_var[i]);
-            let before = told + (*held - told) * fade;
-            *held = before.max(told);
+            let (stated, held) = (self.gps_bias_var[i], &mut self.gps_bias_held_var[i]);
+            let before = stated + (*held - stated) * fade;
+            *held = before.max(stated);
             *held - before
         })
     }
@@ -78,10 +78,10 @@ impl Senses {
 impl Core {
     /// Appearance at the quality of a fix: where its kind changes, the receiver's error is another one; where it is said to be
     /// larger, it may have grown.
-    pub(crate) fn sense_fix(&mut self, fix: FixKind, told_m: Option<Vector3<f64>>) {
+    pub(crate) fn sense_fix(&mut self, fix: FixKind, stated_m: Option<Vector3<f64>>) {
         let (state, models) = (&mut self.state, &self.models);
         let (before, t) = (state.senses, state.t);
-        state.senses.of_fix(fix, told_m, state.learnt.receiver.factor(), models);
+        state.senses.of_fix(fix, stated_m, state.learnt.receiver.factor(), models);
         let bias_var = state.senses.gps_bias_var;
         if is_rtk(fix) != is_rtk(before.fix) && bias_var != before.gps_bias_var {
             state.senses.hold_bias(t);
@@ -112,8 +112,8 @@ impl State {
     /// Takes the slow errors' intensities from what the sensors are found to be.
     pub(crate) fn sense(&mut self) {
         self.senses.of_tilt(&self.tilt);
-        let (fitted, told) = (self.learnt.tilt_error_var, self.senses.tilt_error_var);
-        self.learnt.tilt_error_var = if self.is_blind() { told } else { fitted.min(told) };
+        let (fitted, modelled) = (self.learnt.tilt_error_var, self.senses.tilt_error_var);
+        self.learnt.tilt_error_var = if self.is_blind() { modelled } else { fitted.min(modelled) };
     }
 
     /// A tilt sensor feels something else than was thought: its errors start anew, and tilt too where nothing but the
@@ -145,8 +145,10 @@ impl State {
     /// Reads tilt off the sensor whose meaning is known best, anew.
     fn read_tilt(&mut self) {
         let undecided = |watch: &&TiltWatch| watch.felt == Felt::Undecided;
-        let heard = || self.tilt.iter().filter_map(|watch| Some((watch, watch.last_down()?)));
-        let Some((watch, down)) = heard().find(|(w, _)| !undecided(w)).or(heard().next()) else { return };
+        let readings = || self.tilt.iter().filter_map(|watch| Some((watch, watch.last_down()?)));
+        let Some((watch, down)) = readings().find(|(w, _)| !undecided(w)).or(readings().next()) else {
+            return;
+        };
         let ahead = self.own.rotation().column(0);
         let (attitude, var) = (watch.attitude(ahead.y.atan2(ahead.x), &down), watch.tilt_var());
         self.own.ned_from_body = attitude;

@@ -21,7 +21,7 @@ const OPENED: f64 = 30.0;
 const SHOWN_S: f64 = 3.0;
 const SHOWN: f64 = 1.5;
 /// Least share of the variance that a frame must have found out.
-const LEAST_TOLD: f64 = 0.3;
+const LEAST_FOUND: f64 = 0.3;
 
 /// Slip of one vehicle.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
@@ -110,7 +110,7 @@ impl State {
     /// Fits target `i`'s slip by what a frame has made of where it was; `since_s` is the time since it was seen before.
     pub(crate) fn learn_slip(&mut self, i: usize, before: &Across, since_s: f64) {
         let found = before.var - self.across_var(i, before);
-        if found < LEAST_TOLD * before.var {
+        if found < LEAST_FOUND * before.var {
             return;
         }
         let moved = before.moved(&self.across(i));

@@ -367,12 +367,12 @@ impl State {
             let place = (x.0.hypot(y.0), x.1.max(y.1));
             [size, place, turn]
         });
-        let told = |k: usize, (value, sigma): (f64, f64)| {
+        let significant = |k: usize, (value, sigma): (f64, f64)| {
             let beyond = value.abs() > LEAST_REPORTED[k].max(REPORTED_SIGMAS * sigma);
             (beyond && sigma < WELL_KNOWN[k]).then_some((k, value))
         };
         let all = three.into_iter().flatten().enumerate();
-        all.filter_map(move |(k, found)| told(k, found))
+        all.filter_map(move |(k, found)| significant(k, found))
     }
 }
 

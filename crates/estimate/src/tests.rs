@@ -86,7 +86,7 @@ struct Scene {
     /// Where the rover is: north, east; added to its heading.
     rover: [f64; 3],
     /// Stated accuracy of the receiver, position and velocity.
-    told: Option<(f64, f64)>,
+    stated: Option<(f64, f64)>,
 }
 
 impl Scene {
@@ -102,7 +102,7 @@ impl Scene {
             models: Models::new(&rig, &estimator, &site),
             step: 0,
             rover: [-2.0, -3.0, 0.0],
-            told: None,
+            stated: None,
         }
     }
 
@@ -159,8 +159,8 @@ impl Scene {
                     geoid_m: Some(0.0),
                     vel_ned_mps: Some(Vector3::zeros()),
                     vel_has_down: true,
-                    position_sigma_m: self.told.map(|(position_m, _)| Vector3::repeat(position_m)),
-                    velocity_sigma_mps: self.told.map(|(_, velocity_mps)| Vector3::repeat(velocity_mps)),
+                    position_sigma_m: self.stated.map(|(position_m, _)| Vector3::repeat(position_m)),
+                    velocity_sigma_mps: self.stated.map(|(_, velocity_mps)| Vector3::repeat(velocity_mps)),
                     ..GnssEpoch::default()
                 };
                 self.filter.gnss(&Stamped { t_valid: t, t_recv: t, seq: seq + 2, value }, &mut out);
@@ -267,15 +267,15 @@ fn a_vehicle_that_comes_back_elsewhere_is_placed_anew_and_never_lost() {
 #[test]
 fn what_the_receiver_says_of_its_errors_is_believed() {
     // Position and velocity of the helicopter, one sigma, after eight seconds of such a receiver.
-    let sigmas = |told: Option<(f64, f64)>| {
+    let sigmas = |stated: Option<(f64, f64)>| {
         let mut scene = Scene::new();
-        scene.told = told;
+        scene.stated = stated;
         let out = scene.hear(120);
         let last = out.iter().rev().find_map(|o| match o {
             EstimatorOutput::Ownship(ownship) => Some(*ownship),
             _ => None,
         });
-        let last = last.expect("it is told");
+        let last = last.expect("it is reported");
         (last.position_sigma_m(), last.velocity_sigma_mps().x)
     };
     let (usual, usual_velocity) = sigmas(None);

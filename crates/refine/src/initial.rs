@@ -51,13 +51,13 @@ pub(crate) fn filtered(
         ..InitialValues::default()
     };
     let (mut out, mut asked) = (Vec::new(), None);
-    for heard in recording.in_order() {
-        match heard {
+    for arrival in recording.in_order() {
+        match arrival {
             Measured::Epoch(epoch) => filter.gnss(epoch, &mut out),
             Measured::Reading(sample) => filter.attitude(sample, &mut out),
             Measured::Frame(frame) => filter.frame(frame, &mut out),
         }
-        let t = heard.t_recv();
+        let t = arrival.t_recv();
         filter.tick(t, &mut out);
         if asked.is_none_or(|asked| t - asked >= Span::from_s(STEP_S)) {
             asked = Some(t);

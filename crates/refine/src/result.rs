@@ -22,7 +22,7 @@ pub struct Constant {
 }
 
 /// A flight determines a constant where it reduces its sigma below this share of the prior's.
-const TOLD: f64 = 0.8;
+const DETERMINED: f64 = 0.8;
 
 /// A difference below this share of the prior's sigma is no reason to change a configuration.
 const MATTERS: f64 = 0.5;
@@ -30,7 +30,7 @@ const MATTERS: f64 = 0.5;
 impl Constant {
     /// Whether the flight determines it; otherwise it stays near its expected value.
     pub fn is_determined(&self) -> bool {
-        self.prior_sigma > 0.0 && self.sigma < TOLD * self.prior_sigma
+        self.prior_sigma > 0.0 && self.sigma < DETERMINED * self.prior_sigma
     }
 
     /// Whether the flight determines it to differ from its expected value, by more than three sigmas and by a relevant

@@ -59,7 +59,7 @@ pub struct ClosedFlight {
     late: Stream,
     /// Events in transit, by reception.
     coming: VecDeque<(MonoTime, EventBody)>,
-    compass_heard: MonoTime,
+    compass_received: MonoTime,
     flown: MonoTime,
     /// Frames that were exposed and are rendered elsewhere.
     exposed: Vec<FrameTruth>,
@@ -82,7 +82,7 @@ impl ClosedFlight {
             lateness,
             late: stream(Purpose::Lateness),
             coming: VecDeque::new(),
-            compass_heard: world.time(0.0),
+            compass_received: world.time(0.0),
             flown: world.time(0.0),
             exposed: Vec::new(),
             seq: 0,
@@ -147,8 +147,8 @@ impl ClosedFlight {
         while let Some((t, data)) = self.compass_line.pop() {
             // A line keeps its order, however late it is read.
             let late = Span::from_ms(self.late.uniform(0.0, self.lateness.compass_ms.max(1e-9)));
-            self.compass_heard = self.compass_heard.max(t + late);
-            self.put(self.compass_heard, EventBody::Bytes { source: Source::Compass, data });
+            self.compass_received = self.compass_received.max(t + late);
+            self.put(self.compass_received, EventBody::Bytes { source: Source::Compass, data });
         }
         while self.exposures.due_s(&world) + EXPOSED_BY_S <= now_s {
             let Some(truth) = self.exposures.next(&world) else { break };

@@ -281,8 +281,8 @@ fn mud(scenario: &mut Scenario, percent: f64) {
 }
 
 fn leave_distortion_out(scenario: &mut Scenario) {
-    let told = &mut scenario.rig.camera.intrinsics.distortion;
-    scenario.misfit.distortion = Some(std::mem::take(told));
+    let configured = &mut scenario.rig.camera.intrinsics.distortion;
+    scenario.misfit.distortion = Some(std::mem::take(configured));
 }
 
 #[cfg(test)]

@@ -78,7 +78,7 @@ impl Default for FollowerTuning {
 #[derive(Clone, Debug)]
 pub struct Follower {
     tuning: FollowerTuning,
-    told: Option<(FollowTarget, MonoTime)>,
+    latest: Option<(FollowTarget, MonoTime)>,
     /// Least arrival minus stamp.
     least: Option<Span>,
     /// Where it stays while there is no message.
@@ -90,7 +90,7 @@ pub struct Follower {
 impl Follower {
     /// A follower without a message yet.
     pub fn new(tuning: FollowerTuning) -> Self {
-        Self { tuning, told: None, least: None, hold: None, wanted: Vector3::zeros(), last: None }
+        Self { tuning, latest: None, least: None, hold: None, wanted: Vector3::zeros(), last: None }
     }
 
     /// Takes a message that was received at `t`.
@@ -104,7 +104,7 @@ impl Follower {
             _ => apart,
         };
         self.least = Some(least);
-        self.told = Some((*target, MonoTime::default() + target.stamp + least));
+        self.latest = Some((*target, MonoTime::default() + target.stamp + least));
     }
 
     /// The demanded acceleration at `now`, at `position_m` with `velocity_mps`; north, east, down.
@@ -117,16 +117,17 @@ impl Follower {
         let limits = self.tuning;
         let dt = self.last.map_or(0.0, |last| (now - last).s());
         self.last = Some(now);
-        let heard = self.told.filter(|(_, t)| now - *t <= limits.timeout);
-        let (place, velocity, acceleration) = match heard {
-            Some((told, t)) => {
+        let fresh = self.latest.filter(|(_, t)| now - *t <= limits.timeout);
+        let (place, velocity, acceleration) = match fresh {
+            Some((target, t)) => {
                 self.hold = None;
                 let age = (now - t).s();
                 let above = Vector3::z() * limits.height_m;
-                let v = told.velocity_mps + told.acceleration_mps2 * age;
-                let p =
-                    told.position_m + told.velocity_mps * age + told.acceleration_mps2 * (0.5 * age * age);
-                (p - above, v, told.acceleration_mps2)
+                let v = target.velocity_mps + target.acceleration_mps2 * age;
+                let p = target.position_m
+                    + target.velocity_mps * age
+                    + target.acceleration_mps2 * (0.5 * age * age);
+                (p - above, v, target.acceleration_mps2)
             }
             None => {
                 let stop = position_m + velocity_mps * 1.0;
@@ -163,13 +164,13 @@ mod tests {
             let now = MonoTime::default() + Span::from_s(100.0 + t);
             if k % 20 == 0 && t < silent_from {
                 // Received 50 ms late, from another clock.
-                let told = FollowTarget {
+                let target = FollowTarget {
                     stamp: Span::from_s(7.0 + t),
                     position_m: at(t),
                     velocity_mps: Vector3::new(1.5, 0.0, 0.0),
                     acceleration_mps2: Vector3::zeros(),
                 };
-                follower.hear(&told, now);
+                follower.hear(&target, now);
             }
             let a = follower.command(now, &p, &v);
             v += a * 0.005;
@@ -185,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn told_nothing_it_stops() {
+    fn without_messages_it_stops() {
         let (_, v) = flown(20.0, 10.0);
         assert!(v.norm() < 0.02, "{v}");
     }

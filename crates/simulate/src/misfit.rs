@@ -85,8 +85,8 @@ impl Default for GroundMisfit {
 
 impl Misfit {
     /// The true instruments and targets, where the pipeline gets these.
-    pub fn flown(&self, told: &Rig) -> Rig {
-        let mut rig = told.clone();
+    pub fn flown(&self, configured: &Rig) -> Rig {
+        let mut rig = configured.clone();
         let lens = &mut rig.camera.intrinsics;
         (lens.fx, lens.fy) = (lens.fx * (1.0 + self.focal), lens.fy * (1.0 + self.focal));
         lens.distortion = self.distortion.unwrap_or(lens.distortion);
@@ -130,7 +130,7 @@ fn turned(top: ImageTop, turns: usize) -> ImageTop {
 
 impl Scenario {
     /// Height of the ground as configured, metres down from the truth; `None` where it is to be found.
-    pub fn told_ground_down_m(&self) -> Option<f64> {
+    pub fn configured_ground_down_m(&self) -> Option<f64> {
         match self.misfit.ground {
             GroundMisfit::Lower(by_m) => Some(-by_m),
             GroundMisfit::Takeoff => None,
@@ -139,10 +139,10 @@ impl Scenario {
 
     /// The ground's section of a configuration: level, at the height of the origin, unless the misfit changes it.
     pub fn ground(&self) -> GroundConfig {
-        let told = |elevation_msl_m, source| GroundConfig { elevation_msl_m, source, terrain: None };
+        let section = |elevation_msl_m, source| GroundConfig { elevation_msl_m, source, terrain: None };
         match self.misfit.ground {
-            GroundMisfit::Lower(by_m) => told(Some(self.origin.height_m - self.geoid_m + by_m), None),
-            GroundMisfit::Takeoff => told(None, Some(GroundSource::Takeoff)),
+            GroundMisfit::Lower(by_m) => section(Some(self.origin.height_m - self.geoid_m + by_m), None),
+            GroundMisfit::Takeoff => section(None, Some(GroundSource::Takeoff)),
         }
     }
 }

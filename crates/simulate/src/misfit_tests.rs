@@ -38,7 +38,7 @@ fn mean_and_rms(values: &[f64]) -> (f64, f64) {
 }
 
 /// All events, as text.
-fn heard(world: &Arc<World>) -> Vec<String> {
+fn received(world: &Arc<World>) -> Vec<String> {
     let mut suite = SensorSuite::new(Arc::clone(world));
     let mut all = Vec::new();
     while let Some(sample) = suite.next() {
@@ -73,7 +73,7 @@ fn tilts(with: &[(&str, f64)], seed: u64) -> Vec<[f64; 2]> {
 
 #[test]
 fn a_figure_of_nothing_leaves_the_flight_as_it_was_to_the_bit() {
-    let nominal = heard(&flown(&[], 4));
+    let nominal = received(&flown(&[], 4));
     let mut nothing = scenario("follow", &[]);
     for d in Deviation::all().iter().filter(|d| d.limits.0 <= 0.0) {
         let keeps = matches!(
@@ -97,7 +97,7 @@ fn a_figure_of_nothing_leaves_the_flight_as_it_was_to_the_bit() {
         }
     }
     nothing.camera.hidden.clear();
-    assert!(heard(&Arc::new(World::new(nothing, 4))) == nominal);
+    assert!(received(&Arc::new(World::new(nothing, 4))) == nominal);
 }
 
 #[test]
@@ -125,8 +125,8 @@ fn markers_differ_from_the_configuration_by_what_is_said() {
 }
 
 #[test]
-fn ground_is_told_wrongly_or_not_at_all() {
-    let right = scenario("follow", &[]).ground().elevation_msl_m.expect("told");
+fn ground_is_configured_wrongly_or_not_at_all() {
+    let right = scenario("follow", &[]).ground().elevation_msl_m.expect("configured");
     assert_eq!(scenario("follow", &[("ground-lower", 10.0)]).ground().elevation_msl_m, Some(right + 10.0));
     let takeoff = scenario("follow", &[("takeoff-in-air", 1.0)]).ground();
     assert_eq!((takeoff.elevation_msl_m, takeoff.source), (None, Some(GroundSource::Takeoff)));
@@ -218,7 +218,7 @@ fn stamps_jitter_and_are_late() {
 }
 
 #[test]
-fn a_rolling_shutter_is_drawn_as_it_is_told() {
+fn a_rolling_shutter_is_drawn_as_configured() {
     let with = [("readout", 40.0), ("speed", 4.0)];
     let (world, still) = (flown(&with, 8), flown(&with[1..], 8));
     let family = world.rig().target[0].marker[0].family.expect("a tag");
@@ -400,6 +400,6 @@ fn lens_mount_and_vibration_move_the_picture() {
             assert!((least..=most).contains(&moved), "{with:?}: {moved} px");
         }
     }
-    let told = scenario("follow", &[("no-distortion", 1.0)]);
-    assert_eq!(told.rig.camera.intrinsics.distortion, [0.0; 5]);
+    let configured = scenario("follow", &[("no-distortion", 1.0)]);
+    assert_eq!(configured.rig.camera.intrinsics.distortion, [0.0; 5]);
 }

@@ -168,19 +168,19 @@ impl SensorSuite {
         self.compass.0.bias_rad()
     }
 
-    fn gnss_sample(&mut self, heard: &GnssSample, t_recv: MonoTime) -> Sample {
+    fn gnss_sample(&mut self, sample: &GnssSample, t_recv: MonoTime) -> Sample {
         self.gnss.1 = self.gnss.0.next(&self.world);
         let scenario = self.world.scenario();
-        let t_valid = heard.t_true + self.gnss.0.latency_error(scenario) + self.gnss.0.stamp_noise(scenario);
-        let stamped = Stamped { t_valid, t_recv, seq: self.seq, value: heard.epoch };
-        Sample::Gnss { t_true: heard.t_true, stamped }
+        let t_valid = sample.t_true + self.gnss.0.latency_error(scenario) + self.gnss.0.stamp_noise(scenario);
+        let stamped = Stamped { t_valid, t_recv, seq: self.seq, value: sample.epoch };
+        Sample::Gnss { t_true: sample.t_true, stamped }
     }
 
-    fn compass_sample(&mut self, heard: &CompassSample, t_recv: MonoTime) -> Sample {
+    fn compass_sample(&mut self, sample: &CompassSample, t_recv: MonoTime) -> Sample {
         self.compass.1 = self.compass.0.next(&self.world);
-        let t_valid = heard.t_first_byte - Span::from_ms(self.world.scenario().rig.compass.latency_ms);
-        let stamped = Stamped { t_valid, t_recv, seq: self.seq, value: heard.sample };
-        Sample::Attitude { t_true: heard.t_true, stamped }
+        let t_valid = sample.t_first_byte - Span::from_ms(self.world.scenario().rig.compass.latency_ms);
+        let stamped = Stamped { t_valid, t_recv, seq: self.seq, value: sample.sample };
+        Sample::Attitude { t_true: sample.t_true, stamped }
     }
 
     fn frame_sample(&mut self, truth: &FrameTruth) -> Sample {
@@ -332,15 +332,15 @@ impl Iterator for SensorSuite {
         let rig = &self.world.scenario().rig;
         let line = |bytes: f64, baud: u32| Span::from_s(bytes * 10.0 / f64::from(baud));
         let (gnss, compass, frame) = (self.gnss.1, self.compass.1, self.exposures.1);
-        let heard = [
+        let arrivals = [
             gnss.map(|s| s.t_first_byte + line(WIRE_BYTES.0, rig.gps.baud)),
             compass.map(|s| s.t_first_byte + line(WIRE_BYTES.1, rig.compass.baud)),
             frame.map(|f| f.t_recv),
         ];
-        let t_recv = heard.iter().flatten().min().copied()?;
+        let t_recv = arrivals.iter().flatten().min().copied()?;
         let sample = match (gnss, compass, frame) {
-            (Some(sample), _, _) if heard[0] == Some(t_recv) => self.gnss_sample(&sample, t_recv),
-            (_, Some(sample), _) if heard[1] == Some(t_recv) => self.compass_sample(&sample, t_recv),
+            (Some(sample), _, _) if arrivals[0] == Some(t_recv) => self.gnss_sample(&sample, t_recv),
+            (_, Some(sample), _) if arrivals[1] == Some(t_recv) => self.compass_sample(&sample, t_recv),
             (_, _, Some(truth)) => self.frame_sample(&truth),
             _ => return None,
         };

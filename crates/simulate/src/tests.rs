@@ -98,7 +98,7 @@ fn markers_are_in_view_where_the_scenario_wants_them() {
 
 #[test]
 fn samples_arrive_in_order_and_repeat() {
-    let heard = |seed| -> Vec<(i64, String)> {
+    let arrivals = |seed| -> Vec<(i64, String)> {
         let mut suite = SensorSuite::new(world("noisy", seed));
         let mut all = Vec::new();
         while let Some(sample) = suite.next() {
@@ -106,10 +106,10 @@ fn samples_arrive_in_order_and_repeat() {
         }
         all
     };
-    let first = heard(11);
+    let first = arrivals(11);
     assert!(first.windows(2).all(|pair| pair[0].0 <= pair[1].0), "out of order");
-    assert!(first == heard(11), "the same seed gave another flight");
-    assert!(first != heard(12));
+    assert!(first == arrivals(11), "the same seed gave another flight");
+    assert!(first != arrivals(12));
     // 5 fixes, 30 readings and 15 frames a second for a minute, less what the scenario loses.
     assert!((2_800..3_000).contains(&first.len()), "{}", first.len());
 }

@@ -22,7 +22,7 @@ class Frame:
 
     number: int
     time_ns: int
-    heard_ns: int
+    received_ns: int
     encoding: str
     width: int
     height: int
@@ -81,11 +81,11 @@ class Flight:
     def datum(self):
         """Origin of the NED frame: latitude and longitude in degrees, height above the ellipsoid; `None` where none was
         settled. One that moved holds."""
-        told = self._messages.get("/datum")
-        return (told[-1][1].lat_deg, told[-1][1].lon_deg, told[-1][1].height_m) if told else None
+        messages = self._messages.get("/datum")
+        return (messages[-1][1].lat_deg, messages[-1][1].lon_deg, messages[-1][1].height_m) if messages else None
 
     def utc(self, time_ns):
-        """UTC of an instant of the flight; `None` where the receiver never told the date with a fix."""
+        """UTC of an instant of the flight; `None` where the receiver never reported the date with a fix."""
         ahead = [m.utc_minus_host_ns for _, m in self._messages.get("/health", []) if m.HasField("utc_minus_host_ns")]
         if not ahead:
             return None

@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn utc_is_said_where_the_receiver_told_it_and_nowhere_else() {
+    fn utc_is_sent_where_the_receiver_reported_it_and_nowhere_else() {
         let unset = Vehicle { utc: None, ..vehicle() };
         assert!(nmea(&unset).starts_with("$GPRMC,,A,3100.000000,N,08530.000000,W,3.89,270.0,,,,A*"));
         let parsed: Value = serde_json::from_str(&geojson(&[unset])).expect("JSON");

@@ -267,18 +267,18 @@ impl Client {
             let channels = scope.channels();
             channels.all.iter().zip(1..).map(|(channel, id)| channel.advertised(id)).collect()
         };
-        let mut told = all.len() as u64;
+        let mut advertised = all.len() as u64;
         self.tell(&json!({"op": "advertise", "channels": all})).await?;
         loop {
             tokio::select! {
                 message = news.recv() => match message {
-                    Ok(News::Channel(id)) if id > told => {
-                        told = self.advertise(scope, told).await?;
+                    Ok(News::Channel(id)) if id > advertised => {
+                        advertised = self.advertise(scope, advertised).await?;
                     }
                     Ok(News::Channel(_)) => {}
                     Ok(News::Message(said)) => self.send(&said).await?,
                     // The client missed some messages; channels must not be among them.
-                    Err(broadcast::error::RecvError::Lagged(_)) => told = self.advertise(scope, told).await?,
+                    Err(broadcast::error::RecvError::Lagged(_)) => advertised = self.advertise(scope, advertised).await?,
                     Err(broadcast::error::RecvError::Closed) => return Ok(()),
                 },
                 said = self.socket.recv() => match said {
@@ -290,15 +290,15 @@ impl Client {
         }
     }
 
-    /// Advertises channels after number `told`; returns the last.
-    async fn advertise(&mut self, scope: &Scope, told: u64) -> Result<u64, axum::Error> {
+    /// Advertises channels after number `advertised`; returns the last.
+    async fn advertise(&mut self, scope: &Scope, advertised: u64) -> Result<u64, axum::Error> {
         let fresh: Vec<_> = {
             let channels = scope.channels();
-            let numbered = channels.all.iter().zip(1..).skip(told as usize);
+            let numbered = channels.all.iter().zip(1..).skip(advertised as usize);
             numbered.map(|(channel, id)| channel.advertised(id)).collect()
         };
-        let last = told + fresh.len() as u64;
-        if last > told {
+        let last = advertised + fresh.len() as u64;
+        if last > advertised {
             self.tell(&json!({"op": "advertise", "channels": fresh})).await?;
         }
         Ok(last)

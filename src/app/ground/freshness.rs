@@ -32,14 +32,14 @@ pub(super) struct PayloadClock {
 
 impl PayloadClock {
     /// Something of this host time was received at `came`.
-    pub(super) fn heard(&mut self, t: MonoTime, came: Instant) {
+    pub(super) fn received(&mut self, t: MonoTime, came: Instant) {
         if self.newest.is_none_or(|(newest, _)| t > newest) {
             self.newest = Some((t, came));
         }
     }
 
     /// The payload reported UTC.
-    pub(super) fn told_utc(&mut self, utc_minus_host: Span) {
+    pub(super) fn reported_utc(&mut self, utc_minus_host: Span) {
         self.utc_minus_host = Some(utc_minus_host);
     }
 
@@ -87,12 +87,12 @@ mod tests {
         let mut clock = PayloadClock::default();
         let came = Instant::now();
         assert_eq!((clock.at(came), clock.utc(at(1.0))), (None, None));
-        clock.heard(at(100.0), came);
-        clock.heard(at(90.0), came + Duration::from_secs(1));
+        clock.received(at(100.0), came);
+        clock.received(at(90.0), came + Duration::from_secs(1));
         let now = came + Duration::from_secs(5);
         assert!((clock.age(at(99.0), now) - Span::from_s(6.0)).abs() < Span::from_ms(1.0));
         assert_eq!(clock.age(at(200.0), now), Span::ZERO);
-        clock.told_utc(Span::from_s(1_000_000.0));
+        clock.reported_utc(Span::from_s(1_000_000.0));
         assert_eq!(clock.utc(at(1.0)).map(UtcTime::unix_ns), Some(1_000_001_000_000_000));
     }
 }

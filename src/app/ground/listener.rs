@@ -213,12 +213,12 @@ mod tests {
         let mut late = TcpStream::connect(address).await.expect("connected");
         let (mut visitor, _) = listener.next().await;
         late.write_all(b"question").await.expect("written");
-        let mut heard = [0; 8];
-        visitor.read_exact(&mut heard).await.expect("asked");
-        let left = inside[1].read(&mut heard).await.expect_err("the place is given away");
+        let mut received = [0; 8];
+        visitor.read_exact(&mut received).await.expect("asked");
+        let left = inside[1].read(&mut received).await.expect_err("the place is given away");
         assert_eq!(left.kind(), io::ErrorKind::ConnectionAborted);
         silent[0].write_all(b"more").await.expect("written");
-        assert_eq!(inside[0].read(&mut heard).await.expect("still inside"), 4);
+        assert_eq!(inside[0].read(&mut received).await.expect("still inside"), 4);
         // When clients leave, then their places are free.
         inside.clear();
         drop(visitor);

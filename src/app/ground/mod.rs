@@ -7,6 +7,7 @@
 //!                                 └─► one line a second per payload
 //! ```
 
+mod browser;
 mod cot;
 mod listener;
 mod feeds;
@@ -59,6 +60,8 @@ pub struct GroundSettings {
     pub out: PathBuf,
     /// Where the web page is served.
     pub web: Option<SocketAddr>,
+    /// Whether the page is opened in the desktop's browser.
+    pub open: bool,
     /// The token that visitors of the page, and Foxglove, must send; a random one where a port of theirs is not on
     /// loopback and none is given.
     pub token: Option<String>,
@@ -172,36 +175,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     let view = Arc::new(Mutex::new(View::default()));
     let live = broadcast::Sender::new(PAGE_QUEUE);
     let mut tasks = tokio::task::JoinSet::new();
-    let tokens = Tokens::of(&settings)?;
-    if let Some(address) = settings.web {
-        let listener = listen(address).await?;
-        terminal.line(format_args!("page at http://{}/{}", listener.local_addr()?, tokens.asked(address)));
-        let (tiles, position) = (settings.tiles.clone(), settings.position);
-        let web =
-            Web { view: Arc::clone(&view), live: live.clone(), tiles, position, token: tokens.at(address) };
-        tasks.spawn(web::serve(listener, web));
-    }
-    let scope = settings.foxglove.map(|_| Scope::default());
-    if let (Some(address), Some(scope)) = (settings.foxglove, scope.clone()) {
-        let listener = listen(address).await?;
-        terminal.line(format_args!("Foxglove at ws://{}/{}", listener.local_addr()?, tokens.asked(address)));
-        let token = tokens.at(address);
-        tasks.spawn(foxglove::serve(listener, foxglove::Server { scope, token }));
-    }
-    if let Some(address) = settings.nmea {
-        let listener = listen(address).await?;
-        terminal.line(format_args!("NMEA at tcp://{}", listener.local_addr()?));
-        tasks.spawn(nmea_port::serve(ClientListener::new(listener, "nmea"), Arc::clone(&view)));
-    }
-    if !settings.cot.is_empty() {
-        let over_tls = settings.cot.iter().any(|to| matches!(to, CotTo::Tls(_)));
-        let tls =
-            over_tls.then(|| cot::connector(&settings.cot_keys)).transpose().map_err(GroundError::Cot)?;
-        for to in &settings.cot {
-            terminal.line(format_args!("Cursor on Target to {to}"));
-        }
-        tasks.spawn(cot::serve(settings.cot.clone(), tls, Arc::clone(&view)));
-    }
+    let scope = serve(&settings, &view, &live, terminal, &mut tasks).await?;
     let (to_disk, from_link) = std::sync::mpsc::sync_channel(DISK_QUEUE);
     let disk_handle = handle.clone();
     let disk = std::thread::Builder::new()
@@ -234,6 +208,52 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     let _ = tokio::time::timeout(Duration::from_secs(5), taken).await;
     let _ = tokio::task::spawn_blocking(move || disk.join()).await;
     Ok(())
+}
+
+/// Starts everything that the station serves and sends; returns Foxglove's channels, where they are served.
+async fn serve(
+    settings: &GroundSettings,
+    view: &Arc<Mutex<View>>,
+    live: &broadcast::Sender<Arc<str>>,
+    terminal: &Terminal,
+    tasks: &mut tokio::task::JoinSet<std::io::Result<()>>,
+) -> Result<Option<Scope>, GroundError> {
+    let tokens = Tokens::of(settings)?;
+    if let Some(address) = settings.web {
+        let listener = listen(address).await?;
+        let (bound, asked) = (listener.local_addr()?, tokens.asked(address));
+        terminal.line(format_args!("page at http://{bound}/{asked}"));
+        if settings.open {
+            let url = format!("http://{}/{asked}", browser::reachable(bound));
+            tasks.spawn(browser::open(url, terminal.clone()));
+        }
+        let (tiles, position) = (settings.tiles.clone(), settings.position);
+        let web =
+            Web { view: Arc::clone(view), live: live.clone(), tiles, position, token: tokens.at(address) };
+        tasks.spawn(web::serve(listener, web));
+    }
+    let scope = settings.foxglove.map(|_| Scope::default());
+    if let (Some(address), Some(scope)) = (settings.foxglove, scope.clone()) {
+        let listener = listen(address).await?;
+        terminal.line(format_args!("Foxglove at ws://{}/{}", listener.local_addr()?, tokens.asked(address)));
+        let token = tokens.at(address);
+        tasks.spawn(foxglove::serve(listener, foxglove::Server { scope, token }));
+    }
+    if let Some(address) = settings.nmea {
+        let listener = listen(address).await?;
+        terminal.line(format_args!("NMEA at tcp://{}", listener.local_addr()?));
+        tasks.spawn(nmea_port::serve(ClientListener::new(listener, "nmea"), Arc::clone(view)));
+    }
+    if !settings.cot.is_empty() {
+        let over_tls = settings.cot.iter().any(|to| matches!(to, CotTo::Tls(_)));
+        let tls =
+            over_tls.then(|| cot::connector(&settings.cot_keys)).transpose().map_err(GroundError::Cot)?;
+        for to in &settings.cot {
+            terminal.line(format_args!("Cursor on Target to {to}"));
+        }
+        tasks.spawn(cot::serve(settings.cot.clone(), tls, Arc::clone(view)));
+    }
+    Ok(scope)
 }
 
 /// Where records go.

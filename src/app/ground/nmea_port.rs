@@ -36,7 +36,7 @@ pub(super) async fn serve(mut listener: ClientListener, view: Arc<Mutex<View>>) 
 }
 
 async fn produce(sentences: &broadcast::Sender<Arc<str>>, view: &Mutex<View>) {
-    let mut told = BTreeMap::new();
+    let mut sent = BTreeMap::new();
     loop {
         tokio::time::sleep(EVERY).await;
         for vehicle in lock(view).vehicles(Instant::now()) {
@@ -44,7 +44,7 @@ async fn produce(sentences: &broadcast::Sender<Arc<str>>, view: &Mutex<View>) {
             // A lost vehicle is due again when its age in whole seconds changes.
             let lost = (!vehicle.is_current()).then(|| vehicle.age.s() as u64);
             let now = (vehicle.state.timestamp, lost);
-            if told.insert(key, now) != Some(now) {
+            if sent.insert(key, now) != Some(now) {
                 // There may be no receiver.
                 let _ = sentences.send(feeds::nmea(&vehicle).into());
             }

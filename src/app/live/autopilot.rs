@@ -190,20 +190,20 @@ pub fn follow_target(
 ) -> Option<FollowTarget> {
     let mut frames = Vec::new();
     MavlinkFrames::default().push(bytes, &mut frames);
-    frames.iter().filter(|heard| heard.system == system).find_map(|heard| {
-        let MavMessage::FOLLOW_TARGET(told) = &heard.message else { return None };
+    frames.iter().filter(|sent| sent.system == system).find_map(|sent| {
+        let MavMessage::FOLLOW_TARGET(target) = &sent.message else { return None };
         let place = windhover_base::geo::Geodetic {
-            lat_deg: f64::from(told.lat) * 1e-7,
-            lon_deg: f64::from(told.lon) * 1e-7,
+            lat_deg: f64::from(target.lat) * 1e-7,
+            lon_deg: f64::from(target.lon) * 1e-7,
             height_m: frame.datum().height_m,
         };
         let level = frame.ned(place);
         let vector = |v: [f32; 3]| Vector3::from(v).map(f64::from);
         Some(FollowTarget {
-            stamp: Span::from_ns(i64::try_from(told.timestamp).ok()?.checked_mul(1_000_000)?),
-            position_m: Vector3::new(level.x, level.y, origin_msl_m - f64::from(told.alt)),
-            velocity_mps: vector(told.vel),
-            acceleration_mps2: vector(told.acc),
+            stamp: Span::from_ns(i64::try_from(target.timestamp).ok()?.checked_mul(1_000_000)?),
+            position_m: Vector3::new(level.x, level.y, origin_msl_m - f64::from(target.alt)),
+            velocity_mps: vector(target.vel),
+            acceleration_mps2: vector(target.acc),
         })
     })
 }

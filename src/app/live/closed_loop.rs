@@ -49,7 +49,7 @@ pub struct Moment {
     /// The vehicle.
     pub vehicle: VehicleTruth,
     /// The message that the follower received in this step, if any, north, east, down of the world's origin.
-    pub told: Option<FollowTarget>,
+    pub received: Option<FollowTarget>,
 }
 
 /// A flight whose helicopter follows the estimates of the vehicle.
@@ -62,7 +62,7 @@ pub struct ClosedLoop {
     another: Option<SimulatedAutopilot>,
     follower: Follower,
     settings: LoopSettings,
-    heard: bool,
+    has_autopilot: bool,
     system_id: u8,
     next_tell: MonoTime,
     next_second: MonoTime,
@@ -105,7 +105,7 @@ impl ClosedLoop {
             another: settings.another_m.map(|away_m| SimulatedAutopilot::new(AUTOPILOT_SYSTEM + 1, away_m)),
             follower: Follower::new(tuning),
             settings,
-            heard: config.autopilot.is_some(),
+            has_autopilot: config.autopilot.is_some(),
             system_id: config.mavlink.system_id,
             next_tell: begin,
             next_second: begin,
@@ -130,15 +130,15 @@ impl ClosedLoop {
         self.flight.step(&mut events)?;
         let t = self.flight.now();
         self.hear_autopilot(&world, t, &mut events);
-        let told = match self.settings.truth {
+        let received = match self.settings.truth {
             true => self.tell_truth(&world, t),
             false => self.tell(&world, t, &mut events),
         };
-        if let Some(told) = &told {
-            self.follower.hear(told, t);
+        if let Some(received) = &received {
+            self.follower.hear(received, t);
         }
         let t_s = world.seconds(t);
-        Ok(Moment { t_s, own: world.ownship(t), vehicle: world.vehicle(0, t), told })
+        Ok(Moment { t_s, own: world.ownship(t), vehicle: world.vehicle(0, t), received })
     }
 
     /// Merges the autopilot's messages into the events, at their arrival.
@@ -156,14 +156,14 @@ impl ClosedLoop {
             asked.iter().for_each(|frame| MavlinkFrames::default().push(frame, &mut frames));
             frames.iter().for_each(|frame| self.autopilot.hears(world, frame, t + LINK, &mut bytes));
         }
-        if self.heard && !bytes.is_empty() {
+        if self.has_autopilot && !bytes.is_empty() {
             self.coming.push((t + LINK + LINK, bytes));
         }
         for (at, data) in self.coming.extract_if(.., |(at, _)| *at <= t).collect::<Vec<_>>() {
             let mut frames = Vec::new();
             MavlinkFrames::default().push(&data, &mut frames);
             for frame in &frames {
-                self.companion.heard(frame, at, &mut Vec::new());
+                self.companion.receive(frame, at, &mut Vec::new());
             }
             events.push(Event {
                 t_recv: at,

@@ -4,6 +4,7 @@
 use std::net::UdpSocket;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use nalgebra::Vector3;
@@ -24,6 +25,8 @@ use windhover_simulate::{ClosedFlight, FlightError, Follower, FollowerTuning, Sc
 const NAP: Duration = Duration::from_millis(2);
 /// Period of the progress messages.
 const SAID_EVERY_S: f64 = 5.0;
+/// Time after which the filter has settled: the score begins then, in a short flight at its half.
+const SETTLED_S: f64 = 15.0;
 
 /// Why a live simulation ended early.
 #[derive(Debug, thiserror::Error)]
@@ -95,7 +98,7 @@ pub struct LiveFlight {
     gps: PtyLine,
     compass: PtyLine,
     to_daemon: PtyLine,
-    heard: MavlinkFrames,
+    from_daemon: MavlinkFrames,
     camera: FrameRenderer,
     system_id: u8,
     moments: Vec<Moment>,
@@ -144,18 +147,18 @@ impl LiveFlight {
             gps,
             compass,
             to_daemon,
-            heard: MavlinkFrames::default(),
+            from_daemon: MavlinkFrames::default(),
             camera,
             system_id,
             moments: Vec::new(),
         })
     }
 
-    /// Flies for the scenario's length, with progress messages to `say`.
-    pub fn run(mut self, mut say: impl FnMut(String)) -> Result<Score, LiveError> {
+    /// Flies for the scenario's length or until `stop` is set, with progress messages to `say`.
+    pub fn run(mut self, stop: &AtomicBool, mut say: impl FnMut(String)) -> Result<Score, LiveError> {
         let end = self.world.time(self.world.scenario().duration_s);
         let mut next_s = SAID_EVERY_S;
-        while self.flight.now() < end {
+        while self.flight.now() < end && !stop.load(Ordering::Relaxed) {
             while self.flight.now() + World::STEP <= self.clock.now() && self.flight.now() < end {
                 self.step()?;
             }
@@ -166,18 +169,19 @@ impl LiveFlight {
             }
             std::thread::sleep(NAP);
         }
-        Ok(Score::of(&self.moments, self.world.scenario().duration_s.min(15.0)))
+        let flown_s = self.world.seconds(self.flight.now());
+        Ok(Score::of(&self.moments, SETTLED_S.min(0.5 * flown_s)))
     }
 
     fn words(&self, now_s: f64) -> String {
         let Some(last) = self.moments.last() else { return String::new() };
         let away = (last.own.position_ned_m - last.vehicle.origin()).xy().norm();
         let recent = self.moments.iter().rev().take(1_000);
-        let told = recent.filter(|moment| moment.told.is_some()).count();
+        let messages = recent.filter(|moment| moment.received.is_some()).count();
         let behind_ms = (self.clock.now() - self.flight.now()).ms();
         let v = last.vehicle.speed_mps;
         format!(
-            "{now_s:.0} s: {away:.2} m from the vehicle, which drives {v:.2} m/s; {told} messages received in 5 s; simulation {behind_ms:.0} ms behind"
+            "{now_s:.0} s: {away:.2} m from the vehicle, which drives {v:.2} m/s; {messages} messages received in 5 s; simulation {behind_ms:.0} ms behind"
         )
     }
 
@@ -203,13 +207,13 @@ impl LiveFlight {
         let mut said = Vec::new();
         let now = self.flight.now();
         self.autopilot.says(&self.world, now, &mut said);
-        let told = self.hear(now, &mut said);
+        let received = self.hear(now, &mut said);
         self.to_daemon.send(&said);
         events.iter().for_each(|event| self.deliver(event));
         self.flight.exposed().into_iter().for_each(|frame| self.camera.draw(frame));
         let t_s = self.world.seconds(now);
         let (own, vehicle) = (self.world.ownship(now), self.world.vehicle(0, now));
-        self.moments.push(Moment { t_s, own, vehicle, told });
+        self.moments.push(Moment { t_s, own, vehicle, received });
         Ok(())
     }
 
@@ -224,19 +228,19 @@ impl LiveFlight {
     /// Handles the daemon's messages to the autopilot: time requests are answered, the vehicle is followed.
     fn hear(&mut self, now: MonoTime, said: &mut Vec<u8>) -> Option<windhover_simulate::FollowTarget> {
         let mut frames = Vec::new();
-        self.heard.push(&self.to_daemon.receive(), &mut frames);
+        self.from_daemon.push(&self.to_daemon.receive(), &mut frames);
         let scenario = self.world.scenario();
         let origin_msl_m = scenario.origin.height_m - scenario.geoid_m;
-        let mut told = None;
+        let mut received = None;
         for frame in &frames {
             self.autopilot.hears(&self.world, frame, self.clock.now(), said);
             let target = follow_target(&frame.bytes, self.system_id, self.world.frame(), origin_msl_m);
-            told = target.or(told);
+            received = target.or(received);
         }
-        if let (Some(told), Flown::Follower(follower)) = (&told, &mut self.flown) {
-            follower.hear(told, now);
+        if let (Some(received), Flown::Follower(follower)) = (&received, &mut self.flown) {
+            follower.hear(received, now);
         }
-        told
+        received
     }
 }
 

@@ -28,7 +28,7 @@ pub struct Score {
     /// Highest speed of the helicopter, m/s.
     pub speed_max_mps: f64,
     /// Number of messages.
-    pub told: usize,
+    pub messages: usize,
 }
 
 impl Score {
@@ -45,19 +45,19 @@ impl Score {
             .iter()
             .filter_map(|m| {
                 let (s, c) = m.vehicle.heading_rad.sin_cos();
-                let error = m.told?.velocity_mps.xy() - Vector2::new(c, s) * m.vehicle.speed_mps;
+                let error = m.received?.velocity_mps.xy() - Vector2::new(c, s) * m.vehicle.speed_mps;
                 Some((error, -(m.own.ned_from_body * Vector3::z()).xy()))
             })
             .unzip();
         let squares: f64 = errors.iter().map(Vector2::norm_squared).sum();
-        let told = errors.len();
+        let messages = errors.len();
         Self {
             follow_rms_m: mean(&|m| away(m).powi(2)).sqrt(),
             follow_max_m: most(&away),
             tilt_rms_deg: mean(&|m| tilt(m).powi(2)).sqrt(),
             tilt_max_deg: most(&tilt),
             height_m: mean(&|m| m.vehicle.origin().z - m.own.position_ned_m.z),
-            velocity_rms_mps: (squares / told.max(1) as f64).sqrt(),
+            velocity_rms_mps: (squares / messages.max(1) as f64).sqrt(),
             correlation: [0, 1]
                 .map(|axis| correlation(errors.iter().map(|e| e[axis]), tilts.iter().map(|t| t[axis])))
                 .into_iter()
@@ -65,11 +65,11 @@ impl Score {
             lag_ms: -1e3
                 * slope(moments.iter().filter_map(|m| {
                     let (s, c) = m.vehicle.heading_rad.sin_cos();
-                    let error = m.told?.position_m.xy() - m.vehicle.origin().xy();
+                    let error = m.received?.position_m.xy() - m.vehicle.origin().xy();
                     Some((error, Vector2::new(c, s) * m.vehicle.speed_mps))
                 })),
             speed_max_mps: most(&|m| m.own.velocity_ned_mps.norm()),
-            told,
+            messages,
         }
     }
 }

@@ -116,10 +116,10 @@ fn add_rows(rows: &[Row], recording: &mut Recording) {
 
 /// UTC less host time: the median over the epochs.
 fn utc_ahead(recording: &Recording) -> Option<Span> {
-    let told = recording.epochs.iter().filter_map(|e| Some(e.value.utc?.unix_ns() - e.t_valid.ns()));
-    let mut told: Vec<i64> = told.collect();
-    told.sort_unstable();
-    told.get(told.len() / 2).copied().map(Span::from_ns)
+    let differences = recording.epochs.iter().filter_map(|e| Some(e.value.utc?.unix_ns() - e.t_valid.ns()));
+    let mut differences: Vec<i64> = differences.collect();
+    differences.sort_unstable();
+    differences.get(differences.len() / 2).copied().map(Span::from_ns)
 }
 
 /// RTKLIB's solution: `%` begins its header.
@@ -157,8 +157,8 @@ fn rtklib_row(fields: &[&str], is_gpst: bool) -> Result<Row, String> {
     let figure =
         |i: usize| rest.get(i).ok_or("it has too few columns".to_owned()).and_then(|f| text::number(f));
     let at = Geodetic { lat_deg: figure(0)?, lon_deg: figure(1)?, height_m: figure(2)? };
-    let told = [figure(5), figure(6), figure(7)];
-    let sigma_m = std::array::from_fn(|i| match &told[i] {
+    let sigmas = [figure(5), figure(6), figure(7)];
+    let sigma_m = std::array::from_fn(|i| match &sigmas[i] {
         Ok(sigma) if *sigma > 0.0 => *sigma,
         _ => DEFAULT_SIGMA_M[i],
     });

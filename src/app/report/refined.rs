@@ -14,9 +14,10 @@ pub(super) fn section(context: &Context<'_>) -> Option<Section> {
         "Estimated from the whole flight, afterwards: constants beside the configured values, with one sigma. What the \
          flight does not determine stays near its configured value.",
     );
-    let told: Vec<Vec<String>> = refined.constants.iter().filter(|constant| constant.told).map(row).collect();
-    if !told.is_empty() {
-        body += &table(&["constant", "unit", "found", "one sigma", "expected", "one sigma"], &told);
+    let determined: Vec<Vec<String>> =
+        refined.constants.iter().filter(|constant| constant.told).map(row).collect();
+    if !determined.is_empty() {
+        body += &table(&["constant", "unit", "found", "one sigma", "expected", "one sigma"], &determined);
     }
     let silent: Vec<&str> =
         refined.constants.iter().filter(|c| !c.told).map(|constant| constant.name.as_str()).collect();

@@ -30,8 +30,8 @@ pub(super) struct Timing {
 /// The streams of a flight that have messages.
 pub(super) fn streams(context: &Context<'_>) -> Vec<Stream> {
     let flight = context.flight;
-    let of = |t: &Option<prost_types::Timestamp>, heard: &Option<prost_types::Timestamp>| {
-        (host_time(t.as_ref()), host_time(heard.as_ref()))
+    let of = |t: &Option<prost_types::Timestamp>, received: &Option<prost_types::Timestamp>| {
+        (host_time(t.as_ref()), host_time(received.as_ref()))
     };
     let streams = [
         Stream { name: "gps", times: flight.epochs.iter().map(|e| of(&e.timestamp, &e.heard)).collect() },
@@ -50,7 +50,7 @@ impl Stream {
     }
 
     fn latencies_ms(&self) -> Vec<f64> {
-        self.times.iter().map(|(t, heard)| (*heard - *t).ms()).collect()
+        self.times.iter().map(|(t, received)| (*received - *t).ms()).collect()
     }
 
     /// `None` for fewer than two messages.
@@ -161,7 +161,7 @@ fn latency_chart(context: &Context<'_>, streams: &[Stream]) -> String {
         let points: Vec<[f64; 2]> = stream
             .times
             .iter()
-            .map(|(t, heard)| [context.flight.seconds(*heard), (*heard - *t).ms()])
+            .map(|(t, received)| [context.flight.seconds(*received), (*received - *t).ms()])
             .collect();
         chart.named(stream.name, cloud(&points, 1.0), ink);
     }

@@ -57,8 +57,8 @@ fn opening(context: &Context<'_>) -> String {
             Some(format!("{} {} ({:.1} a second)", s.times.len(), unit_of(s.name), s.timing()?.rate_hz))
         })
         .collect();
-    let heard = if sensors.is_empty() { "no decoded messages".to_owned() } else { sensors.join(", ") };
-    let mut text = format!("Recorded {began}, {} long: {heard}.", length(flight.duration_s()));
+    let received = if sensors.is_empty() { "no decoded messages".to_owned() } else { sensors.join(", ") };
+    let mut text = format!("Recorded {began}, {} long: {received}.", length(flight.duration_s()));
     let heights: Vec<f64> = flight.ownship.iter().map(|o| -o.down_m).collect();
     if !heights.is_empty() {
         text += &format!(

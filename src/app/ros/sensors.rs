@@ -48,9 +48,9 @@ impl RosTranslator {
 
     /// `/imu/data`, in the sensor's own axes, with their mount as a transform and the configured noise as covariance
     /// (of the mean over a tenth of a second; without a configuration zeros, which mean "not known").
-    pub(super) fn inertial(&mut self, sample: &InertialSample, heard: MonoTime, out: &mut Vec<RosRecord>) {
+    pub(super) fn inertial(&mut self, sample: &InertialSample, t_recv: MonoTime, out: &mut Vec<RosRecord>) {
         let settings = self.imu.unwrap_or_default();
-        let t = heard - Span::from_ms(settings.latency_ms);
+        let t = t_recv - Span::from_ms(settings.latency_ms);
         if !self.statics.contains_key(IMU) {
             let body_from_imu = UnitQuaternion::from_rotation_matrix(&settings.body_from_imu());
             let mount = Transform {
@@ -59,7 +59,7 @@ impl RosTranslator {
                 translation: Vector3::zeros(),
                 rotation: motion::flu_from_frd() * body_from_imu,
             };
-            self.constant(mount, heard, out);
+            self.constant(mount, t_recv, out);
         }
         let sigma = |figure: f64| if self.imu.is_some() { figure } else { 0.0 };
         let imu = Imu {
@@ -71,7 +71,7 @@ impl RosTranslator {
             linear_acceleration: sample.force_mps2.unwrap_or_default(),
             linear_acceleration_covariance: of(sample.force_mps2, sigma(settings.force_noise_mps2)),
         };
-        out.push(RosRecord::new("/imu/data", heard, t, &imu));
+        out.push(RosRecord::new("/imu/data", t_recv, t, &imu));
     }
 }
 

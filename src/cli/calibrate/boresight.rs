@@ -80,7 +80,7 @@ fn surveyed_markers(args: &Args, config: &Config) -> BTreeMap<MarkerId, (Geodeti
 }
 
 fn as_json(found: &Boresight) -> serde_json::Value {
-    let finding = |f: &Finding| json!({"name": f.name, "unit": f.unit, "value": f.value, "sigma": f.sigma, "prior": f.prior, "told": f.told});
+    let finding = |f: &Finding| json!({"name": f.name, "unit": f.unit, "value": f.value, "sigma": f.sigma, "prior": f.prior, "told": f.determined});
     let markers: Vec<_> = found
         .markers
         .iter()
@@ -117,7 +117,7 @@ fn print_text(found: &Boresight, config: &Config) -> CliResult {
     }
     outln!("\n                         value  one sigma")?;
     for f in &found.parameters {
-        let note = if f.told { "" } else { "   not determined by these flights" };
+        let note = if f.determined { "" } else { "   not determined by these flights" };
         outln!("{:<20} {:>9.3} {:>9.3} {:<3}{note}", f.name, f.value, f.sigma, f.unit)?;
     }
     outln!("\ncamera relative to compass (which determines a vehicle's position)")?;

@@ -222,13 +222,13 @@ mod tests {
             fps: 25.0,
             pixel_format: PixelFormat::Grey,
         };
-        let (sender, mut told) = mpsc::unbounded_channel();
+        let (sender, mut given) = mpsc::unbounded_channel();
         let reports = move |report| drop(sender.send(report));
         let path = folder.path().to_string_lossy().into_owned();
         let mut frames = Vec::new();
         let taken = async {
             loop {
-                match told.recv().await.expect("the task runs") {
+                match given.recv().await.expect("the task runs") {
                     Report::Frame(t, frame) => frames.push((t, frame)),
                     Report::Note(NoteKind::PlayedOut, ..) => break,
                     _ => {}
@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_recording_is_told() {
+    fn what_is_no_recording_is_reported() {
         assert!(open(Path::new("/nowhere/at/all")).is_err());
         assert_eq!(pgm_header(b"P5 1280 1024 255\n..."), Some((1280, 1024, 17)));
         assert_eq!(pgm_header(b"P2 1 1 255\n0"), None);

@@ -156,7 +156,7 @@ mod tests {
     use super::*;
 
     /// The camera's reports for the bytes that the other end sends, and its final fault.
-    async fn heard(sent: Vec<Vec<u8>>, stays: bool) -> (Vec<Report>, Fault) {
+    async fn received(sent: Vec<Vec<u8>>, stays: bool) -> (Vec<Report>, Fault) {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("camera.sock").to_string_lossy().into_owned();
         let listener = UnixListener::bind(&path).expect("bound");
@@ -169,12 +169,12 @@ mod tests {
                 std::future::pending::<()>().await;
             }
         });
-        let (sender, mut told) = mpsc::unbounded_channel();
+        let (sender, mut given) = mpsc::unbounded_channel();
         let reports = move |report| drop(sender.send(report));
         let fault = stream(&path, HostClock::start(), &reports, &mut || ()).await;
         other_end.abort();
         let mut all = Vec::new();
-        while let Ok(report) = told.try_recv() {
+        while let Ok(report) = given.try_recv() {
             if !matches!(report, Report::Beat) {
                 all.push(report);
             }
@@ -187,10 +187,10 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn frames_come_with_their_stamps_and_odd_stamps_are_told() {
+    async fn frames_come_with_their_stamps_and_odd_stamps_are_reported() {
         let clock = HostClock::start();
         let now = (clock.now() - clock.less_monotonic()).ns();
-        let (reports, fault) = heard(vec![frame(now), frame(now + 3_600_000_000_000)], false).await;
+        let (reports, fault) = received(vec![frame(now), frame(now + 3_600_000_000_000)], false).await;
         let frames: Vec<_> = reports
             .iter()
             .filter_map(|report| if let Report::Frame(t, frame) = report { Some((*t, frame)) } else { None })
@@ -211,9 +211,9 @@ mod tests {
         let mut foreign = frame(0);
         foreign[4..8].copy_from_slice(b"H264");
         for lie in [odd, short, foreign, b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n".to_vec()] {
-            assert_eq!(heard(vec![lie], true).await.1.kind, FaultKind::Unsuitable);
+            assert_eq!(received(vec![lie], true).await.1.kind, FaultKind::Unsuitable);
         }
-        let (_, fault) = heard(vec![frame(0)[..40 - 4].to_vec()], true).await;
+        let (_, fault) = received(vec![frame(0)[..40 - 4].to_vec()], true).await;
         assert_eq!(fault.kind, FaultKind::Frozen);
         let nobody = stream("/nowhere/at/all", HostClock::start(), &|_| (), &mut || ()).await;
         assert_eq!(nobody.kind, FaultKind::Missing);

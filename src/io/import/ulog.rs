@@ -238,8 +238,8 @@ impl Log {
             return;
         };
         let row = Row { fields: &topic.fields, data };
-        let Some(heard) = row.usec("timestamp") else { return };
-        let true_at = row.usec("timestamp_sample").unwrap_or(heard);
+        let Some(logged) = row.usec("timestamp") else { return };
+        let true_at = row.usec("timestamp_sample").unwrap_or(logged);
         let t = MonoTime::from_ns(true_at * 1_000);
         match topic.name.as_str() {
             "vehicle_attitude" => {
@@ -259,7 +259,7 @@ impl Log {
                 let is_chosen = chosen_or_raw == "vehicle_gps_position";
                 let Some(fix) = fix(&row) else { return };
                 if let Some(utc) = row.usec("time_utc_usec").filter(|_| fix.kind >= 2) {
-                    self.utc_less_boot.get_or_insert(utc - heard);
+                    self.utc_less_boot.get_or_insert(utc - logged);
                 }
                 if is_chosen || self.fixes_of.is_empty() {
                     self.fixes_of = if is_chosen { "vehicle_gps_position" } else { "sensor_gps" };

@@ -25,7 +25,7 @@ impl LinkEndpoint {
     /// Connects to a peer, and again whenever the connection is lost or silent, until the port is closed.
     pub(super) async fn dial(self, address: String) {
         let mut current: Option<Peer> = None;
-        let mut told_unresolved = false;
+        let mut unresolved_reported = false;
         let (mut pause, mut answered) = (PAUSE, Instant::now());
         // An attempt beside a silent connection may have reached the peer although its answer did not reach us: then it
         // is this attempt that took over.
@@ -50,7 +50,7 @@ impl LinkEndpoint {
             }
             match tokio::net::lookup_host(&address).await {
                 Ok(found) => {
-                    told_unresolved = false;
+                    unresolved_reported = false;
                     for candidate in found {
                         match self.call(candidate).await {
                             Called::Answered(peer) => {
@@ -64,8 +64,8 @@ impl LinkEndpoint {
                         }
                     }
                 }
-                Err(e) if !told_unresolved => {
-                    told_unresolved = true;
+                Err(e) if !unresolved_reported => {
+                    unresolved_reported = true;
                     let why = e.to_string();
                     self.events.tell(LinkEvent::Unresolved { address: address.clone(), why });
                 }
@@ -116,7 +116,7 @@ enum Watched {
 /// Waits until a connection is closed or has been silent for a while.
 async fn watch(peer: &Peer) -> Watched {
     let connection = &peer.connection;
-    let mut heard = connection.stats().udp_rx.datagrams;
+    let mut datagrams = connection.stats().udp_rx.datagrams;
     let mut since = Instant::now();
     loop {
         tokio::select! {
@@ -133,8 +133,8 @@ async fn watch(peer: &Peer) -> Watched {
             () = tokio::time::sleep(PAUSE) => {}
         }
         let now = connection.stats().udp_rx.datagrams;
-        if now != heard {
-            (heard, since) = (now, Instant::now());
+        if now != datagrams {
+            (datagrams, since) = (now, Instant::now());
         } else if since.elapsed() > SUSPICIOUS {
             return Watched::Silent;
         }

@@ -100,7 +100,7 @@ pub struct Governor {
     /// IP and UDP headers of one packet, bytes.
     headers: f64,
     updated: Instant,
-    heard: Instant,
+    last_report: Instant,
     delivered: f64,
     /// Recent lost and acknowledged bytes, with exponential forgetting over [`LOSS_MEMORY_S`].
     lost: f64,
@@ -125,7 +125,7 @@ impl Governor {
             bucket: Bucket::new(RATE_AT_START, now),
             headers,
             updated: now,
-            heard: now,
+            last_report: now,
             delivered: RATE_AT_START,
             lost: 0.0,
             acked: 0.0,
@@ -172,7 +172,7 @@ impl Governor {
         self.lost = self.lost * kept + noted.lost as f64;
         self.acked = self.acked * kept + noted.acked as f64;
         if noted.acked == 0 {
-            if !self.cut && now.saturating_duration_since(self.heard) > SILENCE + self.queue {
+            if !self.cut && now.saturating_duration_since(self.last_report) > SILENCE + self.queue {
                 self.cut = true;
                 // The earlier result may be much more than the path carries afterwards.
                 self.found = None;
@@ -180,7 +180,7 @@ impl Governor {
             }
             return;
         }
-        self.heard = now;
+        self.last_report = now;
         if std::mem::take(&mut self.cut) {
             self.restored = Some(now);
         }

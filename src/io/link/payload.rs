@@ -191,22 +191,22 @@ fn welcome(shared: &Arc<PayloadShared>, peer: Peer) -> impl Future<Output = ()> 
         unread: 0,
         wanted: 0,
     };
-    let told = {
+    let up_reported = {
         let mut stations = shared.stations();
         let old = stations.remove(&peer.name);
         let open = old.as_ref().filter(|old| old.peer.connection.close_reason().is_none());
-        let told = open.map_or_else(Arc::default, |old| Arc::clone(&old.told));
+        let up_reported = open.map_or_else(Arc::default, |old| Arc::clone(&old.up_reported));
         if let Some(old) = old {
             old.peer.supersede();
         }
-        let connected = Connected { peer: peer.clone(), status, told: Arc::clone(&told) };
+        let connected = Connected { peer: peer.clone(), status, up_reported: Arc::clone(&up_reported) };
         stations.insert(peer.name.clone(), connected);
-        told
+        up_reported
     };
     let shared = Arc::clone(shared);
     async move {
         let up = || {
-            if !told.swap(true, Ordering::Relaxed) {
+            if !up_reported.swap(true, Ordering::Relaxed) {
                 let address = peer.address();
                 shared.events.tell(LinkEvent::Up { peer: peer.name.clone(), address });
             }

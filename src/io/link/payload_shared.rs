@@ -54,7 +54,7 @@ pub(super) struct Connected {
     pub(super) peer: Peer,
     pub(super) status: StationStatus,
     /// Whether `link_up` was reported; a connection that takes over inherits it.
-    pub(super) told: Arc<AtomicBool>,
+    pub(super) up_reported: Arc<AtomicBool>,
 }
 
 /// Shared by the sessions.

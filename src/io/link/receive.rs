@@ -139,7 +139,7 @@ impl Receiver {
     /// so requested again.
     async fn take(&self, record: pb::Record, live: bool) -> Result<(), WireError> {
         let arrived = Instant::now();
-        *lock(&self.state.heard) = arrived;
+        *lock(&self.state.last_received) = arrived;
         let Some(channel) = lock(&self.channels).get(&record.channel).cloned() else { return Ok(()) };
         let Some(flight) = lock(&self.flights).get(&record.run).cloned() else { return Ok(()) };
         if !lock(&self.state.received).take(record.run, record.number) {
@@ -239,7 +239,7 @@ impl Receiver {
     async fn speak(&self, mut out: SendStream) -> Result<(), WireError> {
         let mut asked = pb::Want::default();
         let mut asked_at = Instant::now();
-        let mut told = pb::Stored::default();
+        let mut reported = pb::Stored::default();
         let mut look = tokio::time::interval(LOOK);
         look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
         loop {
@@ -258,10 +258,10 @@ impl Receiver {
                 }
                 () = self.state.stored.notified() => {
                     let stored = lock(&self.state.received).stored_message();
-                    if stored != told {
+                    if stored != reported {
                         let body = Some(to_payload::Body::Stored(stored.clone()));
                         wire::write(&mut out, &pb::ToPayload { body }).await?;
-                        told = stored;
+                        reported = stored;
                     }
                 }
             }

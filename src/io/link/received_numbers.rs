@@ -201,16 +201,17 @@ mod tests {
     fn what_is_missing_becomes_overdue_with_time() {
         let mut received = ReceivedNumbers::default();
         received.announce(&extent(0, 10), |_, _| RangeSet::of(0, 6));
-        let told = |received: &ReceivedNumbers| (received.progress().missing, received.progress().overdue);
+        let progress =
+            |received: &ReceivedNumbers| (received.progress().missing, received.progress().overdue);
         for _ in 1..OVERDUE_LOOKS {
             received.want();
-            assert_eq!(told(&received), (4, 0));
+            assert_eq!(progress(&received), (4, 0));
         }
         received.take(5, 11);
         received.want();
-        assert_eq!(told(&received), (5, 4), "10 is still young");
+        assert_eq!(progress(&received), (5, 4), "10 is still young");
         received.take(5, 6);
-        assert_eq!(told(&received), (4, 3));
+        assert_eq!(progress(&received), (4, 3));
     }
 
     #[test]

@@ -78,7 +78,7 @@ impl StationHandle {
             status.rtt_ms = connection.rtt().as_secs_f64() * 1e3;
             status.address = peer.address();
             status.bytes = connection.stats().udp_rx.bytes;
-            status.silent = lock(&state.heard).elapsed();
+            status.silent = lock(&state.last_received).elapsed();
             status.progress = lock(&state.received).progress();
             status
         };
@@ -140,7 +140,7 @@ fn welcome(shared: &Arc<StationShared>, peer: Peer) -> impl Future<Output = ()> 
     let (state, shared) = (shared.state_of(&peer), Arc::clone(shared));
     async move {
         let up = || {
-            if !state.told.swap(true, Ordering::Relaxed) {
+            if !state.up_reported.swap(true, Ordering::Relaxed) {
                 let address = peer.address();
                 shared.events.tell(LinkEvent::Up { peer: peer.name.clone(), address });
             }
@@ -149,7 +149,7 @@ fn welcome(shared: &Arc<StationShared>, peer: Peer) -> impl Future<Output = ()> 
         let ours = lock(&state.peer).connection.stable_id() == peer.connection.stable_id();
         if ours {
             lock(&state.status).connected = false;
-            state.told.store(false, Ordering::Relaxed);
+            state.up_reported.store(false, Ordering::Relaxed);
             shared.events.ended(&peer, ended);
         }
     }

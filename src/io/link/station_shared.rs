@@ -97,10 +97,10 @@ pub(super) struct PayloadState {
     pub(super) received: Mutex<ReceivedNumbers>,
     pub(super) stored: Notify,
     pub(super) status: Mutex<PayloadStatus>,
-    pub(super) heard: Mutex<Instant>,
+    pub(super) last_received: Mutex<Instant>,
     pub(super) peer: Mutex<Peer>,
     /// Whether `link_up` was reported.
-    pub(super) told: AtomicBool,
+    pub(super) up_reported: AtomicBool,
 }
 
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -126,7 +126,7 @@ impl StationShared {
             let old = std::mem::replace(&mut *lock(&state.peer), peer.clone());
             old.supersede();
             lock(&state.status).connected = true;
-            *lock(&state.heard) = Instant::now();
+            *lock(&state.last_received) = Instant::now();
             return Arc::clone(state);
         }
         let status = PayloadStatus {
@@ -144,9 +144,9 @@ impl StationShared {
             received: Mutex::default(),
             stored: Notify::new(),
             status: Mutex::new(status),
-            heard: Mutex::new(Instant::now()),
+            last_received: Mutex::new(Instant::now()),
             peer: Mutex::new(peer.clone()),
-            told: AtomicBool::new(false),
+            up_reported: AtomicBool::new(false),
         });
         payloads.insert(peer.name.clone(), Arc::clone(&state));
         state

@@ -74,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn runs_are_told_apart_by_card_and_always_have_a_name() {
+    fn runs_are_distinguished_by_card_and_always_have_a_name() {
         let run = |run, flight: &str| Extent { run, flight: flight.into(), first: 3, end: 10 };
         assert_eq!(on_link(run(1, "20261118T150405Z"), 0xabcd), run(1 ^ 0xabcd, "20261118T150405Z"));
         assert_eq!(on_link(run(2, ""), 0), run(2, "boot-2"));

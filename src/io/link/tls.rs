@@ -148,7 +148,7 @@ pub fn refusal(error: &quinn::ConnectionError) -> (String, bool) {
         _ => return (error.to_string(), false),
     };
     // A TLS alert n travels as QUIC error 0x100 + n (RFC 9001, 4.8; alerts: RFC 8446, 6).
-    let told = matches!(error, E::ConnectionClosed(_));
+    let by_peer = matches!(error, E::ConnectionClosed(_));
     let what = match code.checked_sub(0x100) {
         Some(42 | 43 | 46) => "certificate not accepted",
         Some(44) => "certificate revoked",
@@ -160,6 +160,6 @@ pub fn refusal(error: &quinn::ConnectionError) -> (String, bool) {
         Some(0..=255) => "TLS handshake failed",
         _ => return (error.to_string(), false),
     };
-    let side = if told { "the other side refused us" } else { "refused" };
+    let side = if by_peer { "the other side refused us" } else { "refused" };
     (format!("{side}: {what} ({error})"), true)
 }

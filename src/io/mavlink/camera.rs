@@ -65,7 +65,7 @@ impl Camera {
             MavCmd::MAV_CMD_REQUEST_CAMERA_SETTINGS => Some(CAMERA_SETTINGS_DATA::ID),
             _ => None,
         };
-        let told = match wanted {
+        let answer = match wanted {
             Some(CAMERA_INFORMATION_DATA::ID) => Some(self.information(now)),
             Some(CAMERA_SETTINGS_DATA::ID) => Some(settings(now)),
             _ => None,
@@ -74,7 +74,7 @@ impl Camera {
         let comes_anyway = asked.command == MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL
             && [CAMERA_TRACKING_GEO_STATUS_DATA::ID, CAMERA_TRACKING_IMAGE_STATUS_DATA::ID]
                 .contains(&(asked.param1 as u32));
-        let result = match told.is_some() || comes_anyway {
+        let result = match answer.is_some() || comes_anyway {
             true => MavResult::MAV_RESULT_ACCEPTED,
             false => MavResult::MAV_RESULT_UNSUPPORTED,
         };
@@ -85,7 +85,7 @@ impl Camera {
             target_component: from.component,
             ..COMMAND_ACK_DATA::DEFAULT
         });
-        std::iter::once(ack).chain(told).collect()
+        std::iter::once(ack).chain(answer).collect()
     }
 
     fn information(&self, now: Span) -> MavMessage {

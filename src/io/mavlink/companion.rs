@@ -52,7 +52,7 @@ impl Companion {
     }
 
     /// Handles a frame received at `t`; returns whether it is the autopilot's. Appends the answers.
-    pub fn heard(&mut self, frame: &MavlinkFrame, t: MonoTime, out: &mut Vec<Vec<u8>>) -> bool {
+    pub fn receive(&mut self, frame: &MavlinkFrame, t: MonoTime, out: &mut Vec<Vec<u8>>) -> bool {
         if is_autopilot(frame) && self.wanted.is_none_or(|wanted| wanted == frame.system) {
             let system = *self.system.get_or_insert_with(|| {
                 self.notes.push(format!("system {} is used", frame.system));
@@ -83,7 +83,7 @@ impl Companion {
     }
 
     fn beat(&mut self, time_boot_ms: u32, t: MonoTime) {
-        self.clock.heard(Span::from_ns(i64::from(time_boot_ms) * 1_000_000), t);
+        self.clock.observe(Span::from_ns(i64::from(time_boot_ms) * 1_000_000), t);
         if self.clock.restarts() != self.restarts {
             self.restarts = self.clock.restarts();
             self.configured = false;
@@ -177,12 +177,12 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_said_before_it_is_heard_and_then_its_time_is_asked_for() {
+    fn nothing_is_sent_before_the_first_frame_and_then_its_time_is_requested() {
         let mut companion = Companion::new(None, true);
         let mut said = Vec::new();
         companion.every_second(at(0.0), &mut said);
         assert!(said.is_empty());
-        assert!(companion.heard(&of(3, &heartbeat()), at(0.5), &mut said));
+        assert!(companion.receive(&of(3, &heartbeat()), at(0.5), &mut said));
         companion.every_second(at(1.0), &mut said);
         let said = frames(&said);
         assert_eq!(said.len(), 2 + WANTED.len());
@@ -191,14 +191,14 @@ mod tests {
         // Its request is answered in its own time, once that is known.
         let mut out = Vec::new();
         let its = MavMessage::TIMESYNC(TIMESYNC_DATA { ts1: 7, ..TIMESYNC_DATA::DEFAULT });
-        companion.heard(&of(3, &its), at(1.001), &mut out);
+        companion.receive(&of(3, &its), at(1.001), &mut out);
         assert!(out.is_empty());
         let answer = TIMESYNC_DATA { tc1: 50_000_000_000, ts1: question.ts1, ..TIMESYNC_DATA::DEFAULT };
-        companion.heard(&of(3, &MavMessage::TIMESYNC(answer)), at(1.004), &mut out);
-        companion.heard(&of(3, &its), at(2.002), &mut out);
-        let MavMessage::TIMESYNC(told) = &frames(&out)[0].message else { panic!("{out:?}") };
-        assert_eq!(told.ts1, 7);
-        assert!((told.tc1 - 51_000_000_000).abs() < 1_000_000, "{}", told.tc1);
+        companion.receive(&of(3, &MavMessage::TIMESYNC(answer)), at(1.004), &mut out);
+        companion.receive(&of(3, &its), at(2.002), &mut out);
+        let MavMessage::TIMESYNC(answer) = &frames(&out)[0].message else { panic!("{out:?}") };
+        assert_eq!(answer.ts1, 7);
+        assert!((answer.tc1 - 51_000_000_000).abs() < 1_000_000, "{}", answer.tc1);
     }
 
     #[test]
@@ -206,7 +206,7 @@ mod tests {
         let key = SigningKey([5; 32]);
         let mut companion = Companion::new(None, true).signing(Some((key.clone(), 2)));
         let mut said = Vec::new();
-        companion.heard(&of(3, &heartbeat()), at(0.5), &mut said);
+        companion.receive(&of(3, &heartbeat()), at(0.5), &mut said);
         companion.every_second(at(1.0), &mut said);
         let stamps: Vec<u64> =
             said.iter().map(|frame| packet::verify(frame, &key).expect("signed").2).collect();
@@ -214,15 +214,15 @@ mod tests {
     }
 
     #[test]
-    fn another_autopilot_is_told_and_not_heard() {
+    fn another_autopilot_is_reported_and_not_used() {
         let mut companion = Companion::new(None, false);
-        assert!(companion.heard(&of(1, &heartbeat()), at(0.0), &mut Vec::new()));
-        assert!(!companion.heard(&of(2, &heartbeat()), at(0.1), &mut Vec::new()));
-        assert!(!companion.heard(&of(2, &heartbeat()), at(1.1), &mut Vec::new()));
+        assert!(companion.receive(&of(1, &heartbeat()), at(0.0), &mut Vec::new()));
+        assert!(!companion.receive(&of(2, &heartbeat()), at(0.1), &mut Vec::new()));
+        assert!(!companion.receive(&of(2, &heartbeat()), at(1.1), &mut Vec::new()));
         assert_eq!(companion.notes().len(), 2);
         let mut second = Companion::new(Some(2), false);
-        assert!(!second.heard(&of(1, &heartbeat()), at(0.0), &mut Vec::new()));
-        assert!(second.heard(&of(2, &heartbeat()), at(0.1), &mut Vec::new()));
+        assert!(!second.receive(&of(1, &heartbeat()), at(0.0), &mut Vec::new()));
+        assert!(second.receive(&of(2, &heartbeat()), at(0.1), &mut Vec::new()));
     }
 
     #[test]
@@ -232,12 +232,12 @@ mod tests {
             MavMessage::SYSTEM_TIME(SYSTEM_TIME_DATA { time_boot_ms: boot_ms, ..SYSTEM_TIME_DATA::DEFAULT })
         };
         let mut requests = Vec::new();
-        companion.heard(&of(3, &heartbeat()), at(0.0), &mut Vec::new());
+        companion.receive(&of(3, &heartbeat()), at(0.0), &mut Vec::new());
         for second in 0..20_u32 {
             let s = f64::from(second);
             // After ten seconds it counts from zero.
             let boot_ms = 1_000 * if second < 10 { 500 + second } else { second - 10 };
-            companion.heard(&of(3, &time(boot_ms)), at(s), &mut Vec::new());
+            companion.receive(&of(3, &time(boot_ms)), at(s), &mut Vec::new());
             let mut said = Vec::new();
             companion.every_second(at(s + 0.1), &mut said);
             requests.push(said.len() > 2);

@@ -110,7 +110,9 @@ impl MavlinkEncoder {
                 self.helicopter.own(own, self.frame.as_ref());
             }
             Output::Datum(_, datum) => self.frame = Some(LocalFrame::new(*datum)),
-            Output::Reading(SensorReading::Autopilot(position)) => self.helicopter.heard(position),
+            Output::Reading(SensorReading::Autopilot(position)) => {
+                self.helicopter.autopilot_position(position)
+            }
             Output::Reading(SensorReading::Gnss(fix)) => {
                 self.geoid_m = fix.value.geoid_m.or(self.geoid_m);
                 if let Some(utc) = fix.value.utc {
@@ -202,8 +204,8 @@ impl MavlinkEncoder {
         let place = nalgebra::Vector3::new(at_now.north_m + apart.x, at_now.east_m + apart.y, down);
         let place = frame.geodetic(&place);
         let absolute = at_now.covariance.map_or(0.0, |p| p[(0, 0)].max(p[(1, 1)]).max(0.0).sqrt());
-        let heard = difference.is_some_and(|(_, fresh)| fresh);
-        let relative = state.relative_sigma_m.filter(|_| heard);
+        let is_fresh = difference.is_some_and(|(_, fresh)| fresh);
+        let relative = state.relative_sigma_m.filter(|_| is_fresh);
         let report = VehicleReport {
             now: self.since_start(now),
             state: at_now,

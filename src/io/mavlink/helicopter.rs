@@ -44,7 +44,7 @@ struct Difference {
 #[derive(Clone, Debug, Default)]
 pub struct Helicopter {
     own: VecDeque<Ownship>,
-    heard: Option<Stamped<AutopilotPosition>>,
+    latest: Option<Stamped<AutopilotPosition>>,
     difference: Option<Difference>,
 }
 
@@ -61,8 +61,8 @@ impl Helicopter {
     }
 
     /// Takes a position of its autopilot.
-    pub fn heard(&mut self, position: &Stamped<AutopilotPosition>) {
-        self.heard = Some(*position);
+    pub fn autopilot_position(&mut self, position: &Stamped<AutopilotPosition>) {
+        self.latest = Some(*position);
     }
 
     /// The helicopter at `t`, interpolated between states; for a short time after the last, that one.
@@ -87,26 +87,26 @@ impl Helicopter {
 
     /// Updates the difference between the autopilot's position and ours, once both are known for the same time.
     fn compare(&mut self, frame: &LocalFrame) {
-        let Some(heard) = self.heard else { return };
-        let known = self.own.back().is_some_and(|last| last.t_valid >= heard.t_valid);
-        let Some(own) = self.at(heard.t_valid).filter(|_| known) else { return };
-        self.heard = None;
+        let Some(latest) = self.latest else { return };
+        let known = self.own.back().is_some_and(|last| last.t_valid >= latest.t_valid);
+        let Some(own) = self.at(latest.t_valid).filter(|_| known) else { return };
+        self.latest = None;
         let place = windhover_base::geo::Geodetic {
-            lat_deg: heard.value.lat_deg,
-            lon_deg: heard.value.lon_deg,
+            lat_deg: latest.value.lat_deg,
+            lon_deg: latest.value.lon_deg,
             height_m: own.height_m,
         };
         let apart = frame.ned(place) - own.position_ned_m;
-        let place_m = Vector3::new(apart.x, apart.y, heard.value.alt_msl_m - own.height_m);
-        let clock = heard.value.boot - (heard.t_valid - MonoTime::default());
+        let place_m = Vector3::new(apart.x, apart.y, latest.value.alt_msl_m - own.height_m);
+        let clock = latest.value.boot - (latest.t_valid - MonoTime::default());
         let place_m = match self.difference {
-            Some(last) if heard.t_valid > last.at && heard.t_valid - last.at <= FRESH => {
-                let share = 1.0 - (-(heard.t_valid - last.at).s() / AVERAGED_S).exp();
+            Some(last) if latest.t_valid > last.at && latest.t_valid - last.at <= FRESH => {
+                let share = 1.0 - (-(latest.t_valid - last.at).s() / AVERAGED_S).exp();
                 last.place_m + (place_m - last.place_m) * share
             }
             _ => place_m,
         };
-        self.difference = Some(Difference { at: heard.t_valid, place_m, clock });
+        self.difference = Some(Difference { at: latest.t_valid, place_m, clock });
     }
 
     /// The autopilot's position minus ours (north, east; altitude above mean sea level minus our height above the

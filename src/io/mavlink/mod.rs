@@ -55,7 +55,7 @@ pub enum MavlinkError {
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct MavlinkCounts {
     /// Frames received, with a valid signature where a key is set.
-    pub heard: u64,
+    pub received: u64,
     /// Datagrams refused where a key is set: unsigned, of another key, replayed, not MAVLink.
     pub refused: u64,
     /// Frames of other systems under one of our system ids.
@@ -65,9 +65,9 @@ pub struct MavlinkCounts {
 impl MavlinkCounts {
     /// As text, where any frame was refused or foreign.
     pub fn words(&self) -> Option<String> {
-        let Self { heard, refused, foreign } = self;
+        let Self { received, refused, foreign } = self;
         (refused + foreign > 0)
-            .then(|| format!("{heard} received, {refused} refused, {foreign} under our ids"))
+            .then(|| format!("{received} received, {refused} refused, {foreign} under our ids"))
     }
 }
 
@@ -77,7 +77,7 @@ pub struct MavlinkSender {
     stations: Stations,
     targets: usize,
     key: Option<SigningKey>,
-    heard_stamp: u64,
+    last_stamp: u64,
     /// Checksums of recently sent frames.
     sent: VecDeque<u32>,
     frames: Vec<Vec<u8>>,
@@ -108,7 +108,7 @@ impl MavlinkSender {
             ),
             targets: config.target.len(),
             key,
-            heard_stamp: 0,
+            last_stamp: 0,
             sent: VecDeque::with_capacity(OWN_FRAMES),
             frames: Vec::new(),
             counts: MavlinkCounts::default(),
@@ -182,11 +182,11 @@ impl MavlinkSender {
         if let Some(key) = &self.key {
             let verdict = packet::verify(bytes, key).and_then(|(_, _, stamp)| {
                 let now = utc.map_or(0, packet::time_stamp);
-                let fresh = stamp > self.heard_stamp && stamp.saturating_add(REPLAY_WINDOW) > now;
+                let fresh = stamp > self.last_stamp && stamp.saturating_add(REPLAY_WINDOW) > now;
                 if fresh { Ok(stamp) } else { Err(Refused::Replayed) }
             });
             match verdict {
-                Ok(stamp) => self.heard_stamp = stamp,
+                Ok(stamp) => self.last_stamp = stamp,
                 Err(_) => {
                     self.counts.refused += 1;
                     return;
@@ -196,10 +196,10 @@ impl MavlinkSender {
         if self.sent.contains(&crc32fast::hash(bytes)) {
             return;
         }
-        let mut heard = Vec::new();
-        MavlinkFrames::default().push(bytes, &mut heard);
-        for frame in heard {
-            self.counts.heard += 1;
+        let mut frames = Vec::new();
+        MavlinkFrames::default().push(bytes, &mut frames);
+        for frame in frames {
+            self.counts.received += 1;
             self.frame(&frame, now, answers);
         }
     }

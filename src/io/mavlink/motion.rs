@@ -131,8 +131,8 @@ mod tests {
         assert!(off < 1e-3 && (whole.speed_mps - 2.2).abs() < 1e-12, "{off} {whole:?}");
         let (before, after) = (velocity(&state, reference_m), velocity(&whole, reference_m));
         let middle = ahead(&state, 0.8, reference_m, Span::from_ms(125.0));
-        let told = acceleration(&middle, 0.8, reference_m);
-        assert!(((after - before) / 0.25 - told).norm() < 0.01, "{told}");
+        let computed = acceleration(&middle, 0.8, reference_m);
+        assert!(((after - before) / 0.25 - computed).norm() < 0.01, "{computed}");
     }
 
     #[test]
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn the_change_of_speed_is_told_where_it_is_surer_than_its_noise() {
+    fn the_change_of_speed_is_sent_where_it_exceeds_its_noise() {
         let rate = |change: f64, variance: f64| {
             let mut rate = SpeedRate::default();
             for k in 0..20 {

@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn a_station_that_cannot_be_reached_is_told_once_and_counted() {
+    fn a_station_that_cannot_be_reached_is_reported_once_and_counted() {
         // Given a good address, a name that does not exist, and a port that is never free.
         let mut stations = to(&["127.0.0.1:9", "no-such-host.invalid:14550", "127.0.0.1:0"]);
         for _ in 0..3 {
@@ -232,8 +232,8 @@ mod tests {
         assert_eq!((all[2].sent, all[2].failed), (0, 3));
         assert!(all[2].words().contains("0 sent, 3 failed ("), "{}", all[2].words());
         // Then each fault is reported once, and the name is resolved again only after a while.
-        let told: Vec<String> = stations.news().into_iter().map(|news| news.name).collect();
-        assert_eq!(told, ["no-such-host.invalid:14550", "127.0.0.1:0"]);
+        let reported: Vec<String> = stations.news().into_iter().map(|news| news.name).collect();
+        assert_eq!(reported, ["no-such-host.invalid:14550", "127.0.0.1:0"]);
         assert_eq!(stations.unresolved(MonoTime::default() + Span::from_s(1.0)), None);
         let again = stations.unresolved(MonoTime::default() + Span::from_s(11.0));
         assert_eq!(again, Some(vec!["no-such-host.invalid:14550".to_owned(), "127.0.0.1:0".to_owned()]));

@@ -113,7 +113,7 @@ impl Bench {
 }
 
 /// MAV_STATE of the first target's heartbeat, where there is one, and whether a position of it was sent.
-fn told(sent: &[(u8, u8, u32, Vec<u8>)]) -> (Option<u8>, bool) {
+fn first_target(sent: &[(u8, u8, u32, Vec<u8>)]) -> (Option<u8>, bool) {
     let first = |id| sent.iter().find(move |(system, _, kind, _)| (*system, *kind) == (42, id));
     (first(0).map(|(.., payload)| payload[7]), first(33).is_some() && first(144).is_some())
 }
@@ -125,13 +125,13 @@ const STANDBY: Option<u8> = Some(3);
 #[test]
 fn a_dead_camera_ends_the_positions_and_the_heartbeats_tell() {
     let mut bench = Bench::new();
-    assert_eq!(told(&bench.sent(0.0)), (STANDBY, false));
+    assert_eq!(first_target(&bench.sent(0.0)), (STANDBY, false));
     bench.estimate(1.0, TrackStatus::Tracking, 0.1);
-    assert_eq!(told(&bench.sent(1.05)), (ACTIVE, true));
+    assert_eq!(first_target(&bench.sent(1.05)), (ACTIVE, true));
     // When no more outputs come, then the last state is not sent without end.
-    assert_eq!(told(&bench.sent(1.4)), (None, true));
-    assert_eq!(told(&bench.sent(2.1)), (STANDBY, false));
-    assert_eq!(told(&bench.sent(32.1)), (STANDBY, false));
+    assert_eq!(first_target(&bench.sent(1.4)), (None, true));
+    assert_eq!(first_target(&bench.sent(2.1)), (STANDBY, false));
+    assert_eq!(first_target(&bench.sent(32.1)), (STANDBY, false));
 }
 
 /// A slow rate is that of positions; a listener still gets a heartbeat once a second.
@@ -142,7 +142,7 @@ fn a_slow_rate_slows_no_heartbeat() {
     let step = bench.sender.every().s();
     while s < 30.0 {
         bench.estimate(s, TrackStatus::Tracking, 0.1);
-        let (beat, position) = told(&bench.sent(s + 0.01));
+        let (beat, position) = first_target(&bench.sent(s + 0.01));
         (beats, positions) = (beats + u32::from(beat == ACTIVE), positions + u32::from(position));
         s += step;
     }
@@ -156,20 +156,20 @@ fn a_slow_rate_slows_no_heartbeat() {
 fn a_covered_tag_is_predicted_for_a_second() {
     let mut bench = Bench::new();
     bench.estimate(1.0, TrackStatus::Tracking, 0.1);
-    assert_eq!(told(&bench.sent(1.0)), (ACTIVE, true));
+    assert_eq!(first_target(&bench.sent(1.0)), (ACTIVE, true));
     bench.estimate(1.9, TrackStatus::Coasting, 0.3);
-    assert_eq!(told(&bench.sent(2.0)), (CRITICAL, true));
+    assert_eq!(first_target(&bench.sent(2.0)), (CRITICAL, true));
     bench.estimate(3.0, TrackStatus::Coasting, 0.5);
-    assert_eq!(told(&bench.sent(3.0)), (STANDBY, false));
+    assert_eq!(first_target(&bench.sent(3.0)), (STANDBY, false));
     bench.estimate(4.0, TrackStatus::Tracking, 0.1);
-    assert_eq!(told(&bench.sent(4.0)), (ACTIVE, true));
+    assert_eq!(first_target(&bench.sent(4.0)), (ACTIVE, true));
 }
 
 #[test]
 fn what_is_not_known_well_enough_is_no_position() {
     let mut bench = Bench::new();
     bench.estimate(1.0, TrackStatus::Tracking, 2.5);
-    assert_eq!(told(&bench.sent(1.0)), (STANDBY, false));
+    assert_eq!(first_target(&bench.sent(1.0)), (STANDBY, false));
 }
 
 #[test]
@@ -191,26 +191,26 @@ fn each_system_counts_its_own_messages_and_the_ground_is_the_terrain_there() {
 }
 
 #[test]
-fn after_a_restart_nothing_is_told_before_it_is_known_anew() {
+fn after_a_restart_nothing_is_sent_before_it_is_known_anew() {
     let mut bench = Bench::new();
     bench.estimate(1.0, TrackStatus::Tracking, 0.1);
-    assert_eq!(told(&bench.sent(1.0)), (ACTIVE, true));
+    assert_eq!(first_target(&bench.sent(1.0)), (ACTIVE, true));
     // When the program starts again, then it is on standby, and counts from the first message again.
     let mut again = Bench::new();
     let sent = again.sent(2.0);
-    assert_eq!(told(&sent), (STANDBY, false));
+    assert_eq!(first_target(&sent), (STANDBY, false));
     assert_eq!(sent[0].1, 0);
     again.estimate(3.0, TrackStatus::Acquiring, 0.1);
-    assert_eq!(told(&again.sent(3.0)), (STANDBY, false));
+    assert_eq!(first_target(&again.sent(3.0)), (STANDBY, false));
     again.estimate(4.0, TrackStatus::Tracking, 0.1);
-    assert_eq!(told(&again.sent(4.0)), (ACTIVE, true));
+    assert_eq!(first_target(&again.sent(4.0)), (ACTIVE, true));
 }
 
 #[test]
-fn after_a_cut_of_the_link_the_present_is_told_and_nothing_of_before() {
+fn after_a_cut_of_the_link_the_present_is_sent_and_nothing_of_before() {
     let mut bench = Bench::new();
     bench.estimate(1.0, TrackStatus::Tracking, 0.1);
-    assert_eq!(told(&bench.sent(1.0)), (ACTIVE, true));
+    assert_eq!(first_target(&bench.sent(1.0)), (ACTIVE, true));
     let address = bench.receiver.local_addr().expect("an address");
     bench.receiver = UdpSocket::bind("127.0.0.1:0").expect("another");
     for tenths in 11..40 {
@@ -222,7 +222,7 @@ fn after_a_cut_of_the_link_the_present_is_told_and_nothing_of_before() {
     bench.receiver.set_nonblocking(true).expect("set");
     bench.estimate(4.0, TrackStatus::Tracking, 0.1);
     let sent = bench.sent(4.0);
-    assert!(told(&sent).1);
+    assert!(first_target(&sent).1);
     let positions = sent.iter().filter(|(system, _, kind, _)| (*system, *kind) == (42, 33)).count();
     assert_eq!(positions, 1, "one, of the present: {sent:?}");
 }
@@ -247,7 +247,7 @@ fn the_state_is_brought_to_the_moment_of_sending() {
 }
 
 #[test]
-fn what_the_autopilot_takes_for_its_position_is_where_the_vehicle_is_told_from() {
+fn the_vehicle_is_reported_relative_to_the_autopilots_own_position() {
     // Given an autopilot whose receiver differs from ours by 2 m east, and whose altitude shows the ground 5 m lower
     // than configured.
     let mut bench = Bench::sending(vec![MavlinkMessage::FollowTarget, MavlinkMessage::LandingTarget]);
@@ -277,18 +277,18 @@ fn what_the_autopilot_takes_for_its_position_is_where_the_vehicle_is_told_from()
     });
     // It is 3 m north of the helicopter, which points east: 3 m to its left, 7.5 m below.
     let landing = landing.expect("it is relative to the helicopter");
-    let told = Vector3::new(landing.x, landing.y, landing.z);
-    assert!((told - Vector3::new(0.0, -3.0, 7.5)).norm() < 1e-3, "{told}");
+    let reported = Vector3::new(landing.x, landing.y, landing.z);
+    assert!((reported - Vector3::new(0.0, -3.0, 7.5)).norm() < 1e-3, "{reported}");
     assert_eq!((landing.time_usec, landing.frame), (101_000_000, MavFrame::MAV_FRAME_BODY_FRD));
     assert!((landing.angle_x.tan() + 3.0 / 7.5).abs() < 1e-5 && landing.angle_y.abs() < 1e-5);
 }
 
 #[test]
-fn a_foreign_system_with_our_id_is_told_and_we_stand_back() {
+fn a_foreign_system_with_our_id_is_reported_and_we_stand_back() {
     let mut bench = Bench::new();
     bench.estimate(1.0, TrackStatus::Tracking, 0.1);
     let own = bench.sent(1.0);
-    assert_eq!(told(&own), (ACTIVE, true));
+    assert_eq!(first_target(&own), (ACTIVE, true));
     let beat = messages::heartbeat(TrackStatus::Tracking);
     let mut answers = Vec::new();
     let foreign = packet::encode(200, Sender { system: 42, component: 1 }, &beat, None);
@@ -301,7 +301,7 @@ fn a_foreign_system_with_our_id_is_told_and_we_stand_back() {
     let news = bench.sender.news();
     assert!(news[0].fault.as_ref().is_some_and(|fault| fault.contains("another system uses id 42")));
     bench.estimate(12.0, TrackStatus::Tracking, 0.1);
-    assert_eq!(told(&bench.sent(12.0)), (ACTIVE, true));
+    assert_eq!(first_target(&bench.sent(12.0)), (ACTIVE, true));
 }
 
 #[test]
@@ -309,7 +309,7 @@ fn our_own_frames_that_a_router_sends_back_are_no_foreign_system() {
     let mut bench = Bench::new();
     let beat = messages::heartbeat(TrackStatus::Lost);
     let ours = packet::encode(0, Sender { system: 42, component: 1 }, &beat, None);
-    assert_eq!(told(&bench.sent(0.0)), (STANDBY, false));
+    assert_eq!(first_target(&bench.sent(0.0)), (STANDBY, false));
     bench.sender.datagram(&ours, START + Span::from_s(0.1), None, &mut Vec::new());
     assert_eq!(bench.sender.counts().foreign, 0);
 }

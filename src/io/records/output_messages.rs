@@ -142,14 +142,14 @@ pub(super) fn annotations(
 }
 
 /// An attitude as a device reported it, valid at `t`.
-pub(super) fn attitude(t: MonoTime, heard: MonoTime, sample: &AttitudeSample) -> wh::Attitude {
+pub(super) fn attitude(t: MonoTime, t_recv: MonoTime, sample: &AttitudeSample) -> wh::Attitude {
     wh::Attitude {
         timestamp: stamp(t),
         heading_rad: sample.heading,
         heading_is_true: sample.heading_is_true,
         pitch_rad: sample.tilt.map(|t| t.pitch),
         roll_rad: sample.tilt.map(|t| t.roll),
-        heard: stamp(heard),
+        heard: stamp(t_recv),
     }
 }
 

@@ -50,10 +50,10 @@ pub fn state(message: &windhover::WarmState) -> Option<WarmState> {
 
 fn filter(message: &windhover::WarmState) -> Option<WarmFilter> {
     let mut covariance = [[0.0; WARM_STATES]; WARM_STATES];
-    let mut told = message.filter_covariance.iter();
+    let mut values = message.filter_covariance.iter();
     for i in 0..WARM_STATES {
         for j in i..WARM_STATES {
-            let value = *told.next()?;
+            let value = *values.next()?;
             (covariance[i][j], covariance[j][i]) = (value, value);
         }
     }
@@ -137,8 +137,8 @@ mod tests {
         uneven.offset_ns.pop();
         let mut longer = whole;
         longer.filter_mean.push(0.0);
-        for told in [short, uneven, longer] {
-            assert_eq!(state(&told), None);
+        for message in [short, uneven, longer] {
+            assert_eq!(state(&message), None);
         }
     }
 }

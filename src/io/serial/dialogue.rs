@@ -24,14 +24,14 @@ impl Dialogue<'_> {
     /// Reads the line for a while; returns whether `enough` was satisfied.
     pub(super) async fn listen(&mut self, enough: impl Fn(&[u8]) -> bool + Send) -> Result<bool, Fault> {
         let limit = self.clock.now() + LISTEN;
-        let (mut heard, mut buffer) = (Vec::new(), vec![0; READ_BYTES]);
+        let (mut received, mut buffer) = (Vec::new(), vec![0; READ_BYTES]);
         loop {
             let read = wait_for(self.line.read(&mut buffer), self.reports);
             let Ok(read) = tokio::time::timeout(left(limit, self.clock), read).await else {
                 return Ok(false);
             };
-            heard.extend_from_slice(&buffer[..read?]);
-            if enough(&heard) {
+            received.extend_from_slice(&buffer[..read?]);
+            if enough(&received) {
                 return Ok(true);
             }
         }

@@ -8,7 +8,7 @@ use windhover_decode::ubx_packets;
 /// speed gives.
 #[derive(Debug, Default)]
 pub(super) struct TextShare {
-    heard: Vec<u8>,
+    window: Vec<u8>,
     /// Windows without anything valid since the last that had something valid.
     unsound: u32,
     /// Windows with both binary bytes and something valid.
@@ -33,22 +33,22 @@ impl TextShare {
     /// device that mixes binary packets into its text is not garbled: a valid sentence or packet shows that the speed
     /// is right.
     pub(super) fn garbled(&mut self, bytes: &[u8]) -> Option<usize> {
-        self.heard.extend_from_slice(bytes);
+        self.window.extend_from_slice(bytes);
         // The bytes of a device that may send packets are examined in pieces that contain a whole one.
-        let window = if self.heard.contains(&0xB5) { WINDOW + KEPT } else { WINDOW };
-        if self.heard.len() < window {
+        let length = if self.window.contains(&0xB5) { WINDOW + KEPT } else { WINDOW };
+        if self.window.len() < length {
             return None;
         }
         let odd =
-            self.heard.iter().filter(|byte| !matches!(byte, b' '..=b'~' | b'\r' | b'\n' | b'\t')).count();
-        let percent = odd * 100 / self.heard.len();
-        let is_packets = percent >= GARBLED_PERCENT && holds_packets(&self.heard);
-        if is_packets || percent >= GARBLED_PERCENT && holds_a_sentence(&self.heard) {
+            self.window.iter().filter(|byte| !matches!(byte, b' '..=b'~' | b'\r' | b'\n' | b'\t')).count();
+        let percent = odd * 100 / self.window.len();
+        let is_packets = percent >= GARBLED_PERCENT && holds_packets(&self.window);
+        if is_packets || percent >= GARBLED_PERCENT && holds_a_sentence(&self.window) {
             (self.mixed, self.unsound) = (self.mixed.saturating_add(1), 0);
         } else {
             self.unsound += 1;
         }
-        self.heard.clear();
+        self.window.clear();
         let is_mixed = is_packets || self.mixed >= MIXES && self.unsound <= UNSOUND_MAX;
         (percent >= GARBLED_PERCENT && !is_mixed).then_some(percent)
     }

@@ -27,21 +27,21 @@ const SENTENCES: [(&str, bool); 7] = [
 pub(super) struct GarminSetup {
     next: usize,
     asked: Option<MonoTime>,
-    heard: Vec<u8>,
+    received: Vec<u8>,
     accepted: u32,
 }
 
 impl GarminSetup {
     pub(super) const fn new() -> Self {
-        Self { next: 0, asked: None, heard: Vec::new(), accepted: 0 }
+        Self { next: 0, asked: None, received: Vec::new(), accepted: 0 }
     }
 
     /// Adds bytes that the receiver sent.
-    pub(super) fn heard(&mut self, bytes: &[u8]) {
+    pub(super) fn received(&mut self, bytes: &[u8]) {
         const KEEP: usize = 2048;
-        self.heard.extend_from_slice(bytes);
-        let excess = self.heard.len().saturating_sub(KEEP);
-        self.heard.drain(..excess);
+        self.received.extend_from_slice(bytes);
+        let excess = self.received.len().saturating_sub(KEEP);
+        self.received.drain(..excess);
     }
 
     /// What to do at `now`.
@@ -52,7 +52,7 @@ impl GarminSetup {
             };
             let Some(asked) = self.asked else {
                 self.asked = Some(now);
-                self.heard.clear();
+                self.received.clear();
                 return Step::Send(sentence(body).into_bytes());
             };
             match self.answer(body) {
@@ -78,13 +78,13 @@ impl GarminSetup {
     /// Whether the receiver echoed `body` (more fields at its end are accepted), with other values, or not at all
     /// (`None`).
     fn answer(&self, body: &str) -> Option<bool> {
-        let text = String::from_utf8_lossy(&self.heard);
+        let text = String::from_utf8_lossy(&self.received);
         let name = body.split(',').next().unwrap_or(body);
         let echo = bodies(&text).find(|echo| echo.split(',').next() == Some(name))?;
         let same = body
             .split(',')
             .zip(echo.split(',').chain(std::iter::repeat("")))
-            .all(|(asked, told)| asked.is_empty() || asked == told);
+            .all(|(asked, answered)| asked.is_empty() || asked == answered);
         Some(same)
     }
 }
@@ -120,7 +120,7 @@ mod tests {
                 Step::Wait(_) => {}
                 Step::Send(sentence) => {
                     if let Some(echo) = answer(&String::from_utf8_lossy(&sentence)) {
-                        setup.heard(echo.as_bytes());
+                        setup.received(echo.as_bytes());
                     }
                 }
                 end => return end,

@@ -37,11 +37,11 @@ pub(super) async fn settle(mut talk: Dialogue<'_>) -> Result<(), Fault> {
             continue;
         }
         send(&mut talk, &format!("PGRMC,,,,,,,,,,{code}")).await?;
-        let heard = talk.listen(|bytes| answered(&text(bytes), code)).await?;
+        let received = talk.listen(|bytes| answered(&text(bytes), code)).await?;
         send(&mut talk, RESET).await?;
         // The echo still has the old speed; the new one takes effect after the reset.
         talk.listen(|bytes| bodies(&text(bytes)).any(|body| body.starts_with("PGRMI"))).await?;
-        talk.note(heard, format!("the receiver used {speed} baud and was set to {wanted}"));
+        talk.note(received, format!("the receiver used {speed} baud and was set to {wanted}"));
         break;
     }
     talk.line.set_speed(wanted).await
@@ -86,7 +86,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sentences_are_told_from_noise() {
+    fn sentences_are_distinguished_from_noise() {
         assert!(holds_a_sentence(&format!("\u{fffd}x${}", sentence("GPRMC,1").trim_start_matches('$'))));
         assert!(!holds_a_sentence("$GPRMC,1*00\r\n$GP"));
         assert!(answered(&sentence("PGRMC,A,,100,,,,,,A,8,,2,4,"), 8));

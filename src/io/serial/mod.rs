@@ -125,7 +125,7 @@ impl Reader<'_> {
             (self.reports)(Report::Bytes(self.clock.now(), bytes.to_vec()));
             backoff.reset();
             if let Some(setup) = &mut setup {
-                setup.heard(bytes);
+                setup.received(bytes);
             }
             self.judge(&mut share, bytes);
         }
@@ -193,10 +193,10 @@ enum Running {
 }
 
 impl Running {
-    fn heard(&mut self, bytes: &[u8]) {
+    fn received(&mut self, bytes: &[u8]) {
         match self {
-            Self::Garmin(setup) => setup.heard(bytes),
-            Self::Ublox(setup) => setup.heard(bytes),
+            Self::Garmin(setup) => setup.received(bytes),
+            Self::Ublox(setup) => setup.received(bytes),
         }
     }
 

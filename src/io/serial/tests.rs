@@ -95,8 +95,8 @@ fn bytes_arrive_and_a_lost_line_comes_back() {
     let line = Line::start(&link.to_string_lossy(), false);
     line.up();
     far.write_all(b"$GPRMC").expect("sent");
-    let heard = line.wait(|r| if let Report::Bytes(_, bytes) = r { Some(bytes) } else { None });
-    assert_eq!(heard, b"$GPRMC");
+    let received = line.wait(|r| if let Report::Bytes(_, bytes) = r { Some(bytes) } else { None });
+    assert_eq!(received, b"$GPRMC");
 
     // When the far end disappears, then the fault is unplugged, then missing.
     std::fs::remove_file(&link).expect("unlinked");
@@ -109,8 +109,8 @@ fn bytes_arrive_and_a_lost_line_comes_back() {
     std::os::unix::fs::symlink(&name, &link).expect("linked");
     line.up();
     far.write_all(b"again").expect("sent");
-    let heard = line.wait(|r| if let Report::Bytes(_, bytes) = r { Some(bytes) } else { None });
-    assert_eq!(heard, b"again");
+    let received = line.wait(|r| if let Report::Bytes(_, bytes) = r { Some(bytes) } else { None });
+    assert_eq!(received, b"again");
 }
 
 #[test]
@@ -166,11 +166,11 @@ fn speed(line: &File) -> u32 {
 fn garmin_at(mut far: File, mut own: u32, mut binary: bool) {
     let asked = received_at(&far);
     std::thread::spawn(move || {
-        let (mut heard, mut told) = (String::new(), own);
+        let (mut received, mut commanded) = (String::new(), own);
         loop {
             let said = asked.recv_timeout(Duration::from_millis(200)).unwrap_or_default();
             if speed(&far) != own {
-                heard.clear();
+                received.clear();
                 if far.write_all(&[0xf8, 0x00, 0x9e, 0xe6]).is_err() {
                     return;
                 }
@@ -184,17 +184,17 @@ fn garmin_at(mut far: File, mut own: u32, mut binary: bool) {
                 }
                 continue;
             }
-            heard.push_str(&String::from_utf8_lossy(&said));
+            received.push_str(&String::from_utf8_lossy(&said));
             let mut answers = garmin::sentence("GPRMC,150400.0,A,3842.2,N,00911.0,W,0,0,181126,,");
-            while let Some((one, rest)) = heard.split_once("\r\n") {
+            while let Some((one, rest)) = received.split_once("\r\n") {
                 let body = one.trim_start_matches('$').split('*').next().unwrap_or_default();
                 match body.split(',').collect::<Vec<_>>().as_slice() {
-                    ["PGRMC", .., "8"] => told = 38_400,
-                    ["PGRMI", .., "R"] => own = told,
+                    ["PGRMC", .., "8"] => commanded = 38_400,
+                    ["PGRMI", .., "R"] => own = commanded,
                     _ => {}
                 }
                 answers.push_str(&garmin::sentence(body));
-                heard = rest.to_owned();
+                received = rest.to_owned();
             }
             if far.write_all(answers.as_bytes()).is_err() {
                 return;
@@ -224,7 +224,7 @@ fn a_receiver_at_another_speed_is_brought_to_the_configured_one() {
 }
 
 #[test]
-fn a_receiver_left_in_binary_mode_is_told_to_speak_nmea() {
+fn a_receiver_left_in_binary_mode_is_set_to_nmea() {
     let (far, name) = pty();
     garmin_at(far, 38_400, true);
     let line = Line::start(&name, true);
@@ -307,7 +307,7 @@ fn a_line_is_framed_as_configured() {
 }
 
 /// The bytes that a line reports, in one piece.
-fn heard(line: &Line, count: usize) -> Vec<u8> {
+fn received(line: &Line, count: usize) -> Vec<u8> {
     let mut all = Vec::new();
     while all.len() < count {
         all.extend(line.wait(|r| if let Report::Bytes(_, bytes) = r { Some(bytes) } else { None }));
@@ -323,13 +323,13 @@ fn a_device_behind_tcp_is_read_and_connected_anew() {
     let (mut peer, _) = server.accept().expect("connected");
     line.up();
     peer.write_all(b"$GPRMC").expect("sent");
-    assert_eq!(heard(&line, 6), b"$GPRMC");
+    assert_eq!(received(&line, 6), b"$GPRMC");
     drop(peer);
     assert_eq!(line.fault().kind, FaultKind::Unplugged);
     let (mut peer, _) = server.accept().expect("connected again");
     line.up();
     peer.write_all(b"again").expect("sent");
-    assert_eq!(heard(&line, 5), b"again");
+    assert_eq!(received(&line, 5), b"again");
     drop((peer, server));
     assert_eq!(line.fault().kind, FaultKind::Unplugged);
     assert_eq!(line.fault().kind, FaultKind::Missing, "no program listens there any more");
@@ -356,6 +356,6 @@ fn datagrams_are_read_from_whoever_sends_them() {
     for text in [b"$GPGGA", b"$GPRMC"] {
         let sender = std::net::UdpSocket::bind("127.0.0.1:0").expect("a port");
         sender.send_to(text, free).expect("sent");
-        assert_eq!(heard(&line, 6), text);
+        assert_eq!(received(&line, 6), text);
     }
 }

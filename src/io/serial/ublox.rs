@@ -60,7 +60,7 @@ pub(super) struct UbloxSetup {
     has_keys: bool,
     requests: std::vec::IntoIter<Request>,
     asked: Option<(Request, MonoTime)>,
-    heard: Vec<u8>,
+    received: Vec<u8>,
     accepted: u32,
     /// For a group of which one must be accepted: whether one was.
     one_of: Option<(bool, &'static str)>,
@@ -69,16 +69,16 @@ pub(super) struct UbloxSetup {
 impl UbloxSetup {
     pub(super) fn new(rate_hz: f64, keep_text: bool) -> Self {
         let requests = by_keys(rate_hz, keep_text).into_iter();
-        let (asked, heard, one_of) = (None, Vec::new(), None);
-        Self { rate_hz, keep_text, has_keys: true, requests, asked, heard, accepted: 0, one_of }
+        let (asked, received, one_of) = (None, Vec::new(), None);
+        Self { rate_hz, keep_text, has_keys: true, requests, asked, received, accepted: 0, one_of }
     }
 
     /// Adds bytes that the receiver sent.
-    pub(super) fn heard(&mut self, bytes: &[u8]) {
+    pub(super) fn received(&mut self, bytes: &[u8]) {
         const KEEP: usize = 4096;
-        self.heard.extend_from_slice(bytes);
-        let excess = self.heard.len().saturating_sub(KEEP);
-        self.heard.drain(..excess);
+        self.received.extend_from_slice(bytes);
+        let excess = self.received.len().saturating_sub(KEEP);
+        self.received.drain(..excess);
     }
 
     /// What to do at `now`.
@@ -123,7 +123,7 @@ impl UbloxSetup {
         }
         let Some(request) = next else { return Some(Step::Accepted(self.accepted)) };
         let packet = ubx_framed(CFG, request.identity, &request.payload);
-        self.heard.clear();
+        self.received.clear();
         self.asked = Some((request, now));
         Some(Step::Send(packet))
     }
@@ -133,7 +133,7 @@ impl UbloxSetup {
         let of = |(class, id, payload): (u8, u8, &[u8])| {
             (class == ACK && payload.starts_with(&[CFG, identity])).then_some(id == 1)
         };
-        ubx_packets(&self.heard).find_map(of)
+        ubx_packets(&self.received).find_map(of)
     }
 }
 
@@ -207,12 +207,12 @@ mod tests {
                     let (class, identity, payload) = ubx_packets(&packet).next().expect("a packet");
                     assert_eq!(class, CFG);
                     // Between solutions, in two reads, after an answer to another packet.
-                    setup.heard(&ubx_framed(1, 7, &[0; 92]));
-                    setup.heard(&ubx_framed(ACK, 1, &[CFG, 0x77]));
+                    setup.received(&ubx_framed(1, 7, &[0; 92]));
+                    setup.received(&ubx_framed(ACK, 1, &[CFG, 0x77]));
                     if let Some(yes) = answer(identity, payload) {
                         let packet = ubx_framed(ACK, u8::from(yes), &[CFG, identity]);
-                        setup.heard(&packet[..4]);
-                        setup.heard(&packet[4..]);
+                        setup.received(&packet[..4]);
+                        setup.received(&packet[4..]);
                     }
                     sent.push(packet);
                 }
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_such_receiver_is_told() {
+    fn another_receiver_is_reported() {
         let (silent, sent) = run(false, |_, _| None);
         assert!(
             matches!(&silent, Step::Refused(why) if why.contains("did not answer the rate")),

@@ -74,7 +74,7 @@ pub(super) fn run(
     let mut channels = Channels::default();
     // Time of the newest event: items without a time get it. The clock may be seconds ahead where the pipeline is
     // behind, and readers sort messages over one second only.
-    let mut heard_ns = None;
+    let mut newest_ns = None;
     let states = ChannelDef::json(STATE_TOPIC);
     let states = Arc::new(ChannelDef { message_encoding: "windhover.state".into(), ..(*states).clone() });
     loop {
@@ -87,7 +87,7 @@ pub(super) fn run(
             Work::Event(event) => encode_event(&event, frames, shared, &mut channels),
             Work::Record(record, number) => Some(channels.raw(&record, number, Weight::of(record.schema))),
             Work::State(name, blob) => {
-                let at = heard_ns.unwrap_or_else(|| unsigned(now()));
+                let at = newest_ns.unwrap_or_else(|| unsigned(now()));
                 let data = state_message(&name, &blob).into();
                 let channel = Arc::clone(&states);
                 Some(RawRecord {
@@ -101,7 +101,7 @@ pub(super) fn run(
             }
         };
         if let Some(raw) = raw {
-            heard_ns = heard_ns.max(Some(raw.log_ns));
+            newest_ns = newest_ns.max(Some(raw.log_ns));
             let topic = raw.channel.topic.clone().into();
             output.push(Entry {
                 bytes: raw.bytes(),

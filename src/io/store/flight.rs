@@ -153,9 +153,9 @@ pub fn name_flight(volume: &Volume, name: &str, start: UtcTime) -> StoreResult<S
 /// The content of `flight.json`, or of the segments where there is none.
 pub fn flight_info(root: &Path, name: &str) -> StoreResult<FlightInfo> {
     let dir = root.join(FLIGHTS).join(name);
-    let told = std::fs::read(dir.join(FLIGHT_FILE)).ok();
-    let told = told.and_then(|bytes| serde_json::from_slice::<FlightInfo>(&bytes).ok());
-    let mut info = match told {
+    let stored = std::fs::read(dir.join(FLIGHT_FILE)).ok();
+    let stored = stored.and_then(|bytes| serde_json::from_slice::<FlightInfo>(&bytes).ok());
+    let mut info = match stored {
         Some(info) => info,
         None => summarize(&dir)?,
     };
@@ -195,8 +195,8 @@ pub fn summarize(dir: &Path) -> StoreResult<FlightInfo> {
 
 /// The run of the daemon a flight belongs to, from `flight.json` or any segment's head.
 pub fn session_of(dir: &Path) -> Option<u32> {
-    let told = std::fs::read(dir.join(FLIGHT_FILE)).ok();
-    if let Some(info) = told.and_then(|bytes| serde_json::from_slice::<FlightInfo>(&bytes).ok()) {
+    let stored = std::fs::read(dir.join(FLIGHT_FILE)).ok();
+    if let Some(info) = stored.and_then(|bytes| serde_json::from_slice::<FlightInfo>(&bytes).ok()) {
         return Some(info.session);
     }
     segment_names(dir).iter().find_map(|name| {
@@ -261,7 +261,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn flight_names_are_told_from_others() {
+    fn flight_names_are_distinguished_from_others() {
         for name in ["20261122T074438Z", "20261122T074438Z-2", "boot-7", "boot-7-2"] {
             assert!(is_flight_name(name), "{name}");
         }

@@ -51,8 +51,8 @@ pub struct FlightWriter {
 
 /// The number of this run of the daemon on this card: one more than the last, stored durably.
 pub fn next_session(volume: &Volume) -> StoreResult<u32> {
-    let told = std::fs::read_to_string(volume.path(SESSION_FILE)).ok();
-    let last = match told.and_then(|text| text.trim().parse::<u32>().ok()) {
+    let text = std::fs::read_to_string(volume.path(SESSION_FILE)).ok();
+    let last = match text.and_then(|text| text.trim().parse::<u32>().ok()) {
         Some(last) => last,
         // Lost or never there: derived from the flights.
         None => flight::flight_names(volume.root())?

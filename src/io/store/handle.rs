@@ -61,7 +61,7 @@ impl Store {
         config_toml: String,
         clock: HostClock,
     ) -> (Self, Receiver<StoreNotice>) {
-        let (notices, heard) = sync_channel(256);
+        let (notices, received) = sync_channel(256);
         let (to_keeper, inbox) = sync_channel(256);
         let shared = Arc::new(StoreShared::new(notices));
         let half = (store.queue_mb as usize) << 19;
@@ -89,7 +89,7 @@ impl Store {
         let keeper = spawn("store-keep", move || keeper.run(&inbox));
         let handle =
             StoreHandle { intake, shared, keeper: to_keeper, region_margin_px: store.region_margin_px };
-        (Self { handle, writers: encode.into_iter().chain(write).collect(), keeper }, heard)
+        (Self { handle, writers: encode.into_iter().chain(write).collect(), keeper }, received)
     }
 
     /// A further handle.
@@ -164,11 +164,11 @@ impl StoreHandle {
     }
 
     /// Waits for information from the card, as long as there is a card to record on.
-    fn wait_for<T>(&self, wait: Duration, told: impl Fn() -> Option<T>) -> Option<T> {
+    fn wait_for<T>(&self, wait: Duration, poll: impl Fn() -> Option<T>) -> Option<T> {
         const STEP: Duration = Duration::from_millis(10);
         for _ in 0..=wait.as_millis() / STEP.as_millis() {
-            if let Some(told) = told() {
-                return Some(told);
+            if let Some(answer) = poll() {
+                return Some(answer);
             }
             if matches!(self.shared.status().recording, Recording::Stopped(_)) {
                 return None;
@@ -209,8 +209,8 @@ impl StoreHandle {
     /// Identity of this run, under which numbered records are stored. Waits up to five seconds for the card; without
     /// one it is a number that no card has, and numbered records are not queued.
     pub fn run(&self) -> u32 {
-        let told = self.wait_for(WAIT_FOR_RUN, || self.shared.session());
-        told.unwrap_or_else(|| self.shared.settle_session(rand::random::<u32>() | 0x8000_0000))
+        let session = self.wait_for(WAIT_FOR_RUN, || self.shared.session());
+        session.unwrap_or_else(|| self.shared.settle_session(rand::random::<u32>() | 0x8000_0000))
     }
 
     /// A station has every number of a run below `through` on its disk.

@@ -239,7 +239,7 @@ fn a_broken_index_is_made_again_from_the_segments() {
 }
 
 #[test]
-fn what_an_earlier_run_knew_is_told_before_a_slow_card_has_begun_a_flight() {
+fn the_state_of_an_earlier_run_is_read_before_a_slow_card_has_begun_a_flight() {
     // Given a state on a card.
     let dir = tempfile::tempdir().unwrap();
     let (clock, journal) = (HostClock::start(), Arc::new(Journal::default()));
@@ -254,12 +254,12 @@ fn what_an_earlier_run_knew_is_told_before_a_slow_card_has_begun_a_flight() {
     // When the next run finds a card that is slow to begin a flight.
     journal.set_held(true);
     let (store, notices) = start();
-    let told = store.handle().state("warm", Duration::from_secs(30));
+    let state = store.handle().state("warm", Duration::from_secs(30));
     let begun = store.handle().status().flight;
     journal.set_held(false);
 
     // Then the state is available meanwhile, and the flight still begins; nothing of it is sealed.
-    assert_eq!((told, begun), (Some(vec![1, 2, 3]), String::new()));
+    assert_eq!((state, begun), (Some(vec![1, 2, 3]), String::new()));
     expect_notice(&notices, "index_ready");
     store.handle().event(&gps(&clock, 1));
     store.stop();
@@ -321,7 +321,7 @@ fn what_a_daemon_far_behind_records_is_read_in_the_order_it_was_handled() {
 }
 
 #[test]
-fn a_flight_that_is_removed_while_it_is_written_is_told_and_begun_anew() {
+fn a_flight_that_is_removed_while_it_is_written_is_reported_and_begun_anew() {
     // Given a flight on the card.
     let dir = tempfile::tempdir().unwrap();
     let clock = HostClock::start();

@@ -372,12 +372,12 @@ pub fn describe(sealing: &Sealing) -> String {
 }
 
 /// Seals all segments of a flight and writes its `flight.json`; a flight without any remaining segment is removed
-/// (`None`). `told` is called for every segment that was not complete.
+/// (`None`). `report` is called for every segment that was not complete.
 pub fn settle_flight(
     volume: &Volume,
     name: &str,
     deep: bool,
-    mut told: impl FnMut(&str, &Sealing),
+    mut report: impl FnMut(&str, &Sealing),
 ) -> StoreResult<Option<FlightInfo>> {
     let dir = format!("{FLIGHTS}/{name}");
     let mut repaired = 0;
@@ -385,7 +385,7 @@ pub fn settle_flight(
         let sealing = seal::seal_segment(volume, &dir, &segment, deep)?;
         if sealing != Sealing::Whole {
             repaired += 1;
-            told(&format!("{name}/{segment}"), &sealing);
+            report(&format!("{name}/{segment}"), &sealing);
         }
     }
     if flight::segment_names(&volume.path(&dir)).is_empty() {

@@ -64,8 +64,8 @@ fn queue_of(segment: &SegmentFile, sealed: &SealedSegment, index: &Index) -> Vec
         .map(|c| c.id)
         .collect();
     // Numbers of a run without a card at its start are not the card's: they stay in the segments.
-    let told = |key: &str| sealed.metadata.get(key).and_then(|v| v.parse::<u32>().ok());
-    let run = told("session").filter(|session| told("run").is_none_or(|run| run == *session));
+    let number = |key: &str| sealed.metadata.get(key).and_then(|v| v.parse::<u32>().ok());
+    let run = number("session").filter(|session| number("run").is_none_or(|run| run == *session));
     let mut changes = Vec::new();
     let mut states = BTreeMap::new();
     for chunk in &sealed.chunks {
@@ -126,16 +126,16 @@ impl std::fmt::Display for Difference {
 
 /// Differences between the index and the closed flights on the card, one line each.
 pub fn differences(root: &Path, index: &Index) -> StoreResult<Vec<Difference>> {
-    let mut told = Vec::new();
+    let mut differences = Vec::new();
     let names = flight::flight_names(root)?;
     let known: BTreeMap<String, u32> = index.flights().into_iter().map(|(run, name)| (name, run)).collect();
     let entries: BTreeMap<(u32, u32), SegmentEntry> = index.segments().into_iter().collect();
     for name in known.keys().filter(|name| !names.contains(name)) {
-        told.push(Difference::NotOnCard(name.clone()));
+        differences.push(Difference::NotOnCard(name.clone()));
     }
     for name in &names {
         let Some(run) = known.get(name) else {
-            told.push(Difference::NotInIndex(name.clone()));
+            differences.push(Difference::NotInIndex(name.clone()));
             continue;
         };
         let dir = root.join(FLIGHTS).join(name);
@@ -143,13 +143,13 @@ pub fn differences(root: &Path, index: &Index) -> StoreResult<Vec<Difference>> {
             let segment = SegmentFile::open(&dir.join(&segment_name))?;
             let (Some(sealed), Some(number)) = (segment.sealed(), number_of(&segment_name)) else { continue };
             match entries.get(&(*run, number)) {
-                None => told.push(Difference::NotInIndex(format!("{name}/{segment_name}"))),
+                None => differences.push(Difference::NotInIndex(format!("{name}/{segment_name}"))),
                 Some(entry) if *entry != entry_of(&segment, &sealed) => {
-                    told.push(Difference::Otherwise(format!("{name}/{segment_name}")));
+                    differences.push(Difference::Otherwise(format!("{name}/{segment_name}")));
                 }
                 Some(_) => {}
             }
         }
     }
-    Ok(told)
+    Ok(differences)
 }

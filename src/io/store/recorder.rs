@@ -53,7 +53,7 @@ pub(super) struct Recorder {
     trouble: Option<String>,
     retry_at: MonoTime,
     /// Log time of the newest record taken, ns.
-    heard_ns: Option<u64>,
+    newest_ns: Option<u64>,
     missed: Drops,
     uncommitted: Drops,
     changes: Vec<Change>,
@@ -81,7 +81,7 @@ impl Recorder {
             flight: None,
             trouble: None,
             retry_at: clock.now(),
-            heard_ns: None,
+            newest_ns: None,
             missed: Drops::default(),
             uncommitted: Drops::default(),
             changes: Vec::new(),
@@ -122,7 +122,7 @@ impl Recorder {
     }
 
     fn take(&mut self, record: &RawRecord) {
-        self.heard_ns = self.heard_ns.max(Some(record.log_ns));
+        self.newest_ns = self.newest_ns.max(Some(record.log_ns));
         if !self.is_open() {
             self.missed.add(&record.channel.topic, record.data.len(), record.log_ns);
             return;
@@ -332,7 +332,7 @@ impl Recorder {
         let missed = std::mem::take(&mut self.missed);
         let (messages, bytes) = (missed.count(), missed.bytes);
         let (from_ns, to_ns) = missed.span_ns.unwrap_or_default();
-        let told = serde_json::json!({
+        let losses = serde_json::json!({
             "from_ns": from_ns,
             "to_ns": to_ns,
             "bytes": bytes,
@@ -340,13 +340,13 @@ impl Recorder {
             "reason": self.trouble.as_deref().unwrap_or("the card did not keep up"),
         });
         // At its place in time among the others, not before waiting records.
-        let at = self.heard_ns.unwrap_or(unsigned(now));
+        let at = self.newest_ns.unwrap_or(unsigned(now));
         self.take(&RawRecord {
             channel: Arc::clone(&self.dropouts),
             log_ns: at,
             publish_ns: at,
             sequence: 0,
-            data: told.to_string().into_bytes().into(),
+            data: losses.to_string().into_bytes().into(),
             weight: Weight::Small,
         });
         self.shared.notice(StoreNotice::Dropout { messages, bytes });

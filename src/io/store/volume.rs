@@ -40,8 +40,8 @@ pub type StoreResult<T> = Result<T, StoreError>;
 
 /// The file system of a path.
 pub fn device_of(path: &Path) -> StoreResult<u64> {
-    let told = std::fs::metadata(path).map_err(|e| StoreError::new("find the data card at", path, e))?;
-    Ok(told.dev())
+    let metadata = std::fs::metadata(path).map_err(|e| StoreError::new("find the data card at", path, e))?;
+    Ok(metadata.dev())
 }
 
 /// A directory tree on the card. Paths given to it are relative to its root.

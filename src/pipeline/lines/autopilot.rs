@@ -11,7 +11,7 @@ use windhover_decode::{AutopilotDecoder, AutopilotMeasurement, DecodeCounts, Rec
 pub(in crate::pipeline) struct AutopilotLine {
     config: AutopilotConfig,
     decoder: AutopilotDecoder,
-    heard: Vec<ReceivedAutopilot>,
+    received: Vec<ReceivedAutopilot>,
     /// Whether it replaces the compass; the same for the receiver.
     is_compass: bool,
     is_receiver: bool,
@@ -22,7 +22,7 @@ impl AutopilotLine {
     pub(super) fn new(config: &AutopilotConfig, rig: &Rig) -> Self {
         Self {
             decoder: AutopilotDecoder::new(config.system_id),
-            heard: Vec::new(),
+            received: Vec::new(),
             is_compass: !rig.compass.is_there(),
             is_receiver: !rig.gps.is_there() && config.gives(AutopilotUse::Gps),
             gps_latency: Span::from_ms(rig.gps.latency_ms),
@@ -33,9 +33,9 @@ impl AutopilotLine {
 
 impl SourceLine for AutopilotLine {
     fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<SensorReading>) {
-        self.decoder.push(bytes, t_recv, &mut self.heard);
+        self.decoder.push(bytes, t_recv, &mut self.received);
         let gives = |what| self.config.gives(what);
-        for ReceivedAutopilot { t, measurement } in self.heard.drain(..) {
+        for ReceivedAutopilot { t, measurement } in self.received.drain(..) {
             match measurement {
                 AutopilotMeasurement::Attitude(value) if gives(AutopilotUse::Attitude) => {
                     let sample = Stamped { t_valid: t, t_recv, seq, value };

@@ -10,7 +10,7 @@ use windhover_decode::{CompassDecoder, DecodeCounts, ReceivedAttitude};
 /// Compass bytes to samples at their time of validity.
 pub(in crate::pipeline) struct CompassLine {
     decoder: CompassDecoder,
-    heard: Vec<ReceivedAttitude>,
+    received: Vec<ReceivedAttitude>,
     clock: SteadyClock,
     /// Of rates and forces that come in sentences of their own.
     inertial_clock: SteadyClock,
@@ -24,7 +24,7 @@ impl CompassLine {
     pub(super) fn new(config: &CompassConfig, inertial_latency_ms: f64) -> Self {
         Self {
             decoder: CompassDecoder::new(config.format).checksums_required(config.require_checksum),
-            heard: Vec::new(),
+            received: Vec::new(),
             clock: SteadyClock::new(),
             inertial_clock: SteadyClock::new(),
             wire: Wire::new(config.framing, config.baud),
@@ -36,17 +36,17 @@ impl CompassLine {
 
 impl CompassLine {
     fn stamp(&mut self, seq: u64, out: &mut Vec<SensorReading>) {
-        for heard in self.heard.drain(..) {
-            let length = heard.bytes + heard.bytes_after;
-            let alone = heard.reading.is_inertial_only();
+        for received in self.received.drain(..) {
+            let length = received.bytes + received.bytes_after;
+            let alone = received.reading.is_inertial_only();
             let clock = if alone { &mut self.inertial_clock } else { &mut self.clock };
-            let began = clock.smooth(heard.t_first - self.wire.time(length));
-            let t_recv = heard.t_recv;
+            let began = clock.smooth(received.t_first - self.wire.time(length));
+            let t_recv = received.t_recv;
             if !alone {
-                let sample = Stamped { t_valid: began - self.latency, t_recv, seq, value: heard.sample };
+                let sample = Stamped { t_valid: began - self.latency, t_recv, seq, value: received.sample };
                 out.push(SensorReading::Attitude(sample));
             }
-            let inertial = self.inertial_latency.zip(heard.reading.inertial);
+            let inertial = self.inertial_latency.zip(received.reading.inertial);
             if let Some((latency, value)) = inertial.filter(|(_, sample)| sample.can_be()) {
                 out.push(SensorReading::Inertial(Stamped { t_valid: began - latency, t_recv, seq, value }));
             }
@@ -56,17 +56,17 @@ impl CompassLine {
 
 impl SourceLine for CompassLine {
     fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<SensorReading>) {
-        self.decoder.push(bytes, t_recv, &mut self.heard);
+        self.decoder.push(bytes, t_recv, &mut self.received);
         self.stamp(seq, out);
     }
 
     fn tick(&mut self, now: MonoTime, seq: u64, out: &mut Vec<SensorReading>) {
-        self.decoder.tick(now, &mut self.heard);
+        self.decoder.tick(now, &mut self.received);
         self.stamp(seq, out);
     }
 
     fn finish(&mut self, out: &mut Vec<SensorReading>) {
-        self.decoder.flush(&mut self.heard);
+        self.decoder.flush(&mut self.received);
         self.stamp(u64::MAX, out);
     }
 
@@ -99,7 +99,7 @@ mod tests {
             match (imu, rest) {
                 (false, []) => {}
                 (true, [SensorReading::Inertial(inertial)]) => {
-                    let rate = inertial.value.rate_rps.expect("told");
+                    let rate = inertial.value.rate_rps.expect("reported");
                     assert_eq!((rate.x, rate.y, rate.z), (-0.001, 0.002, -0.003));
                     // Each has its own latency.
                     assert_eq!(inertial.t_valid - attitude.t_valid, Span::from_ms(15.0));

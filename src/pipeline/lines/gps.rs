@@ -12,7 +12,7 @@ const WARM_ARRIVALS: usize = 50;
 /// GPS bytes to epochs at their time of validity.
 pub(in crate::pipeline) struct GpsLine {
     decoder: GnssDecoder,
-    heard: Vec<ReceivedEpoch>,
+    received: Vec<ReceivedEpoch>,
     clock: GnssClock,
     clock_sigma: Option<Span>,
     wire: Wire,
@@ -24,7 +24,7 @@ impl GpsLine {
         let latency = Span::from_ms(config.latency_ms);
         Self {
             decoder: GnssDecoder::new().of_format(config.format).checksums_required(config.require_checksum),
-            heard: Vec::new(),
+            received: Vec::new(),
             clock: GnssClock::new(latency),
             clock_sigma: None,
             wire: Wire::new(config.framing, config.baud),
@@ -33,20 +33,21 @@ impl GpsLine {
     }
 
     fn stamp(&mut self, seq: u64, out: &mut Vec<SensorReading>) {
-        for heard in self.heard.drain(..) {
-            let began = heard.t_first_byte - self.wire.time(heard.bytes_before_end);
-            if let (true, Some(time_of_day_ns)) = (heard.opens_burst, heard.epoch.time_of_day_ns) {
+        for received in self.received.drain(..) {
+            let began = received.t_first_byte - self.wire.time(received.bytes_before_end);
+            if let (true, Some(time_of_day_ns)) = (received.opens_burst, received.epoch.time_of_day_ns) {
                 self.clock.observe(time_of_day_ns, began);
             }
             // An epoch without a time, or one that the time fit cannot place, was valid one latency before its arrival.
-            let fitted = heard.epoch.time_of_day_ns.and_then(|of_day| self.clock.host_time_of(of_day, began));
-            if !heard.opens_burst && fitted.is_none() {
+            let fitted =
+                received.epoch.time_of_day_ns.and_then(|of_day| self.clock.host_time_of(of_day, began));
+            if !received.opens_burst && fitted.is_none() {
                 // A second instant within a burst: neither its arrival nor the fit gives it a time.
                 continue;
             }
             self.clock_sigma = fitted.map(|(_, sigma)| sigma);
             let t_valid = fitted.map_or(began - self.latency, |(t, _)| t);
-            let epoch = Stamped { t_valid, t_recv: heard.t_last_byte, seq, value: heard.epoch };
+            let epoch = Stamped { t_valid, t_recv: received.t_last_byte, seq, value: received.epoch };
             out.push(SensorReading::Gnss(epoch));
         }
     }
@@ -81,17 +82,17 @@ impl GpsLine {
 
 impl SourceLine for GpsLine {
     fn push(&mut self, bytes: &[u8], t_recv: MonoTime, seq: u64, out: &mut Vec<SensorReading>) {
-        self.decoder.push(bytes, t_recv, &mut self.heard);
+        self.decoder.push(bytes, t_recv, &mut self.received);
         self.stamp(seq, out);
     }
 
     fn tick(&mut self, now: MonoTime, seq: u64, out: &mut Vec<SensorReading>) {
-        self.decoder.tick(now, &mut self.heard);
+        self.decoder.tick(now, &mut self.received);
         self.stamp(seq, out);
     }
 
     fn finish(&mut self, out: &mut Vec<SensorReading>) {
-        self.decoder.flush(&mut self.heard);
+        self.decoder.flush(&mut self.received);
         self.stamp(u64::MAX, out);
     }
 

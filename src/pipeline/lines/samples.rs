@@ -70,7 +70,7 @@ mod tests {
     use windhover_base::geo::Tilt;
 
     #[test]
-    fn samples_are_true_a_latency_before_they_are_heard() {
+    fn samples_are_valid_a_latency_before_they_are_received() {
         let mut line = SampleLine::new(20.0);
         let sample = InertialSample { rate_rps: Some(Vector3::x()), force_mps2: None };
         let stamped = line.stamp(&sample, MonoTime::from_ns(50_000_000), 7).expect("it can be");

@@ -24,9 +24,9 @@ const FIRST_SIGMA_MS: f64 = 20.0;
 /// Nanoseconds in a day.
 const DAY_NS: i64 = 86_400 * NS_PER_S;
 /// Longest time from the validity of an epoch to its reception for a stamp by the fit.
-const HEARD_WITHIN: Span = Span::from_ns(1_500_000_000);
+const RECEIVED_WITHIN: Span = Span::from_ns(1_500_000_000);
 /// Longest time by which it may seem to be received before its validity: the fit's error.
-const HEARD_BEFORE: Span = Span::from_ns(50_000_000);
+const RECEIVED_BEFORE: Span = Span::from_ns(50_000_000);
 /// One-sigma of a pulse's stamp: interrupt latency of an idle kernel.
 const PULSE_SIGMA: Span = Span::from_ns(50_000);
 /// Number of epochs whose arrivals determine well enough to which pulse each belongs.
@@ -218,14 +218,14 @@ impl GnssClock {
         if went_back { OffLine::Anew } else { OffLine::Unknown }
     }
 
-    /// Host time at which an epoch of this time of day, received at `heard`, was valid, with one-sigma. `None` before
+    /// Host time at which an epoch of this time of day, received at `t_recv`, was valid, with one-sigma. `None` before
     /// the first epoch, and where the epoch does not agree with earlier ones.
-    pub fn host_time_of(&self, time_of_day_ns: i64, heard: MonoTime) -> Option<(MonoTime, Span)> {
-        let offset_ns = self.offset_ns(heard)?;
-        let days = (heard.ns() - offset_ns - time_of_day_ns + DAY_NS / 2).div_euclid(DAY_NS);
+    pub fn host_time_of(&self, time_of_day_ns: i64, t_recv: MonoTime) -> Option<(MonoTime, Span)> {
+        let offset_ns = self.offset_ns(t_recv)?;
+        let days = (t_recv.ns() - offset_ns - time_of_day_ns + DAY_NS / 2).div_euclid(DAY_NS);
         let t_valid = MonoTime::from_ns(time_of_day_ns + offset_ns + days * DAY_NS);
-        let age = heard - t_valid;
-        (age >= -HEARD_BEFORE && age <= HEARD_WITHIN).then_some((t_valid, self.sigma(heard)))
+        let age = t_recv - t_valid;
+        (age >= -RECEIVED_BEFORE && age <= RECEIVED_WITHIN).then_some((t_valid, self.sigma(t_recv)))
     }
 
     /// Quality of the fit; `None` before the first epoch.

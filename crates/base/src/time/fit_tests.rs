@@ -232,7 +232,7 @@ fn a_pulse_takes_the_latency_out_however_late_the_sentences_come() {
 }
 
 #[test]
-fn pulses_that_are_not_used_are_told() {
+fn pulses_that_are_not_used_are_reported() {
     let ambiguous = Pulsed { period_ms: 200, pulse_ms: 200, delay_ms: 220.0, latency_ms: 120.0 };
     assert_eq!(ambiguous.run(0.0, 1).0.pulse_trouble(), Some(PulseTrouble::Ambiguous));
     let at_once = Pulsed { period_ms: 1_000, pulse_ms: 1_000, delay_ms: 2.0, latency_ms: 120.0 };

@@ -60,7 +60,7 @@ pub struct RemoteClock {
 impl RemoteClock {
     /// A message with the remote time `remote` arrived at `t`. False where that is impossible: the clock jumped, which
     /// is accepted when it happens three times in a row.
-    pub fn heard(&mut self, remote: Span, t: MonoTime) -> bool {
+    pub fn observe(&mut self, remote: Span, t: MonoTime) -> bool {
         self.now = t;
         if self.has_jumped(remote, t) {
             self.jumps += 1;
@@ -88,7 +88,7 @@ impl RemoteClock {
     /// An exchange: sent at `sent`, answered at `remote`, the answer received at `received`.
     pub fn exchanged(&mut self, sent: MonoTime, remote: Span, received: MonoTime) {
         let took = received - sent;
-        if took < Span::default() || took > SLOWEST || !self.heard(remote, received) {
+        if took < Span::default() || took > SLOWEST || !self.observe(remote, received) {
             return;
         }
         let half = Span::from_ns(took.ns() / 2);
@@ -163,7 +163,7 @@ mod tests {
             clock.exchanged(sent, remote(there), there + delay(2 * k + 1));
             for j in 1..10_u32 {
                 let t = sent + Span::from_ms(100.0 * f64::from(j));
-                clock.heard(remote(t), t + delay(7_777 * k + u64::from(j)));
+                clock.observe(remote(t), t + delay(7_777 * k + u64::from(j)));
                 let off = clock.host(remote(t)).expect("known") - t;
                 worst = worst.max(if k > 5 { off.s().abs() } else { 0.0 });
             }
@@ -177,7 +177,7 @@ mod tests {
         let mut clock = RemoteClock::default();
         for k in 0..300_u64 {
             let t = at(0.1 * k as f64);
-            assert!(clock.heard(remote(t), t + delay(k)));
+            assert!(clock.observe(remote(t), t + delay(k)));
         }
         let off = clock.host(remote(at(30.0))).expect("known") - at(30.0);
         assert!((0.0..0.006).contains(&off.s()), "{} s", off.s());
@@ -188,13 +188,13 @@ mod tests {
     fn a_remote_that_starts_anew_is_followed_and_one_odd_message_is_not() {
         let mut clock = RemoteClock::default();
         clock.exchanged(at(0.0), remote(at(0.002)), at(0.004));
-        assert!(!clock.heard(Span::from_s(9.0), at(1.0)));
-        assert!(clock.heard(remote(at(1.1)), at(1.11)));
+        assert!(!clock.observe(Span::from_s(9.0), at(1.0)));
+        assert!(clock.observe(remote(at(1.1)), at(1.11)));
         assert_eq!(clock.restarts(), 0);
         let mut believed = 0;
         for k in 0..10 {
             let t = at(2.0 + 0.1 * f64::from(k));
-            believed += u32::from(clock.heard(Span::from_s(0.1 * f64::from(k)), t + Span::from_ms(2.0)));
+            believed += u32::from(clock.observe(Span::from_s(0.1 * f64::from(k)), t + Span::from_ms(2.0)));
         }
         assert_eq!((clock.restarts(), believed), (1, 8));
         let off = clock.host(Span::from_s(0.5)).expect("known") - at(2.5);

@@ -348,8 +348,8 @@ mod tests {
                 continue;
             }
             let sent_ms = since_ms + late_ms * Distribution::<f64>::sample(&Exp1, &mut rng);
-            let heard_ms = (sent_ms / tick_ms).ceil() * tick_ms;
-            let t = MonoTime::from_ns(start) + Span::from_ms(heard_ms);
+            let received_ms = (sent_ms / tick_ms).ceil() * tick_ms;
+            let t = MonoTime::from_ns(start) + Span::from_ms(received_ms);
             errors.push((clock.smooth(t) - MonoTime::from_ns(start) - Span::from_ms(since_ms)).ms());
         }
         let settled = &errors[60..];

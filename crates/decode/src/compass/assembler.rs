@@ -5,7 +5,7 @@
 //! sentence that was seen to follow the longest silence. A device with a sentence for the whole attitude repeats it in
 //! the others, which then add nothing.
 
-use super::reading::{CompassReading, ReceivedAttitude, heard};
+use super::reading::{CompassReading, ReceivedAttitude, received};
 use crate::burst::Cycle;
 use crate::counts::DecodeCounts;
 use crate::lines::LineSpan;
@@ -98,7 +98,7 @@ impl ReadingAssembler {
         self.draft = None;
         self.since_whole = 0;
         counts.used += 1;
-        out.push(heard(reading, span, span, counts));
+        out.push(received(reading, span, span, counts));
     }
 
     /// A sentence of rates and forces: a reading of its own beside those of the attitude.
@@ -110,7 +110,7 @@ impl ReadingAssembler {
         out: &mut Vec<ReceivedAttitude>,
     ) {
         counts.used += 1;
-        out.push(heard(reading, span, span, counts));
+        out.push(received(reading, span, span, counts));
     }
 
     /// A sentence of plain NMEA.
@@ -162,7 +162,7 @@ impl ReadingAssembler {
     fn give_out(&mut self, counts: &mut DecodeCounts, out: &mut Vec<ReceivedAttitude>) {
         if let Some(mut draft) = self.draft.take() {
             draft.reading.flagged &= draft.reading.heading_deg.is_none();
-            out.push(heard(draft.reading, draft.first, draft.last, counts));
+            out.push(received(draft.reading, draft.first, draft.last, counts));
             self.done = draft.keys;
         }
     }

@@ -23,8 +23,8 @@ pub(super) fn read(
     sentence: &Sentence<'_>,
     counts: &mut DecodeCounts,
 ) -> Result<Option<CompassReading>, Refusal> {
-    let told = (sentence.address(), sentence.field(1));
-    let (heading_at, pitch_at, roll_at, quality_at) = match told {
+    let address_and_type = (sentence.address(), sentence.field(1));
+    let (heading_at, pitch_at, roll_at, quality_at) = match address_and_type {
         ("PTNL", "AVR") => (3, 5, 7, Some(10)),
         ("PSAT", "HPR") => (3, 4, 5, None),
         ("PSSN", "HRP") => (4, 6, 5, Some(11)),

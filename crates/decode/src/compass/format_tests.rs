@@ -1,12 +1,10 @@
 //! The readings of each format's sentences.
 
-use nalgebra::Vector3;
-
 use super::*;
 use crate::sentence::framed;
 use crate::ubx::ubx_framed;
 
-fn said(format: CompassFormat, body: &str) -> Result<Option<CompassReading>, Refusal> {
+pub(super) fn said(format: CompassFormat, body: &str) -> Result<Option<CompassReading>, Refusal> {
     let framed = framed(body);
     let sentence = Sentence::of_line(framed.as_bytes())?;
     match reader(format) {
@@ -171,8 +169,8 @@ fn angles_in_sentences_of_their_own_make_one_reading() {
         for times in [1, 2, 9] {
             let (out, counts) = readings(CompassFormat::Nmea, bursts(&bodies, times).as_bytes());
             assert_eq!((out.len(), counts.used), (times, 3 * times as u64), "{counts}");
-            for heard in out {
-                let CompassReading { heading_deg, pitch_deg, roll_deg, .. } = heard.reading;
+            for received in out {
+                let CompassReading { heading_deg, pitch_deg, roll_deg, .. } = received.reading;
                 assert_eq!((heading_deg, pitch_deg, roll_deg), (Some(218.652), Some(0.145), Some(3.873)));
             }
         }
@@ -180,12 +178,12 @@ fn angles_in_sentences_of_their_own_make_one_reading() {
 }
 
 #[test]
-fn a_heading_told_in_several_ways_counts_once() {
+fn a_heading_reported_in_several_ways_counts_once() {
     let all = ["HCHDG,101.1,,,7.1,W", "HCHDM,101.1,M", "HCHDT,94.0,T", "HCTHS,94.0,A"];
     for ways in 1..=4 {
         let (out, counts) = readings(CompassFormat::Nmea, bursts(&all[..ways], 20).as_bytes());
         assert_eq!((out.len(), counts.used, counts.ignored), (20, 20, 20 * (ways as u64 - 1)), "{counts}");
-        assert!(out.iter().all(|heard| heard.reading.heading_deg == Some(101.1)));
+        assert!(out.iter().all(|received| received.reading.heading_deg == Some(101.1)));
     }
     let derived_only = bursts(&["HCHDG,,,,,", "HCHDT,94.0,T"], 3);
     let (out, _) = readings(CompassFormat::Nmea, derived_only.as_bytes());
@@ -204,12 +202,14 @@ fn what_repeats_a_whole_attitude_says_nothing_more() {
         bodies.rotate_left(rotated);
         let (out, counts) = readings(CompassFormat::Hmr3000, bursts(&bodies, 10).as_bytes());
         assert_eq!(out.len(), 10, "{counts}");
-        assert!(out.iter().all(|heard| heard.sample.tilt.is_some() && heard.sample.heading.is_some()));
+        assert!(
+            out.iter().all(|received| received.sample.tilt.is_some() && received.sample.heading.is_some())
+        );
     }
 }
 
 #[test]
-fn a_reading_is_heard_with_its_last_sentence_once_its_end_is_known() {
+fn a_reading_is_complete_with_its_last_sentence_once_its_end_is_known() {
     let (mut decoder, mut out) = (CompassDecoder::new(CompassFormat::Nmea), Vec::new());
     let bodies = ["HCHDG,101.1,,,,", "HCXDR,A,1.5,D,PITCH", "HCXDR,A,2.5,D,ROLL"];
     // The recording starts in the middle of a burst, 33 ms from burst to burst, 6 ms from sentence to sentence.
@@ -235,13 +235,13 @@ fn a_reading_is_heard_with_its_last_sentence_once_its_end_is_known() {
 
 #[test]
 fn vectornav_tells_angles_or_a_quaternion() {
-    let told = (Some(85.123), Some(-0.9), Some(0.8), false, true);
+    let reported = (Some(85.123), Some(-0.9), Some(0.8), false, true);
     for body in [
         "VNYPR,+085.123,-000.900,+000.800",
         "VNYMR,+085.123,-000.900,+000.800,+01.0640,-00.2531,+03.0614,+00.005,+00.344,-09.758,-0.001,-0.001,-0.001",
         "VNYBA,+085.123,-000.900,+000.800,+00.1,+00.2,+00.3,0,0,0",
     ] {
-        assert_eq!(reading(CompassFormat::Vectornav, body), told, "{body}");
+        assert_eq!(reading(CompassFormat::Vectornav, body), reported, "{body}");
     }
     assert_eq!(reading(CompassFormat::Vectornav, "VNYPR,-090.000,+001.0,-002.0").0, Some(270.0));
     // A rotation by 90 degrees about down, then by 30 about the right wing.
@@ -306,11 +306,11 @@ fn headings_between_antennas_are_true() {
 }
 
 /// All readings of a format from bytes.
-fn all(format: CompassFormat, bytes: &[u8]) -> (Vec<CompassReading>, DecodeCounts) {
+pub(super) fn all(format: CompassFormat, bytes: &[u8]) -> (Vec<CompassReading>, DecodeCounts) {
     let (mut decoder, mut out) = (CompassDecoder::new(format), Vec::new());
     decoder.push(bytes, MonoTime::default(), &mut out);
     decoder.flush(&mut out);
-    (out.iter().map(|heard| heard.reading).collect(), decoder.counts().clone())
+    (out.iter().map(|received| received.reading).collect(), decoder.counts().clone())
 }
 
 /// NAV-RELPOSNED of this version with this heading, 1e-5 degrees, and these flags.
@@ -332,7 +332,7 @@ fn ublox_tells_the_heading_between_its_antennas() {
             let bytes = [sentence.clone(), relative(1, 20_175_000, flags), sentence.clone()].concat();
             let (out, counts) = all(format, &bytes);
             assert!(
-                (out[0].heading_deg.expect("told") - 201.75).abs() < 1e-9 && out[0].heading_is_true,
+                (out[0].heading_deg.expect("reported") - 201.75).abs() < 1e-9 && out[0].heading_is_true,
                 "{counts}"
             );
             assert_eq!((out.len(), out[0].pitch_deg, counts.refused_total()), (1, None, 0), "{counts}");
@@ -361,93 +361,4 @@ fn headings_of_sentences_beside_packets_are_read() {
     let bytes: Vec<u8> = (0..5).flat_map(|_| [noise.clone(), hpr.clone()].concat()).collect();
     let (out, counts) = all(CompassFormat::Nmea, &bytes);
     assert_eq!((out.len(), counts.refused_total(), counts.ignored), (5, 0, 5), "{counts}");
-}
-
-/// A record of WitMotion.
-fn wit(kind: u8, figures: [i16; 3]) -> Vec<u8> {
-    let mut record = vec![0x55, kind];
-    figures.iter().for_each(|figure| record.extend(figure.to_le_bytes()));
-    record.extend([0x12, 0x34]);
-    record.push(record.iter().fold(0u8, |sum, byte| sum.wrapping_add(*byte)));
-    record
-}
-
-/// Degrees in WitMotion's unit.
-fn steps(degrees: f64) -> i16 {
-    (degrees / 180.0 * 32_768.0).round() as i16
-}
-
-#[test]
-fn witmotion_tells_angles_rates_and_forces() {
-    let angles = |x: f64, y: f64, z: f64| wit(0x53, [steps(x), steps(y), steps(z)]);
-    for (bytes, wanted) in [
-        (angles(0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-        (angles(0.0, 0.0, -90.0), (90.0, 0.0, 0.0)),
-        (angles(5.0, 0.0, 30.0), (330.0, 5.0, 0.0)),
-        (angles(0.0, -7.0, 0.0), (0.0, 0.0, -7.0)),
-    ] {
-        let (out, _) = all(CompassFormat::Witmotion, &bytes);
-        let told = (out[0].heading_deg, out[0].pitch_deg, out[0].roll_deg);
-        let near = |told: Option<f64>, wanted: f64| {
-            let off = told.expect("told") - wanted;
-            (off - 360.0 * (off / 360.0).round()).abs() < 0.01
-        };
-        assert!(
-            near(told.0, wanted.0) && near(told.1, wanted.1) && near(told.2, wanted.2),
-            "{told:?} {wanted:?}"
-        );
-    }
-    // At rest the specific force is up: one g about z. A turn to the right seen from above is negative about z.
-    let stream =
-        [wit(0x51, [0, 0, 2_048]), wit(0x52, [0, 0, -1_638]), wit(0x54, [1, 2, 3]), angles(0.0, 0.0, 0.0)];
-    let mut bytes = vec![0x55, 0x55, 0x53];
-    bytes.extend(stream.concat());
-    bytes.extend(angles(0.0, 0.0, 10.0));
-    let (out, counts) = all(CompassFormat::Witmotion, &bytes);
-    assert_eq!((out.len(), counts.used, counts.ignored, counts.noise_bytes), (2, 2, 3, 3), "{counts}");
-    let inertial = out[0].inertial.expect("told");
-    let (force, rate) = (inertial.force_mps2.expect("told"), inertial.rate_rps.expect("told"));
-    assert!((force.z + 9.806_65).abs() < 1e-9 && force.xy().norm() < 1e-9, "{force}");
-    assert!((rate.z.to_degrees() - 100.0).abs() < 0.05 && rate.xy().norm() < 1e-9, "{rate}");
-    assert_eq!(out[1].inertial, None, "a gathered value is used once");
-}
-
-#[test]
-fn bno08x_tells_tilt_and_a_yaw_that_is_no_heading() {
-    let record = |angles: [i16; 3]| {
-        let mut record = vec![0xAA, 0xAA, 0xDE];
-        angles.iter().for_each(|angle| record.extend(angle.to_le_bytes()));
-        record.extend([0x00, 0x00, 0x00, 0x00, 0xE8, 0x03, 0, 0, 0]);
-        record.push(record[2..].iter().fold(0u8, |sum, byte| sum.wrapping_add(*byte)));
-        record
-    };
-    let mut damaged = record([100, 200, 300]);
-    damaged[7] ^= 1;
-    let bytes = [vec![0xAA], record([-9_000, 250, -1_050]), damaged, record([0, 0, 0])].concat();
-    let (mut decoder, mut heard) = (CompassDecoder::new(CompassFormat::Bno08xRvc), Vec::new());
-    decoder.push(&bytes, MonoTime::default(), &mut heard);
-    let (first, counts) = (heard[0], decoder.counts());
-    let near = |told: Option<f64>, wanted: f64| (told.expect("told") - wanted).abs() < 1e-9;
-    assert!(near(first.reading.heading_deg, 270.0) && near(first.reading.pitch_deg, 2.5));
-    assert!(near(first.reading.roll_deg, -10.5) && first.reading.is_valid());
-    assert_eq!(
-        (first.sample.heading, first.sample.tilt.is_some()),
-        (None, true),
-        "yaw has an arbitrary zero"
-    );
-    assert_eq!((heard.len(), counts.refused(Refusal::BadChecksum) > 0), (2, true), "{counts}");
-    assert!(all(CompassFormat::Bno08xRvc, &record([20_000, 0, 0])).1.refused(Refusal::OutOfRange) > 0);
-}
-
-#[test]
-fn vectornav_tells_rates_and_forces() {
-    let told = |body: &str| said(CompassFormat::Vectornav, body).expect("sound").expect("told").inertial;
-    let vnymr =
-        "VNYMR,+085.123,-000.900,+000.800,+01.06,-00.25,+03.06,+00.005,+00.344,-09.758,-0.001,+0.002,-0.003";
-    let inertial = told(vnymr).expect("told");
-    assert_eq!(inertial.force_mps2, Some(Vector3::new(0.005, 0.344, -9.758)));
-    assert_eq!(inertial.rate_rps, Some(Vector3::new(-0.001, 0.002, -0.003)));
-    let vnqmr = "VNQMR,0,0,0,1,1.0,2.0,3.0,0.1,0.2,-9.8,0.01,0.02,0.03";
-    assert_eq!(told(vnqmr).expect("told").rate_rps, Some(Vector3::new(0.01, 0.02, 0.03)));
-    assert_eq!((told("VNYPR,+085.1,-000.9,+000.8"), told("VNYMR,1,2,3,,,,,,,,,")), (None, None));
 }

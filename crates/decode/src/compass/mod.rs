@@ -8,6 +8,8 @@ mod fields;
 #[cfg(test)]
 mod format_tests;
 mod hmr3000;
+#[cfg(test)]
+mod inertial_tests;
 mod long_ascii;
 mod nmea;
 mod os5000;

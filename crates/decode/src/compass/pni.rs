@@ -11,7 +11,7 @@ use std::collections::VecDeque;
 
 use crc::{CRC_16_XMODEM, Crc};
 
-use super::reading::{CompassReading, ReceivedAttitude, heard};
+use super::reading::{CompassReading, ReceivedAttitude, received};
 use crate::counts::{DecodeCounts, Refusal};
 use crate::lines::LineSpan;
 use windhover_base::time::MonoTime;
@@ -66,7 +66,7 @@ impl PacketFramer {
                 match self.reading(&packet, counts) {
                     Ok(Some(reading)) => {
                         counts.used += 1;
-                        out.push(heard(reading, span, span, counts));
+                        out.push(received(reading, span, span, counts));
                     }
                     Ok(None) => counts.ignored += 1,
                     Err(why) => counts.refuse(why),
@@ -267,7 +267,7 @@ mod tests {
         let (mut framer, mut counts, mut out) =
             (PacketFramer::default(), DecodeCounts::default(), Vec::new());
         framer.push(bytes, MonoTime::default(), &mut counts, &mut out);
-        (out.iter().map(|heard| heard.reading).collect(), counts)
+        (out.iter().map(|received| received.reading).collect(), counts)
     }
 
     #[test]

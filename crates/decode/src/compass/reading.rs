@@ -77,7 +77,7 @@ pub struct ReceivedAttitude {
 }
 
 /// Stamps a reading from its first and last sentence.
-pub(super) fn heard(
+pub(super) fn received(
     reading: CompassReading,
     first: LineSpan,
     last: LineSpan,

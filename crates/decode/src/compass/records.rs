@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use super::reading::{CompassReading, ReceivedAttitude, heard};
+use super::reading::{CompassReading, ReceivedAttitude, received};
 use crate::counts::{DecodeCounts, Refusal};
 use crate::lines::LineSpan;
 use windhover_base::time::MonoTime;
@@ -61,7 +61,7 @@ impl RecordFramer {
             match (self.form.read)(&record, &mut self.gathered) {
                 Ok(Some(reading)) => {
                     counts.used += 1;
-                    out.push(heard(reading, span, span, counts));
+                    out.push(received(reading, span, span, counts));
                 }
                 Ok(None) => counts.ignored += 1,
                 Err(why) => counts.refuse(why),

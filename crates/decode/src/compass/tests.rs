@@ -19,8 +19,8 @@ fn in_pieces(format: CompassFormat, bytes: &[u8], sizes: &[usize]) -> Vec<Receiv
     out
 }
 
-fn check(heard: &[ReceivedAttitude]) -> Result<(), TestCaseError> {
-    for ReceivedAttitude { reading, sample, .. } in heard {
+fn check(received: &[ReceivedAttitude]) -> Result<(), TestCaseError> {
+    for ReceivedAttitude { reading, sample, .. } in received {
         prop_assert!(reading.heading_deg.is_none_or(|deg| (0.0..=360.0).contains(&deg)));
         let angles = [reading.pitch_deg, reading.roll_deg];
         prop_assert!(angles.iter().flatten().all(|deg| (-180.0..=180.0).contains(deg)));
@@ -65,7 +65,7 @@ proptest! {
         }
         for format in CompassFormat::ALL {
             let readings = |sizes: &[usize]| {
-                in_pieces(format, &bytes, sizes).iter().map(|heard| heard.reading).collect::<Vec<_>>()
+                in_pieces(format, &bytes, sizes).iter().map(|received| received.reading).collect::<Vec<_>>()
             };
             prop_assert_eq!(readings(&[usize::MAX]), readings(&sizes));
         }

@@ -103,7 +103,7 @@ pub fn asked(ts1: i64) -> Option<MonoTime> {
 #[derive(Clone, Debug, Default)]
 pub struct AutopilotDecoder {
     frames: MavlinkFrames,
-    heard: Vec<MavlinkFrame>,
+    received: Vec<MavlinkFrame>,
     follows: Option<u8>,
     clock: RemoteClock,
     quaternion: Option<MonoTime>,
@@ -121,9 +121,9 @@ impl AutopilotDecoder {
 
     /// Takes bytes that were received at `t`.
     pub fn push(&mut self, bytes: &[u8], t: MonoTime, out: &mut Vec<ReceivedAutopilot>) {
-        let mut heard = std::mem::take(&mut self.heard);
-        self.frames.push(bytes, &mut heard);
-        for frame in heard.drain(..) {
+        let mut received = std::mem::take(&mut self.received);
+        self.frames.push(bytes, &mut received);
+        for frame in received.drain(..) {
             let used = self.frame(&frame, t, out);
             let counts = self.frames.counts_mut();
             match used {
@@ -132,7 +132,7 @@ impl AutopilotDecoder {
                 Err(why) => counts.refuse(why),
             }
         }
-        self.heard = heard;
+        self.received = received;
     }
 
     /// Counts of the decoded bytes.
@@ -215,7 +215,7 @@ impl AutopilotDecoder {
 
     /// Host time of a time since its start that was received at `t`.
     fn at(&mut self, boot: Span, t: MonoTime) -> Result<MonoTime, Refusal> {
-        let believed = self.clock.heard(boot, t);
+        let believed = self.clock.observe(boot, t);
         self.clock.host(boot).filter(|_| believed).ok_or(Refusal::OutOfRange)
     }
 

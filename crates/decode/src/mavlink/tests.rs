@@ -46,14 +46,14 @@ fn following() -> AutopilotDecoder {
     decoder
 }
 
-fn heard(decoder: &mut AutopilotDecoder, message: &MavMessage, t: MonoTime) -> Vec<ReceivedAutopilot> {
+fn received(decoder: &mut AutopilotDecoder, message: &MavMessage, t: MonoTime) -> Vec<ReceivedAutopilot> {
     let mut out = Vec::new();
     decoder.push(&frame(1, 1, message), t, &mut out);
     out
 }
 
 #[test]
-fn only_the_autopilot_is_heard() {
+fn only_the_autopilot_is_decoded() {
     let mut decoder = following();
     let mut out = Vec::new();
     // A ground station, another helicopter, a camera of the same one.
@@ -63,8 +63,8 @@ fn only_the_autopilot_is_heard() {
     assert_eq!(out, []);
     decoder.push(&frame(1, 1, &attitude(100_000, 0.5)), at(0.002), &mut out);
     let AutopilotMeasurement::Attitude(sample) = out[0].measurement else { panic!("{out:?}") };
-    assert!(sample.heading_is_true && (sample.heading.expect("told") - 0.5).abs() < 1e-6);
-    let tilt = sample.tilt.expect("told");
+    assert!(sample.heading_is_true && (sample.heading.expect("reported") - 0.5).abs() < 1e-6);
+    let tilt = sample.tilt.expect("reported");
     assert!((tilt.pitch + 0.2).abs() < 1e-6 && (tilt.roll - 0.1).abs() < 1e-6);
     // With a configured system id, only that system is used.
     let mut second = AutopilotDecoder::new(Some(2));
@@ -85,36 +85,36 @@ fn quaternions_are_preferred_and_forces_are_in_si_units() {
         rollspeed: 0.3,
         ..ATTITUDE_QUATERNION_DATA::DEFAULT
     });
-    let out = heard(&mut decoder, &quaternion, at(0.0));
+    let out = received(&mut decoder, &quaternion, at(0.0));
     let [ReceivedAutopilot { measurement: AutopilotMeasurement::Attitude(sample), .. }, rates] = out[..]
     else {
         panic!("{out:?}")
     };
-    assert!((sample.heading.expect("told") - 2.0).abs() < 1e-6, "{sample:?}");
+    assert!((sample.heading.expect("reported") - 2.0).abs() < 1e-6, "{sample:?}");
     let AutopilotMeasurement::Inertial(rates) = rates.measurement else { panic!("{out:?}") };
-    assert!(rates.force_mps2.is_none() && (rates.rate_rps.expect("told").x - 0.3).abs() < 1e-6);
-    assert_eq!(heard(&mut decoder, &attitude(100_100, 0.0), at(0.1)), []);
+    assert!(rates.force_mps2.is_none() && (rates.rate_rps.expect("reported").x - 0.3).abs() < 1e-6);
+    assert_eq!(received(&mut decoder, &attitude(100_100, 0.0), at(0.1)), []);
     let imu = MavMessage::SCALED_IMU(SCALED_IMU_DATA {
         time_boot_ms: 100_150,
         zacc: -1_000,
         xgyro: 500,
         ..SCALED_IMU_DATA::DEFAULT
     });
-    let out = heard(&mut decoder, &imu, at(0.15));
+    let out = received(&mut decoder, &imu, at(0.15));
     let AutopilotMeasurement::Inertial(sample) = out[0].measurement else { panic!("{out:?}") };
     let (rate, force) = sample.rate_rps.zip(sample.force_mps2).expect("both");
     assert!((rate - Vector3::new(0.5, 0.0, 0.0)).norm() < 1e-9);
     assert!((force - Vector3::new(0.0, 0.0, -9.806_65)).norm() < 1e-9);
     // From here on the IMU's own rates are used, not the attitude's.
-    assert_eq!(heard(&mut decoder, &quaternion, at(0.2)).len(), 1);
+    assert_eq!(received(&mut decoder, &quaternion, at(0.2)).len(), 1);
 }
 
 #[test]
 fn fixes_and_its_own_position() {
     let mut decoder = following();
-    heard(&mut decoder, &attitude(100_000, 0.0), at(0.0));
+    received(&mut decoder, &attitude(100_000, 0.0), at(0.0));
     let time = SYSTEM_TIME_DATA { time_unix_usec: 1_800_000_000_000_000, time_boot_ms: 100_100 };
-    heard(&mut decoder, &MavMessage::SYSTEM_TIME(time), at(0.1));
+    received(&mut decoder, &MavMessage::SYSTEM_TIME(time), at(0.1));
     let fix = MavMessage::GPS_RAW_INT(GPS_RAW_INT_DATA {
         time_usec: 100_200_000,
         fix_type: GpsFixType::GPS_FIX_TYPE_RTK_FIXED,
@@ -130,20 +130,20 @@ fn fixes_and_its_own_position() {
         v_acc: 30,
         ..GPS_RAW_INT_DATA::DEFAULT
     });
-    let out = heard(&mut decoder, &fix, at(0.25));
+    let out = received(&mut decoder, &fix, at(0.25));
     let AutopilotMeasurement::Gnss(epoch) = out[0].measurement else { panic!("{out:?}") };
     assert!((out[0].t - at(0.2)).abs() < Span::from_ms(1.0), "by its own clock: {:?}", out[0].t);
     assert_eq!((epoch.fix, epoch.sats), (FixKind::RtkFixed, Some(14)));
     assert_eq!(epoch.utc.map(|utc| utc.unix_ns()), Some(1_800_000_000_100_000_000));
-    assert!((epoch.geoid_m.expect("told") + 27.0).abs() < 1e-9);
-    assert!((epoch.vel_ned_mps.expect("told") - Vector3::new(0.0, 2.5, 0.0)).norm() < 1e-9);
-    assert!((epoch.hpe_m.expect("told") - 0.02).abs() < 1e-9 && !epoch.vel_has_down);
-    assert_eq!(heard(&mut decoder, &fix, at(0.35)), [], "the same fix again");
+    assert!((epoch.geoid_m.expect("reported") + 27.0).abs() < 1e-9);
+    assert!((epoch.vel_ned_mps.expect("reported") - Vector3::new(0.0, 2.5, 0.0)).norm() < 1e-9);
+    assert!((epoch.hpe_m.expect("reported") - 0.02).abs() < 1e-9 && !epoch.vel_has_down);
+    assert_eq!(received(&mut decoder, &fix, at(0.35)), [], "the same fix again");
     let nowhere = MavMessage::GLOBAL_POSITION_INT(GLOBAL_POSITION_INT_DATA {
         time_boot_ms: 100_400,
         ..Default::default()
     });
-    assert_eq!(heard(&mut decoder, &nowhere, at(0.4)), []);
+    assert_eq!(received(&mut decoder, &nowhere, at(0.4)), []);
     let place = MavMessage::GLOBAL_POSITION_INT(GLOBAL_POSITION_INT_DATA {
         time_boot_ms: 100_500,
         lat: 301_234_567,
@@ -152,7 +152,7 @@ fn fixes_and_its_own_position() {
         vx: 120,
         ..GLOBAL_POSITION_INT_DATA::DEFAULT
     });
-    let out = heard(&mut decoder, &place, at(0.5));
+    let out = received(&mut decoder, &place, at(0.5));
     let AutopilotMeasurement::Position(position) = out[0].measurement else { panic!("{out:?}") };
     assert_eq!((position.boot, position.alt_msl_m), (Span::from_s(100.5), 45.0));
 }
@@ -164,23 +164,23 @@ fn questions_for_the_time_put_its_clock_on_ours() {
     let answer =
         |ts1| MavMessage::TIMESYNC(TIMESYNC_DATA { tc1: 101_005_000_000, ts1, ..TIMESYNC_DATA::DEFAULT });
     // An answer to another system's request is not ours.
-    heard(&mut decoder, &answer(asked - 1), at(1.010));
+    received(&mut decoder, &answer(asked - 1), at(1.010));
     assert!(!decoder.clock().is_exchanged());
-    heard(&mut decoder, &answer(asked), at(1.010));
+    received(&mut decoder, &answer(asked), at(1.010));
     assert!(decoder.clock().is_exchanged());
     // A message that took 200 ms is stamped as well as any other.
-    let out = heard(&mut decoder, &attitude(102_000, 0.0), at(2.2));
+    let out = received(&mut decoder, &attitude(102_000, 0.0), at(2.2));
     assert!((out[0].t - at(2.0)).abs() < Span::from_ms(0.01), "{:?}", out[0].t - at(2.0));
 }
 
 #[test]
 fn an_autopilot_that_starts_anew_is_followed() {
     let mut decoder = following();
-    assert_eq!(heard(&mut decoder, &attitude(100_000, 0.0), at(0.0)).len(), 2);
+    assert_eq!(received(&mut decoder, &attitude(100_000, 0.0), at(0.0)).len(), 2);
     let mut after = 0;
     for k in 0..10_u32 {
         let t = at(5.0 + 0.1 * f64::from(k));
-        after += heard(&mut decoder, &attitude(100 * k, 0.0), t).len();
+        after += received(&mut decoder, &attitude(100 * k, 0.0), t).len();
     }
     assert_eq!((after, decoder.clock().restarts()), (16, 1));
 }
@@ -189,13 +189,13 @@ fn an_autopilot_that_starts_anew_is_followed() {
 fn values_that_cannot_be_are_refused_and_noise_is_passed_over() {
     let mut decoder = following();
     for odd in [f32::NAN, f32::INFINITY, 1e9] {
-        assert_eq!(heard(&mut decoder, &attitude(100_000, odd), at(0.0)), []);
+        assert_eq!(received(&mut decoder, &attitude(100_000, odd), at(0.0)), []);
     }
     let zero = MavMessage::ATTITUDE_QUATERNION(ATTITUDE_QUATERNION_DATA {
         time_boot_ms: 100_000,
         ..Default::default()
     });
-    assert_eq!(heard(&mut decoder, &zero, at(0.0)), []);
+    assert_eq!(received(&mut decoder, &zero, at(0.0)), []);
     assert_eq!(decoder.counts().refused(crate::Refusal::OutOfRange), 4);
     // A frame among noise, in parts, and with one bit of another changed.
     let good = frame(1, 1, &attitude(100_100, 0.5));

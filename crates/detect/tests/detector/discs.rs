@@ -1,5 +1,5 @@
 //! Disc pairs drawn in perspective: centres to a fraction of a pixel, ambiguity refused, and no look beyond the
-//! foretold places while tracking.
+//! predicted places while tracking.
 
 use nalgebra::{Rotation3, Unit, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
@@ -172,7 +172,7 @@ fn centres_are_within_the_bar_light_dark_and_red_round_and_aslant() {
 #[test]
 fn what_is_ambiguous_is_refused() {
     let mut rng = ChaCha8Rng::seed_from_u64(8);
-    // Two alike: which is which cannot be told.
+    // Two alike: which is which cannot be decided.
     let alike = [(-0.5, 0.0, 0.42), (0.5, 0.0, 0.42)];
     let scene = Scene::random(&mut rng, Look::Light, 0.2, &alike);
     let mut detector = pair_detector(Look::Light, [0.42, 0.42]);
@@ -183,7 +183,7 @@ fn what_is_ambiguous_is_refused() {
     let mut detector = pair_detector(Look::Light, DIAMETERS);
     let image = scene.render(&mut rng);
     assert_eq!(seen(&mut detector, &image, None), [], "two that can be the first");
-    // Told by their places, while tracking.
+    // Distinguished by their places, while tracking.
     let marker = |marker: usize, disc: usize| MarkerPrediction {
         marker: MarkerId::Disc { target: 0, marker },
         center_px: scene.truth(disc) + Vector2::new(1.0, -1.5),
@@ -196,7 +196,7 @@ fn what_is_ambiguous_is_refused() {
     for (m, disc) in found.iter().zip([0, 2]) {
         assert!((m.center_px - scene.truth(disc)).norm() < 0.3, "{m:?}");
     }
-    // Foretold elsewhere, they are not looked for where they are; lost, they are.
+    // Predicted elsewhere, they are not looked for where they are; lost, they are.
     let scene = Scene::random(&mut rng, Look::Light, 0.2, &pair());
     let image = scene.render(&mut rng);
     prediction.markers.iter_mut().for_each(|m| m.center_px = Vector2::new(30.0, 30.0));
@@ -205,7 +205,7 @@ fn what_is_ambiguous_is_refused() {
 }
 
 #[test]
-fn a_disc_whose_partner_is_covered_is_found_where_it_is_foretold() {
+fn a_disc_whose_partner_is_covered_is_found_where_it_is_predicted() {
     let mut rng = ChaCha8Rng::seed_from_u64(5);
     let scene = Scene::random(&mut rng, Look::Light, 0.2, &[(0.5, 0.0, DIAMETERS[1])]);
     let image = scene.render(&mut rng);
@@ -228,7 +228,7 @@ fn a_disc_whose_partner_is_covered_is_found_where_it_is_foretold() {
         assert_eq!(found[0].marker, MarkerId::Disc { target: 0, marker: 1 });
         assert!((found[0].center_px - scene.truth(0)).norm() < 0.3, "{found:?}");
     }
-    // Foretold of another size, or with the other's place as likely, it is not taken.
+    // Predicted of another size, or with the other's place as likely, it is not taken.
     prediction.markers[1].size_px *= 0.6;
     assert_eq!(seen(&mut detector, &image, Some(&prediction)), []);
     let size_px = 1.2 * DIAMETER_PX;

@@ -68,8 +68,9 @@ impl Aid for GpsVelocity {
         let colour = state.colour_factor(Self::SOURCE);
         for i in 0..z.m {
             z.residual[i] = self.ned_mps[i] - expected[i];
-            let told_var = self.sigma_mps.map_or(0.0, |sigma| sigma[i].powi(2));
-            z.noise[i][i] = models.gps_velocity_var.max(told_var) * state.learnt.gps_velocity_factor * colour;
+            let reported_var = self.sigma_mps.map_or(0.0, |sigma| sigma[i].powi(2));
+            z.noise[i][i] =
+                models.gps_velocity_var.max(reported_var) * state.learnt.gps_velocity_factor * colour;
         }
         Ok(())
     }

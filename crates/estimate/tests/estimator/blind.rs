@@ -83,20 +83,20 @@ fn the_scale_of_tilt_holds_and_its_error_is_covered() {
 }
 
 #[test]
-fn a_wrong_word_on_the_tilt_sensor_is_found_out_told_and_not_believed() {
+fn a_wrong_setting_of_the_tilt_sensor_is_detected_reported_and_not_used() {
     for (kind, share) in [(TiltKind::Inertial, 0.15), (TiltKind::Gravity, 1.0)] {
         let flight = circling(3, kind, share);
         let out = blind(&flight);
-        let told = misfits(&out).find(|m| matches!(m.cause, MisfitCause::TiltKind(_)));
-        let told = told.unwrap_or_else(|| panic!("{kind:?}, {share}: nothing is told"));
-        let MisfitCause::TiltKind(felt) = told.cause else { unreachable!("it was looked for") };
+        let reported = misfits(&out).find(|m| matches!(m.cause, MisfitCause::TiltKind(_)));
+        let reported = reported.unwrap_or_else(|| panic!("{kind:?}, {share}: nothing is reported"));
+        let MisfitCause::TiltKind(felt) = reported.cause else { unreachable!("it was looked for") };
         let right = match felt {
             FeltTilt::Attitude => share == 1.0,
             FeltTilt::Share(found) => (found - share).abs() < 0.05,
             FeltTilt::Force => false,
         };
-        assert!(right && told.source == FusionSource::CompassTilt, "{kind:?}: {told:?}");
-        assert!(flight.world.seconds(told.t) < 60.0, "{told:?}");
+        assert!(right && reported.source == FusionSource::CompassTilt, "{kind:?}: {reported:?}");
+        assert!(flight.world.seconds(reported.t) < 60.0, "{reported:?}");
         let found = out.iter().filter(|o| matches!(o, EstimatorOutput::TiltFelt { .. })).count();
         assert_eq!(found, 1, "{kind:?}: it is decided once");
         let (slope, square) = tilt_of(&flight, &out, 45.0);

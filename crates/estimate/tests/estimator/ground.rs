@@ -177,7 +177,7 @@ fn survey(seconds: f64, at_s: &[f64], runs: u64) -> BTreeMap<u64, [f64; 3]> {
             let state = seen.and_then(|e| e.state).expect("a marker at rest stays known between passes");
             let truth = world.vehicle(0, seen.expect("just found").t_valid);
             let e = Vector2::new(state.north_m - truth.north_m, state.east_m - truth.east_m);
-            let p = state.covariance.expect("told").fixed_view::<2, 2>(0, 0).into_owned();
+            let p = state.covariance.expect("reported").fixed_view::<2, 2>(0, 0).into_owned();
             let row = table.entry(*at as u64).or_default();
             let share = 1.0 / runs as f64;
             row[0] += (0.5 * p.trace()).sqrt() * share;

@@ -55,7 +55,7 @@ fn fly_with(
 }
 
 /// Mean over frames and seeds of squared error over stated variance, of speed and of yaw rate.
-fn squared_over_told(name: &str, px: (f64, f64)) -> [f64; 2] {
+fn squared_over_stated(name: &str, px: (f64, f64)) -> [f64; 2] {
     let (mut sums, mut n) = ([0.0; 2], 0.0);
     for seed in 1..4 {
         let (world, estimates) = fly(name, 25.0, seed, px);
@@ -72,10 +72,10 @@ fn squared_over_told(name: &str, px: (f64, f64)) -> [f64; 2] {
 }
 
 #[test]
-fn speed_and_yaw_rate_are_off_by_what_is_told() {
+fn speed_and_yaw_rate_are_off_by_their_stated_sigma() {
     for px in [(0.5, 0.5), (0.03, 0.1)] {
         for name in ["follow", "circle20"] {
-            let ratios = squared_over_told(name, px);
+            let ratios = squared_over_stated(name, px);
             assert!(ratios.iter().all(|r| (0.7..1.4).contains(r)), "{name}, {px:?} px: {ratios:.2?}");
         }
     }

@@ -4,6 +4,7 @@ mod blind;
 mod filter;
 mod ground;
 mod honesty;
+mod jumps;
 mod matrix;
 mod misfit;
 mod misfit_table;

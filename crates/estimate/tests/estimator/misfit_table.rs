@@ -45,7 +45,7 @@ fn deviations() -> Vec<Deviation> {
 }
 
 /// What the filter reports of a flight, each thing once, with its first figure.
-fn told_once(out: &[EstimatorOutput]) -> Vec<(String, f64)> {
+fn reported_once(out: &[EstimatorOutput]) -> Vec<(String, f64)> {
     let mut once: Vec<(String, f64)> = Vec::new();
     for (cause, figure) in misfits(out) {
         let cause = format!("{cause:?}");
@@ -69,9 +69,9 @@ fn table_of_misfits() {
                 sharp(scenario);
                 change(scenario);
             });
-            let down_m = flight.world.scenario().told_ground_down_m().unwrap_or(0.0);
+            let down_m = flight.world.scenario().configured_ground_down_m().unwrap_or(0.0);
             let out = configured(&flight, |_| {}, Ground::Flat { down_m });
-            words.replace(told_once(&out));
+            words.replace(reported_once(&out));
             scored(&flight, &out, 6.0)
         });
         let t = twin.get_or_insert(s);

@@ -14,7 +14,7 @@ fn without_frames(flight: &Flight) -> Vec<Input> {
 }
 
 /// The filter's output at every tenth of a second between frames, and its other output.
-fn told(flight: &Flight, inputs: &[Input], silence: Span) -> (Vec<Ownship>, Vec<EstimatorOutput>) {
+fn outputs(flight: &Flight, inputs: &[Input], silence: Span) -> (Vec<Ownship>, Vec<EstimatorOutput>) {
     let (mut filter, mut own, mut out) = (flight.filter(), Vec::new(), Vec::new());
     let mut next = inputs[0].t_recv().ns() / TENTH + 1;
     let mut until = |t: MonoTime, filter: &mut windhover_estimate::Estimator| {
@@ -36,7 +36,7 @@ fn told(flight: &Flight, inputs: &[Input], silence: Span) -> (Vec<Ownship>, Vec<
 fn it_goes_on_without_frames() {
     // Given a flight whose camera delivers nothing.
     let flight = fly("follow", 20.0, 3, |_| {});
-    let (own, _) = told(&flight, &without_frames(&flight), Span::ZERO);
+    let (own, _) = outputs(&flight, &without_frames(&flight), Span::ZERO);
     // Then there is a state every tenth of a second, of no frame, with a covariance that is one.
     assert!(own.len() > 180, "{} states", own.len());
     assert!(own.windows(2).all(|w| w[1].t_valid - w[0].t_valid == Span::from_ns(TENTH)));
@@ -55,7 +55,7 @@ fn it_goes_on_without_frames() {
 #[test]
 fn asking_for_it_changes_nothing_else() {
     let flight = fly("follow", 6.0, 4, |_| {});
-    let (own, with) = told(&flight, &flight.inputs, Span::ZERO);
+    let (own, with) = outputs(&flight, &flight.inputs, Span::ZERO);
     let (mut filter, mut without) = (flight.filter(), Vec::new());
     flight.inputs.iter().for_each(|input| input.give(&mut filter, &mut without));
     assert!(!own.is_empty());
@@ -83,7 +83,7 @@ fn at_a_frame_it_is_that_frames() {
 fn in_a_silence_it_grows_vague_and_ends() {
     let flight = fly("follow", 5.0, 6, |_| {});
     let inputs = without_frames(&flight);
-    let (own, _) = told(&flight, &inputs, Span::from_s(30.0));
+    let (own, _) = outputs(&flight, &inputs, Span::from_s(30.0));
     let last = inputs[inputs.len() - 1].t_valid();
     let after: Vec<&Ownship> = own.iter().filter(|own| own.t_valid > last).collect();
     let (first, latest) = (after[0], after[after.len() - 1]);

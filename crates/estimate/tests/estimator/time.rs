@@ -54,7 +54,7 @@ pub(super) fn errors(described: &str) -> [f64; 2] {
 }
 
 /// By how much the camera is reported to be late, s, the last time it was.
-fn told_late(out: &[EstimatorOutput]) -> Option<f64> {
+fn reported_late_s(out: &[EstimatorOutput]) -> Option<f64> {
     let mut late = out.iter().filter_map(|output| match output {
         EstimatorOutput::Misfit(misfit) if misfit.cause == MisfitCause::Late => Some(misfit.figure),
         _ => None,
@@ -66,8 +66,8 @@ fn told_late(out: &[EstimatorOutput]) -> Option<f64> {
 fn a_camera_that_is_late_is_found_out_and_its_frames_put_where_they_belong() {
     for (seed, late_ms) in [(1, 40.0), (2, 40.0), (3, 25.0)] {
         let (world, out) = flown(&format!("follow+camera-late={late_ms}"), 24.0, seed);
-        let told_ms = 1e3 * told_late(&out).expect("it is told");
-        assert!((told_ms - late_ms).abs() < 5.0, "seed {seed}: {told_ms} ms told for {late_ms}");
+        let reported_ms = 1e3 * reported_late_s(&out).expect("it is reported");
+        assert!((reported_ms - late_ms).abs() < 5.0, "seed {seed}: {reported_ms} ms reported for {late_ms}");
         let estimates = out.iter().filter_map(|output| match output {
             EstimatorOutput::Estimate(e) if world.seconds(e.t_valid) > 20.0 => Some(e),
             _ => None,
@@ -95,7 +95,7 @@ fn another_clock_that_is_late_is_not_taken_for_the_cameras() {
         "follow+stamp-jitter=3",
     ] {
         let (_, out) = flown(described, 24.0, 2);
-        assert_eq!(told_late(&out), None, "{described}");
+        assert_eq!(reported_late_s(&out), None, "{described}");
     }
 }
 

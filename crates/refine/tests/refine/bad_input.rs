@@ -103,7 +103,7 @@ fn with_positions_from_outside_the_place_is_theirs() {
     let reference = truth.reference(flown.world.scenario().rig.target[0].reference_m);
     let off = nalgebra::Vector2::new(state.north_m - reference.x, state.east_m - reference.y);
     assert!(off.norm() < 0.3, "off by {off}");
-    let sigma = state.covariance.expect("told")[(0, 0)].sqrt();
+    let sigma = state.covariance.expect("reported")[(0, 0)].sqrt();
     assert!(sigma < 0.3, "{sigma}");
 }
 

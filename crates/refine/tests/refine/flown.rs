@@ -109,7 +109,7 @@ impl Score {
                 state.speed_mps - truth.speed_mps,
                 state.yaw_rate_radps - truth.yaw_rate_radps,
             );
-            let p = state.covariance.expect("told");
+            let p = state.covariance.expect("reported");
             let three: Matrix3<f64> = p.fixed_view::<3, 3>(2, 2).into();
             score.frames += 1.0;
             for i in 0..3 {

@@ -67,8 +67,8 @@ fn proof_of_errors_and_sigmas() {
         for seed in 1..=4 {
             let flown = fly(name, 30.0, seed, |scenario| scenario.camera.features = features);
             filter.add(&Score::of(&flown.filtered(), &flown.world));
-            let told = flown.refined();
-            refined.add(&Score::of(told.targets.iter().map(|(_, e)| e), &flown.world));
+            let result = flown.refined();
+            refined.add(&Score::of(result.targets.iter().map(|(_, e)| e), &flown.world));
         }
         for (what, s) in [("filter", &filter), ("refined", &refined)] {
             println!("{name}, {features} features, {what}: {s}");

@@ -405,7 +405,7 @@ mod tests {
     }
 
     #[test]
-    fn files_removed_under_the_station_are_told_and_begun_anew() {
+    fn files_removed_under_the_station_are_reported_and_begun_anew() {
         let dir = tempfile::tempdir().expect("a temporary directory");
         let mut mirror = Mirror::at(dir.path()).expect("a mirror");
         mirror.keep(&arrival(7, 0));

@@ -3,7 +3,7 @@
 const $ = id => document.getElementById(id);
 const KEEP = 9000, PLOT_S = 60, STALE_MS = 1500, OLD_MS = 3000;
 const fleet = new Map();
-let chosen = null, socket = null, dirty = true, heardAt = 0;
+let chosen = null, socket = null, dirty = true, receivedAt = 0;
 const map = new FieldMap($("map"));
 map.moved = () => { dirty = true; };
 const alarm = new Alarm($("sound"));
@@ -31,7 +31,7 @@ function tabs() {
 // The payload's time now, as the station tells it, and how old something of that time is; null while that is not known.
 const clockNow = p => p && p.clock ? p.clock.now + performance.now() - p.clock.at : null;
 function age(p, t) { const now = clockNow(p); return now == null || t == null ? null : Math.max(0, now - t); }
-// A time of the payload in words: UTC where its receiver told it, else the time of its computer, called so.
+// A time of the payload in words: UTC where its receiver reported it, else the time of its computer, called so.
 function stamp(p, t, from, to) {
   const known = p && p.utc != null, text = new Date(t + (known ? p.utc : 0)).toISOString().replace("T", " ").slice(from, to);
   return [text, known ? "UTC" : "host time"];
@@ -84,12 +84,12 @@ const handlers = {
 function connect() {
   socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${location.pathname.replace(/[^/]*$/, "")}live`);
   socket.onmessage = e => {
-    heardAt = performance.now();
+    receivedAt = performance.now();
     const m = JSON.parse(e.data), handler = handlers[m.k];
     if (handler) handler(m, m.p == null ? null : payload(m.p));
     dirty = true;
   };
-  socket.onopen = () => { heardAt = performance.now(); };
+  socket.onopen = () => { receivedAt = performance.now(); };
   socket.onclose = () => { chip($("server"), "station gone", "bad"); setTimeout(connect, 1000); };
 }
 
@@ -116,7 +116,7 @@ function numbers(p) {
   $("yaw-rate-sigma").textContent = c ? s((Math.sqrt(c[5]) * deg).toFixed(1)) : "";
   $("coordinates").textContent = k ? `${k.lat.toFixed(7)}, ${k.lon.toFixed(7)}` : "";
   $("age").textContent = !e ? "" : fresh ? stamp(p, e.t, 0, 21).join(" ") : old == null ? "age not known" : `last known ${(age(p, (k || e).t) / 1000).toFixed(0)} s ago`;
-  if (socket && socket.readyState === 1 && performance.now() - heardAt <= 4000) chip($("server"), fresh ? "live" : "no news", fresh ? "good" : "warn");
+  if (socket && socket.readyState === 1 && performance.now() - receivedAt <= 4000) chip($("server"), fresh ? "live" : "no news", fresh ? "good" : "warn");
   const note = $("map-note"), down = p && p.link && !p.link.up, cut = p && p.link && p.link.silent_ms > 2000;
   note.style.display = e && (!fresh || down) ? "block" : "none";
   note.textContent = down ? "payload not connected" : cut ? `link silent for ${(p.link.silent_ms / 1000).toFixed(0)} s` : "no new estimates";
@@ -128,7 +128,7 @@ function clock(s) {
   return s < 3600 ? `${Math.floor(s / 60)}:${two(s % 60)}` : `${Math.floor(s / 3600)}:${two(s / 60 % 60)}:${two(s % 60)}`;
 }
 
-// Distance and bearing of a place from the station; where that was not told, from where the helicopter was first seen.
+// Distance and bearing of a place from the station; where that is not known, from where the helicopter was first seen.
 function away(name, p, to) {
   const from = position ? { lat: position[0], lon: position[1] } : p && p.home, rad = Math.PI / 180;
   if (!from || !to) { $(`to-${name}`).textContent = "–"; $(`from-${name}`).textContent = ""; return; }
@@ -322,7 +322,7 @@ $("whole").onclick = () => {
 };
 setInterval(() => {
   $("follow").classList.toggle("on", map.follow);
-  if (socket && socket.readyState === 1 && performance.now() - heardAt > 4000) { chip($("server"), "station silent", "warn"); }
+  if (socket && socket.readyState === 1 && performance.now() - receivedAt > 4000) { chip($("server"), "station silent", "warn"); }
 }, 300);
 window.addEventListener("resize", () => { dirty = true; });
 connect(); draw();

@@ -95,7 +95,7 @@ struct Payload {
     own: Option<(i64, Arc<str>)>,
     own_state: Option<wh::Ownship>,
     health: Option<(i64, Arc<str>)>,
-    health_told: Option<wh::Health>,
+    health_reported: Option<wh::Health>,
     linked: Option<(bool, f64)>,
     datum: Option<Arc<str>>,
     notices: VecDeque<Arc<str>>,
@@ -137,7 +137,7 @@ impl View {
     pub fn record(&mut self, arrival: &Arrival) -> Option<Arc<str>> {
         let name = arrival.payload.to_string();
         let payload = self.payloads.entry(name.clone()).or_default();
-        payload.clock.heard(arrival.publish_time, arrival.arrived);
+        payload.clock.received(arrival.publish_time, arrival.arrived);
         let data = &arrival.data[..];
         match arrival.channel.schema_name.as_str() {
             // The smoother's and the paper's states have schemas of the same name on other topics.
@@ -276,12 +276,12 @@ impl View {
 
     /// The health of every payload as OpenMetrics.
     pub fn metrics(&self, now: Instant) -> String {
-        let told = self.payloads.iter().filter_map(|(payload, p)| {
-            let health = p.health_told.as_ref()?;
+        let reported = self.payloads.iter().filter_map(|(payload, p)| {
+            let health = p.health_reported.as_ref()?;
             let age_s = Some(p.clock.age(host_time(health.timestamp.as_ref()), now).s());
             Some(PayloadMetrics { payload, health, age_s, link: p.linked })
         });
-        openmetrics::render(&told.collect::<Vec<_>>())
+        openmetrics::render(&reported.collect::<Vec<_>>())
     }
 
     /// One line for each payload, for a terminal.

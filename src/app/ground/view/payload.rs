@@ -72,7 +72,7 @@ impl Payload {
     pub(super) fn health(&mut self, name: &str, health: &wh::Health) -> Option<Arc<str>> {
         let t = host_time(health.timestamp.as_ref());
         if let Some(ahead_ns) = health.utc_minus_host_ns {
-            self.clock.told_utc(Span::from_ns(ahead_ns));
+            self.clock.reported_utc(Span::from_ns(ahead_ns));
         }
         let sources: Vec<Value> = health
             .sources
@@ -106,7 +106,7 @@ impl Payload {
         .into();
         if self.health.as_ref().is_none_or(|(last, _)| *last <= t.ns()) {
             self.health = Some((t.ns(), Arc::clone(&text)));
-            self.health_told = Some(health.clone());
+            self.health_reported = Some(health.clone());
         }
         Some(text)
     }

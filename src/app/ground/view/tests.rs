@@ -59,7 +59,7 @@ fn status() -> PayloadStatus {
 }
 
 #[test]
-fn a_vehicle_that_nothing_more_is_heard_of_is_lost_in_every_output() {
+fn a_vehicle_without_news_is_lost_in_every_output() {
     let mut view = View::default();
     let came = Instant::now();
     view.record(&state(100.0, wh::TrackStatus::Tracking, came));
@@ -74,8 +74,8 @@ fn a_vehicle_that_nothing_more_is_heard_of_is_lost_in_every_output() {
     let vehicle = &view.vehicles(now)[0];
     assert_eq!((vehicle.status, vehicle.is_current(), vehicle.age.s().round()), ("lost", false, 35.0));
     // A page that is opened then gets the age of everything.
-    let told: Value = serde_json::from_str(&view.link(&[status()], 1.0, now)).expect("JSON");
-    assert_eq!(told["payloads"][0]["now"].as_f64().map(f64::round), Some(135_000.0));
+    let link: Value = serde_json::from_str(&view.link(&[status()], 1.0, now)).expect("JSON");
+    assert_eq!(link["payloads"][0]["now"].as_f64().map(f64::round), Some(135_000.0));
     assert_eq!(view.history().last().map(|text| text.contains("\"k\":\"link\"")), Some(true));
 }
 
@@ -91,6 +91,6 @@ fn a_camera_that_dies_makes_the_vehicle_old_while_health_goes_on() {
     let vehicle = &view.vehicles(came)[0];
     assert_eq!((vehicle.status, vehicle.age.s().round()), ("lost", 10.0));
     assert_eq!(vehicle.utc.map(UtcTime::unix_ns), Some(1_795_000_100_000_000_000));
-    let told: Value = serde_json::from_str(&view.link(&[status()], 1.0, came)).expect("JSON");
-    assert_eq!(told["payloads"][0]["utc_ms"], json!(1_795_000_000_000.0));
+    let link: Value = serde_json::from_str(&view.link(&[status()], 1.0, came)).expect("JSON");
+    assert_eq!(link["payloads"][0]["utc_ms"], json!(1_795_000_000_000.0));
 }

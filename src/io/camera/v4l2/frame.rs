@@ -19,7 +19,7 @@ const OLDEST_STAMP: Span = Span::from_ns(2_000_000_000);
 pub(super) struct Following {
     sequence: Option<u32>,
     newest: Option<MonoTime>,
-    bad_stamps_told: bool,
+    bad_stamps_reported: bool,
 }
 
 /// The agreed form of the frames.
@@ -94,10 +94,10 @@ impl Frames {
             "do not go forward"
         } else {
             following.newest = Some(stamp);
-            following.bad_stamps_told = false;
+            following.bad_stamps_reported = false;
             return stamp;
         };
-        if !std::mem::replace(&mut following.bad_stamps_told, true) {
+        if !std::mem::replace(&mut following.bad_stamps_reported, true) {
             let text = format!("the driver's stamps {why}; arrival times are used");
             tell(Report::Note(NoteKind::StampsUnusable, 1, text));
         }

@@ -38,7 +38,7 @@ pub(super) fn headings(log: &mut MeasuredLog, topic: &str, fields: &[(MonoTime, 
         .collect();
     let mut forces = forces.into_iter().peekable();
     let mut mean: Option<(MonoTime, Vector3<f64>)> = None;
-    let mut told = Vec::new();
+    let mut attitudes = Vec::new();
     for (t, field) in fields {
         while let Some((at, force)) = forces.next_if(|(at, _)| at <= t) {
             let (last, before) = mean.unwrap_or((at, force));
@@ -50,12 +50,12 @@ pub(super) fn headings(log: &mut MeasuredLog, topic: &str, fields: &[(MonoTime, 
         let level = rot_y(pitch) * rot_x(roll) * field;
         let heading = (-level.y).atan2(level.x) + east_of_north.unwrap_or(0.0);
         let attitude = ned_from_body_321(heading, pitch, roll);
-        told.push((*t, UnitQuaternion::from_rotation_matrix(&attitude)));
+        attitudes.push((*t, UnitQuaternion::from_rotation_matrix(&attitude)));
     }
-    if told.is_empty() {
+    if attitudes.is_empty() {
         log.warnings.push(format!(
             "magnetic fields on {topic} are not used: without specific force the vertical is not known"
         ));
     }
-    told.into_iter().for_each(|(t, attitude)| log.push(t, Measured::Attitude(attitude), topic));
+    attitudes.into_iter().for_each(|(t, attitude)| log.push(t, Measured::Attitude(attitude), topic));
 }

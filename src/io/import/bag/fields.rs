@@ -145,8 +145,8 @@ pub(super) fn nav_sat_fix(fields: &mut Fields<'_>, came: MonoTime) -> Option<Nav
     fields.u16()?;
     let [lat_deg, lon_deg, altitude_m] = fields.f64s()?;
     let covariance = fields.f64s::<9>()?;
-    let told = fields.u8()? != 0 && covariance[0] + covariance[4] > 0.0;
-    let sigmas_m = told.then(|| ((covariance[0] + covariance[4]).sqrt(), covariance[8].max(0.0).sqrt()));
+    let stated = fields.u8()? != 0 && covariance[0] + covariance[4] > 0.0;
+    let sigmas_m = stated.then(|| ((covariance[0] + covariance[4]).sqrt(), covariance[8].max(0.0).sqrt()));
     Some(NavSatFix { t, status, lat_deg, lon_deg, altitude_m, sigmas_m })
 }
 

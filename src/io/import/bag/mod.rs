@@ -196,7 +196,7 @@ pub struct ImportedBag {
 
 /// One topic's messages, before it is known whether they are used.
 #[derive(Default)]
-struct Told {
+struct TopicMessages {
     messages: usize,
     measured: Vec<(MonoTime, Measured)>,
     fields: Vec<(MonoTime, Vector3<f64>)>,
@@ -209,13 +209,13 @@ struct Told {
 /// It is not a bag, or cannot be read.
 pub fn read_bag(path: &Path, topics: &[String]) -> Result<ImportedBag, ImportError> {
     let mut bag = BagReader::open(path)?;
-    let mut told: BTreeMap<(Kind, Arc<str>), Told> = BTreeMap::new();
+    let mut by_topic: BTreeMap<(Kind, Arc<str>), TopicMessages> = BTreeMap::new();
     let mut unread = 0;
     for message in bag.by_ref() {
         let Some(kind) = Kind::of(&message.kind).filter(|_| TIMES.contains(&message.t)) else { continue };
-        let told = told.entry((kind, Arc::clone(&message.topic))).or_default();
-        told.messages += 1;
-        if kind != Kind::Image && take(kind, &message, told).is_none() {
+        let topic_messages = by_topic.entry((kind, Arc::clone(&message.topic))).or_default();
+        topic_messages.messages += 1;
+        if kind != Kind::Image && take(kind, &message, topic_messages).is_none() {
             unread += 1;
         }
     }
@@ -223,15 +223,15 @@ pub fn read_bag(path: &Path, topics: &[String]) -> Result<ImportedBag, ImportErr
     if unread > 0 {
         log.warnings.push(format!("{} do not agree with their type: left out", counted(unread, "message")));
     }
-    let chosen = choose(&told, topics, &mut log.warnings);
-    for name in topics.iter().filter(|name| !told.keys().any(|(_, topic)| **topic == ***name)) {
+    let chosen = choose(&by_topic, topics, &mut log.warnings);
+    for name in topics.iter().filter(|name| !by_topic.keys().any(|(_, topic)| **topic == ***name)) {
         log.warnings.push(format!("the bag has no topic {name} of a supported kind"));
     }
     let mut fields = Vec::new();
-    for ((_, topic), told) in told.iter_mut().filter(|(key, _)| chosen.contains(key)) {
-        told.measured.drain(..).for_each(|(t, what)| log.push(t, what, topic));
-        if !told.fields.is_empty() {
-            fields.push((topic.as_ref(), std::mem::take(&mut told.fields)));
+    for ((_, topic), topic_messages) in by_topic.iter_mut().filter(|(key, _)| chosen.contains(key)) {
+        topic_messages.measured.drain(..).for_each(|(t, what)| log.push(t, what, topic));
+        if !topic_messages.fields.is_empty() {
+            fields.push((topic.as_ref(), std::mem::take(&mut topic_messages.fields)));
         }
     }
     let images = chosen.iter().find(|(kind, _)| *kind == Kind::Image).map(|(_, topic)| Arc::clone(topic));
@@ -254,13 +254,13 @@ const TIMES: std::ops::Range<MonoTime> = MonoTime::from_ns(0)..MonoTime::from_ns
 const YEAR_2000_NS: i64 = 946_684_800_000_000_000;
 
 fn choose(
-    told: &BTreeMap<(Kind, Arc<str>), Told>,
+    by_topic: &BTreeMap<(Kind, Arc<str>), TopicMessages>,
     topics: &[String],
     warnings: &mut Vec<String>,
 ) -> Vec<(Kind, Arc<str>)> {
     let mut chosen = Vec::new();
     for kind in [Kind::Image, Kind::Fix, Kind::Imu, Kind::MagneticField] {
-        let of_kind: Vec<_> = told.iter().filter(|((k, _), _)| *k == kind).collect();
+        let of_kind: Vec<_> = by_topic.iter().filter(|((k, _), _)| *k == kind).collect();
         let named: Vec<_> =
             of_kind.iter().filter(|((_, t), _)| topics.iter().any(|name| **name == **t)).collect();
         let shortest = of_kind.iter().min_by_key(|((_, topic), _)| (topic.len(), Arc::clone(topic)));
@@ -268,8 +268,8 @@ fn choose(
         // A capture has one camera.
         let most = if kind == Kind::Image { 1 } else { used.len() };
         chosen.extend(used.into_iter().take(most).map(|(key, _)| (*key).clone()));
-        for ((_, topic), told) in of_kind.iter().filter(|(key, _)| !chosen.contains(key)) {
-            let count = told.messages;
+        for ((_, topic), topic_messages) in of_kind.iter().filter(|(key, _)| !chosen.contains(key)) {
+            let count = topic_messages.messages;
             warnings.push(format!(
                 "{count} {} on {topic} left out: name it with --topic to use it",
                 kind.words()
@@ -294,7 +294,7 @@ fn frd_from_flu() -> UnitQuaternion<f64> {
     UnitQuaternion::from_quaternion(Quaternion::new(0.0, 1.0, 0.0, 0.0))
 }
 
-fn take(kind: Kind, message: &BagMessage, told: &mut Told) -> Option<()> {
+fn take(kind: Kind, message: &BagMessage, topic_messages: &mut TopicMessages) -> Option<()> {
     let mut fields = Fields::new(message.wire, &message.data)?;
     match kind {
         Kind::Image => {}
@@ -302,22 +302,22 @@ fn take(kind: Kind, message: &BagMessage, told: &mut Told) -> Option<()> {
             let fix = fields::nav_sat_fix(&mut fields, message.t)?;
             // A fix without finite values is not used.
             if fix.lat_deg.is_finite() && fix.lon_deg.is_finite() {
-                told.measured.push((fix.t, Measured::Fix(of_ros(&fix))));
+                topic_messages.measured.push((fix.t, Measured::Fix(of_ros(&fix))));
             }
         }
         Kind::Imu => {
             let imu = fields::imu(&mut fields, message.t)?;
             if let Some(q) = imu.orientation {
                 let q = ned_from_enu() * UnitQuaternion::from_quaternion(q) * frd_from_flu();
-                told.measured.push((imu.t, Measured::Attitude(q)));
+                topic_messages.measured.push((imu.t, Measured::Attitude(q)));
             }
             if let Some((rate, force)) = imu.rate_rps.zip(imu.force_mps2) {
-                told.measured.push((imu.t, Measured::Inertial(frd(rate), frd(force))));
+                topic_messages.measured.push((imu.t, Measured::Inertial(frd(rate), frd(force))));
             }
         }
         Kind::MagneticField => {
             let (t, field) = fields::magnetic_field(&mut fields, message.t)?;
-            told.fields.push((t, frd(field)));
+            topic_messages.fields.push((t, frd(field)));
         }
     }
     Some(())
