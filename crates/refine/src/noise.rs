@@ -58,8 +58,7 @@ impl Components {
             return;
         }
         let width = block.columns.len();
-        let taken: f64 =
-            block.rows.chunks_exact(width).map(|row| back.product(&block.columns, row, row)).sum();
+        let taken: f64 = block.rows.chunks_exact(width).map(|row| back.variance(&block.columns, row)).sum();
         // Of the solution: as the linear model has it from here.
         let square = |(row, right): (&[f64], &f64)| (right - back.change(&block.columns, row)).powi(2);
         let found = weight * block.rows.chunks_exact(width).zip(&block.right).map(square).sum::<f64>();
@@ -87,7 +86,7 @@ impl Components {
             let before = noise.of(source);
             let ratio = whole.absolute / whole.due / before;
             let after = (before * ratio.clamp(1.0 / AT_ONCE, AT_ONCE)).clamp(least, largest);
-            most = most.max((whole.found / whole.due).clamp(1.0 / AT_ONCE, AT_ONCE).ln().abs());
+            most = most.max((after / before).ln().abs());
             noise.set(source, after);
             if source.is_local() {
                 let local = |window| in_window(windows, window, after).clamp(least, largest);
