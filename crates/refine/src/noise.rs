@@ -145,14 +145,14 @@ fn limits(source: Source) -> (f64, f64) {
         Source::Slip(_) => (1.0, 1e4),
         // A hundredth of a pixel of a wide lens to ten of a long one, rad².
         Source::Shake | Source::ShakeRoll => (1e-11, 1e-4),
-        // Displacements of a millimetre to half a metre.
-        Source::Sway(_) | Source::Heave(_) => (1e-6, 0.25),
+        // Displacements of a tenth of a millimetre to half a metre.
+        Source::Sway(_) | Source::Heave(_) => (1e-8, 0.25),
         _ => MOTION,
     }
 }
 
 /// Initial displacement of the markers of a target that sways, m.
-const SWAY_M: f64 = 0.02;
+const SWAY_M: f64 = 0.01;
 
 /// Least initial displacement of a frame whose camera shakes, rad.
 const SHAKE_RAD: f64 = 2e-4;
