@@ -9,7 +9,7 @@
 //! Backward, `x_e = L⁻ᵀ (y − W x_r)`, and of the inverse of the whole matrix only the part over each front is computed
 //! (selected inversion; Takahashi 1973): `G = −L⁻ᵀ W`, `P_er = G P_rr`, `P_ee = (L Lᵀ)⁻¹ + P_er Gᵀ`.
 
-use crate::dense::{Singular, add_rows, backward, cholesky, forward};
+use crate::dense::{Singular, add_rows, backward, cholesky, dot, forward};
 
 /// Layout of a front: two knots, landmarks of two components each, the displacement of a frame, the constants.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -94,6 +94,23 @@ impl Front {
     /// Adds rows `J x ≈ r` of unit variance with a weight; `rows` has them one after the other, with one value for each
     /// of `columns`.
     pub(crate) fn add(&mut self, columns: &[usize], rows: &[f64], right: &[f64], weight: f64) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            unsafe { self.add_wide(columns, rows, right, weight) };
+            return;
+        }
+        self.add_plain(columns, rows, right, weight);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn add_wide(&mut self, columns: &[usize], rows: &[f64], right: &[f64], weight: f64) {
+        self.add_plain(columns, rows, right, weight);
+    }
+
+    #[inline(always)]
+    fn add_plain(&mut self, columns: &[usize], rows: &[f64], right: &[f64], weight: f64) {
         let width = columns.len();
         let mut square = std::mem::take(&mut self.square);
         square.resize(width, 0.0);
@@ -227,11 +244,13 @@ impl Back {
         columns.iter().zip(a).map(|(i, a)| a * self.x[*i]).sum()
     }
 
-    /// `a P bᵀ` of two rows over the same columns.
-    pub(crate) fn product(&self, columns: &[usize], a: &[f64], b: &[f64]) -> f64 {
-        let terms = columns.iter().zip(a).filter(|(_, a)| **a != 0.0).map(|(i, a)| {
-            let row = &self.p[i * self.n..][..self.n];
-            a * columns.iter().zip(b).map(|(j, b)| row[*j] * b).sum::<f64>()
+    /// `a P aᵀ` of a row over some columns.
+    pub(crate) fn variance(&self, columns: &[usize], a: &[f64]) -> f64 {
+        let places = (0..columns.len()).filter(|k| a[*k] != 0.0);
+        let terms = places.map(|k| {
+            let row = &self.p[columns[k] * self.n..][..self.n];
+            let before: f64 = columns[..k].iter().zip(a).map(|(j, b)| row[*j] * b).sum();
+            a[k] * (2.0 * before + a[k] * row[columns[k]])
         });
         terms.sum()
     }
@@ -288,16 +307,20 @@ impl Back {
     #[inline(always)]
     fn open_plain(&mut self, e: &Eliminated, gain: &[f64], inverse: &[f64]) {
         let (n, width) = (self.n, e.rest.len());
+        let (mut row, mut tied) = (vec![0.0; n], vec![0.0; width]);
         for i in 0..e.len {
-            let mut row = vec![0.0; n];
+            row.fill(0.0);
             let gain_of = &gain[i * width..][..width];
             add_rows(&mut row, width, |k| (gain_of[k], &self.p[usize::from(e.rest[k]) * n..][..n]));
-            for j in 0..e.len {
-                let tied = e.rest.iter().zip(&gain[j * width..][..width]);
-                row[e.first + j] =
-                    inverse[i * e.len + j] + tied.map(|(c, g)| row[usize::from(*c)] * g).sum::<f64>();
+            tied.iter_mut().zip(&e.rest).for_each(|(tied, c)| *tied = row[usize::from(*c)]);
+            for j in 0..=i {
+                let covariance = inverse[i * e.len + j] + dot(&tied, &gain[j * width..][..width]);
+                row[e.first + j] = covariance;
+                self.p[(e.first + j) * n + e.first + i] = covariance;
             }
-            self.p[(e.first + i) * n..][..n].copy_from_slice(&row);
+            let own = e.first + i + 1..e.first + e.len;
+            self.p[(e.first + i) * n..][..own.start].copy_from_slice(&row[..own.start]);
+            self.p[(e.first + i) * n + own.end..][..n - own.end].copy_from_slice(&row[own.end..]);
         }
     }
 }

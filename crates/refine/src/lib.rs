@@ -5,6 +5,7 @@ mod beginnings;
 mod block;
 mod dense;
 mod initial;
+mod felt;
 mod frame;
 mod front;
 #[cfg(test)]

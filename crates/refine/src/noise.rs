@@ -58,8 +58,7 @@ impl Components {
             return;
         }
         let width = block.columns.len();
-        let taken: f64 =
-            block.rows.chunks_exact(width).map(|row| back.product(&block.columns, row, row)).sum();
+        let taken: f64 = block.rows.chunks_exact(width).map(|row| back.variance(&block.columns, row)).sum();
         // Of the solution: as the linear model has it from here.
         let square = |(row, right): (&[f64], &f64)| (right - back.change(&block.columns, row)).powi(2);
         let found = weight * block.rows.chunks_exact(width).zip(&block.right).map(square).sum::<f64>();
@@ -87,7 +86,7 @@ impl Components {
             let before = noise.of(source);
             let ratio = whole.absolute / whole.due / before;
             let after = (before * ratio.clamp(1.0 / AT_ONCE, AT_ONCE)).clamp(least, largest);
-            most = most.max((whole.found / whole.due).clamp(1.0 / AT_ONCE, AT_ONCE).ln().abs());
+            most = most.max((after / before).ln().abs());
             noise.set(source, after);
             if source.is_local() {
                 let local = |window| in_window(windows, window, after).clamp(least, largest);
@@ -146,14 +145,14 @@ fn limits(source: Source) -> (f64, f64) {
         Source::Slip(_) => (1.0, 1e4),
         // A hundredth of a pixel of a wide lens to ten of a long one, rad².
         Source::Shake | Source::ShakeRoll => (1e-11, 1e-4),
-        // Displacements of a millimetre to half a metre.
-        Source::Sway(_) | Source::Heave(_) => (1e-6, 0.25),
+        // Displacements of a tenth of a millimetre to half a metre.
+        Source::Sway(_) | Source::Heave(_) => (1e-8, 0.25),
         _ => MOTION,
     }
 }
 
 /// Initial displacement of the markers of a target that sways, m.
-const SWAY_M: f64 = 0.02;
+const SWAY_M: f64 = 0.01;
 
 /// Least initial displacement of a frame whose camera shakes, rad.
 const SHAKE_RAD: f64 = 2e-4;

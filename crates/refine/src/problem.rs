@@ -195,7 +195,7 @@ impl<'a> Pass<'a> {
 
     /// How long after a knot something was at this time by its own clock, s: knots are at the exposures of frames, which are
     /// earlier than their stamps by the camera's delay.
-    fn after_knot(stop: &Stop, t: MonoTime, values: &Values) -> f64 {
+    pub(crate) fn after_knot(stop: &Stop, t: MonoTime, values: &Values) -> f64 {
         (t - stop.t).s() + values.constants[constant::CAMERA_DELAY]
     }
 
@@ -228,7 +228,11 @@ impl<'a> Pass<'a> {
                 let flows = instant.write(&linear, &mut self.rows);
                 instant.timed(&flows, constant::CAMERA_DELAY, 1.0, &mut self.rows);
                 instant.antenna(&linear, &mut self.rows);
-                let residual: Vec<f64> = (0..linear.len()).map(|i| linear.residual(i)).collect();
+                let mut residual: Vec<f64> = (0..linear.len()).map(|i| linear.residual(i)).collect();
+                if source == Source::GpsVelocity {
+                    let smoothing_s2 = values.constants[constant::VELOCITY_SMOOTHING];
+                    instant.smoothed(smoothing_s2, &mut residual, &mut self.rows);
+                }
                 let (noise, factor) = (|a, b| linear.noise(a, b), noise.of(source));
                 if measure::finish(&self.rows, noise, &residual, factor, &mut self.block) {
                     take(Origin::of(source), &self.block);

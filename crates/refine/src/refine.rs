@@ -9,7 +9,9 @@ use windhover_base::time::MonoTime;
 use windhover_estimate::Site;
 use windhover_estimate::batch::{Predictor, SHAKE_COLUMNS};
 
+use crate::block::{Noise, Source};
 use crate::covariance_pass::{PassResult, look};
+use crate::felt::felt as decide_felt;
 use crate::front::Shape;
 use crate::initial::{InitialValues, filtered};
 use crate::motion::Processes;
@@ -19,7 +21,7 @@ use crate::problem::{Pass, Problem};
 use crate::recording::Recording;
 use crate::result::Refined;
 use crate::roughness::make_consistent;
-use crate::solve::{Unsolved, apply, solve};
+use crate::solve::{Unsolved, Watch, apply, solve};
 use crate::surveyed::control_points;
 use crate::unknowns::{constant, knot, outside_places, places, priors};
 use crate::values::{Knot, Values};
@@ -76,6 +78,8 @@ const HELD_TILT_ERROR: f64 = 1e-5;
 const SEGMENT: usize = 5_000;
 /// Most outliers that are listed.
 const NAMED: usize = 200;
+/// Factor on the variance of tilt readings of which it is not known what they mean.
+const UNBELIEVED: f64 = 100.0;
 /// Correlation time of the thrust beyond the weight, s.
 const THRUST_TAU_S: f64 = 2.0;
 
@@ -92,26 +96,31 @@ pub fn refine(
     recordings: &[Recording],
     watch: &mut dyn FnMut(f64) -> bool,
 ) -> Result<Refined, RefineError> {
-    let firsts: Vec<InitialValues> =
+    let mut firsts: Vec<InitialValues> =
         recordings.iter().map(|recording| filtered(rig, estimator, site, recording)).collect();
-    let felt = firsts.iter().find_map(|first| first.felt);
     let mut predictor = Predictor::new(rig, estimator, site);
-    predictor.set_felt(felt);
     let plan = planned(&predictor, recordings, &firsts, rig.target.len(), estimator.lost_after_s);
     if plan.stops.is_empty() {
         return Err(why_not_started(recordings));
     }
-    let mut problem = stated((rig, estimator, site), recordings, plan, &mut predictor, &firsts);
-    let mut values = first_values(&problem, &firsts, &predictor, rig, site);
     let (gust_mps2, thrust_mps2) = (estimator.side_force_mps2, estimator.thrust_mps2);
-    let mut noise =
-        first_noise(problem.targets, gust_mps2, thrust_mps2, shake_of(&firsts).map(|shake| shake.0));
-    let total = (problem.plan.stops.len() * (ROUNDS + 1) * 3) as f64;
+    let shakes = shake_of(&firsts).map(|shake| shake.0);
+    let mut noise = first_noise(rig.target.len(), gust_mps2, thrust_mps2, shakes);
+    let total = (plan.stops.len() * (ROUNDS + 1) * 3) as f64;
     let mut done = 0usize;
     let mut step = |_: usize| {
         done += 1;
         watch((done as f64 / total).min(1.0))
     };
+    let mut felt = firsts.iter().find_map(|first| first.felt);
+    if felt.is_none() {
+        let config = (rig, estimator, site);
+        felt = undecided_felt(config, recordings, (plan.clone(), &firsts), &noise, &mut step)?;
+        firsts.iter_mut().for_each(|first| first.felt = felt);
+    }
+    predictor.set_felt(felt);
+    let mut problem = stated((rig, estimator, site), recordings, plan, &mut predictor, &firsts);
+    let mut values = first_values(&problem, &firsts, &predictor, rig, site);
     let nearly = NEARLY * problem.plan.stops.len() as f64;
     let mut last = false;
     for round in 0.. {
@@ -140,6 +149,29 @@ pub fn refine(
         last = round + 1 >= ROUNDS || (moved < SETTLED && changed == 0);
     }
     unreachable!("the loop ends by its rounds")
+}
+
+/// What the tilt sensor measures, where the filter did not find out; `None` where the flight does not show it.
+fn undecided_felt(
+    config: (&Rig, &EstimatorConfig, &Site),
+    recordings: &[Recording],
+    (plan, firsts): (Plan, &[InitialValues]),
+    noise: &Noise,
+    watch: Watch<'_>,
+) -> Result<Option<FeltTilt>, RefineError> {
+    let (rig, estimator, site) = config;
+    let mut predictor = Predictor::new(rig, estimator, site);
+    let problem = stated(config, recordings, plan, &mut predictor, firsts);
+    if problem.considered_tilt_var > 0.0 {
+        return Ok(None);
+    }
+    let mut values = first_values(&problem, firsts, &predictor, rig, site);
+    let mut noise = noise.clone();
+    noise.set(Source::Tilt, UNBELIEVED);
+    let enough = ROUGHLY * NEARLY * problem.plan.stops.len() as f64;
+    let mut pass = Pass::new(&problem, predictor);
+    solve(&mut pass, &mut values, &noise, enough, watch)?;
+    Ok(decide_felt(&mut pass, &values))
 }
 
 fn why_not_started(recordings: &[Recording]) -> RefineError {
@@ -184,8 +216,8 @@ pub(crate) fn stated<'a>(
         Some(FeltTilt::Share(share)) => Some(share),
         _ => None,
     };
-    let sways: Vec<bool> =
-        (0..targets).map(|target| firsts.iter().any(|first| first.sways[target])).collect();
+    // Any body may sway by millimetres; how far is fitted.
+    let sways: Vec<bool> = (0..targets).map(|target| predictor.moves(target)).collect();
     sways.iter().enumerate().for_each(|(target, sways)| predictor.set_sways(target, *sways));
     let shake = shake_of(firsts);
     predictor.set_shakes(shake.map(|shake| shake.1));

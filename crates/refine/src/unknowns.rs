@@ -84,6 +84,10 @@ pub enum ConstantKind {
     Focal,
     /// A distortion term of the lens relative to its configuration: k1, k2, p1, p2; of a fisheye its four.
     Lens(usize),
+    /// How much older the receiver's velocity is than its position: receivers filter velocity longer.
+    VelocityDelay,
+    /// How far the receiver smooths its velocity beyond delaying it, s²: `v − a τ + s da/dt`; a filter of first order has τ².
+    VelocitySmoothing,
     /// Of a tag: logarithm of its size over that configured; place forward, right; turn.
     Tag {
         /// Index of the target.
@@ -98,7 +102,10 @@ pub enum ConstantKind {
 impl ConstantKind {
     /// Whether its expected value is from the configuration.
     const fn is_configured(self) -> bool {
-        !matches!(self, Self::Trim(_) | Self::Drag | Self::TiltShare)
+        !matches!(
+            self,
+            Self::Trim(_) | Self::Drag | Self::TiltShare | Self::VelocityDelay | Self::VelocitySmoothing
+        )
     }
 }
 
@@ -119,7 +126,9 @@ pub(crate) mod constant {
     pub(crate) const ANTENNA_AT: usize = 21;
     pub(crate) const FOCAL: usize = 24;
     pub(crate) const LENS: usize = 25;
-    pub(crate) const TAGS: usize = 29;
+    pub(crate) const VELOCITY_DELAY: usize = 29;
+    pub(crate) const VELOCITY_SMOOTHING: usize = 30;
+    pub(crate) const TAGS: usize = 31;
 }
 
 /// The prior of a constant.
@@ -200,6 +209,9 @@ const ANTENNA_AT: f64 = 0.1;
 const FOCAL: f64 = 0.005;
 /// Distortion of a calibrated lens: k1, k2, p1, p2.
 const LENS: [f64; 4] = [0.02, 0.02, 0.0005, 0.0005];
+/// Receivers filter velocity over some tenths of a second, s.
+const VELOCITY_DELAY: f64 = 0.1;
+const VELOCITY_SMOOTHING: f64 = 0.02;
 /// A tag as printed and glued on: share of its size, m, m, rad.
 const TAG: [f64; TAG_COLUMNS] = [0.005, 0.01, 0.01, 0.0175];
 
@@ -230,6 +242,8 @@ pub(crate) fn priors(rig: &Rig, predictor: &Predictor, share: Option<f64>, blind
     all.extend((0..3).map(|i| prior(Kind::AntennaAt(i), ANTENNA_AT)));
     all.push(prior(Kind::Focal, FOCAL));
     all.extend((0..4).map(|i| prior(Kind::Lens(i), LENS[i])));
+    all.push(prior(Kind::VelocityDelay, VELOCITY_DELAY));
+    all.push(prior(Kind::VelocitySmoothing, VELOCITY_SMOOTHING));
     let mut last = None;
     for (target, marker) in predictor.tags() {
         // Place and yaw of a target's first tag define the target's frame.
@@ -272,7 +286,10 @@ pub(crate) enum Place {
 /// The same for an external position, which is independent of the receiver's errors.
 pub(crate) fn outside_places(places: &[Place]) -> Vec<Place> {
     let mut places = places.to_vec();
-    columns::GPS_BIAS.chain(columns::GPS_DELAY).for_each(|column| places[column] = Place::Nowhere);
+    columns::GPS_BIAS
+        .chain(columns::GPS_DELAY)
+        .chain(columns::VELOCITY_DELAY)
+        .for_each(|column| places[column] = Place::Nowhere);
     places
 }
 
@@ -298,6 +315,7 @@ pub(crate) fn places(predictor: &Predictor, sways: &[bool], shakes: bool, priors
         (columns::GPS_DELAY, constant::GPS_DELAY),
         (columns::DRAG, constant::DRAG),
         (columns::LENS, constant::LENS),
+        (columns::VELOCITY_DELAY, constant::VELOCITY_DELAY),
     ];
     for (range, first) in of_knot {
         range.enumerate().for_each(|(i, column)| places[column] = Place::Knot(first + i));

@@ -15,13 +15,14 @@ use crate::io::records::topic;
 use crate::text::{csv_field, csv_figure, finite};
 
 /// The tables and their columns.
-pub(super) const TABLES: [(&str, &str); 7] = [
+pub(super) const TABLES: [(&str, &str); 8] = [
     ("estimates.csv", ESTIMATE_COLUMNS),
     ("smoothed.csv", ESTIMATE_COLUMNS),
     ("paper.csv", ESTIMATE_COLUMNS),
     ("refined.csv", ESTIMATE_COLUMNS),
     ("detections.csv", DETECTION_COLUMNS),
     ("ownship.csv", OWNSHIP_COLUMNS),
+    ("ownship_refined.csv", OWNSHIP_COLUMNS),
     ("datum.csv", DATUM_COLUMNS),
 ];
 const ESTIMATE_COLUMNS: &str =
@@ -75,6 +76,7 @@ pub(super) fn export(flight: &Path, mut reader: McapReader, out: &Path) -> Resul
     let mut paper = CsvTable::create(out, "paper.csv", ESTIMATE_COLUMNS)?;
     let mut detections = CsvTable::create(out, "detections.csv", DETECTION_COLUMNS)?;
     let mut ownship = CsvTable::create(out, "ownship.csv", OWNSHIP_COLUMNS)?;
+    let mut ownship_refined = CsvTable::create(out, "ownship_refined.csv", OWNSHIP_COLUMNS)?;
     let mut ownship_rows: Vec<(i64, String)> = Vec::new();
     let mut datum: Option<Datum> = None;
     let mut damaged = Vec::new();
@@ -86,6 +88,10 @@ pub(super) fn export(flight: &Path, mut reader: McapReader, out: &Path) -> Resul
             }
         } else if name == topic::OWNSHIP {
             ownship_rows.extend(decoded::<Ownship>(&message, &mut damaged).map(|own| ownship_row(&own)));
+        } else if name == topic::OWNSHIP_REFINED {
+            if let Some(own) = decoded::<Ownship>(&message, &mut damaged) {
+                ownship_refined.row(&ownship_row(&own).1)?;
+            }
         } else if name == topic::DATUM {
             // A datum that moved replaces the earlier one.
             datum = decoded::<Datum>(&message, &mut damaged).or(datum);
@@ -111,9 +117,7 @@ pub(super) fn export(flight: &Path, mut reader: McapReader, out: &Path) -> Resul
     let mut exported = Exported { files: Vec::new(), warnings };
     let mut tables = vec![estimates, smoothed, paper, detections, ownship];
     // Few flights are refined, and an empty table would look like a refined flight.
-    if refined.rows > 0 {
-        tables.push(refined);
-    }
+    tables.extend([refined, ownship_refined].into_iter().filter(|table| table.rows > 0));
     if let Some(datum) = datum {
         let mut table = CsvTable::create(out, "datum.csv", DATUM_COLUMNS)?;
         table.row(&figures(&[(datum.lat_deg, 10), (datum.lon_deg, 10), (datum.height_m, 4)])[1..])?;

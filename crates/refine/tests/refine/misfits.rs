@@ -2,6 +2,7 @@
 
 use nalgebra::{Rotation3, Vector3};
 use windhover_base::geo::ned_from_body_321;
+use windhover_base::msg::FeltTilt;
 use windhover_refine::{ConstantKind as Kind, Refined};
 use windhover_simulate::Scenario;
 
@@ -52,6 +53,34 @@ fn a_vehicle_that_sways_is_not_believed_to_drive_so() {
     let filter = Score::of(&flown.filtered(), &flown.world);
     assert!(score.nees < MOST_NEES * score.frames, "{score}");
     assert!(score.rms(1) < 0.6 * filter.rms(1), "{score}\nfilter: {filter}");
+}
+
+/// A body that sways by less than a pixel's noise: its motion is not taken for driving.
+#[test]
+fn a_body_that_sways_a_little_is_not_believed_to_drive_so() {
+    let flown = fly("follow", 16.0, 3, |scenario| scenario.deviate("sway", Some(1.5)).expect("known"));
+    let refined = flown.refined();
+    let score = Score::of(refined.targets.iter().map(|(_, e)| e), &flown.world);
+    let filter = Score::of(&flown.filtered(), &flown.world);
+    assert!(score.nees < MOST_NEES * score.frames, "{score}");
+    assert!(score.rms(1) < 0.4 * filter.rms(1), "{score}\nfilter: {filter}");
+}
+
+/// Where a receiver that filters its velocity hides from the filter what the tilt sensor measures, the whole flight shows it, and no
+/// part of the rig absorbs the difference.
+#[test]
+fn what_the_tilt_sensor_measures_is_found_by_the_whole_flight() {
+    let flown = fly("all-a-little", 16.0, 3, |_| {});
+    let refined = flown.refined();
+    assert_eq!(refined.felt, Some(FeltTilt::Force));
+    let of = |kind: Kind| *refined.constants.iter().find(|c| c.kind == kind).expect("estimated");
+    for kind in [Kind::Mount(0), Kind::Mount(1), Kind::Mount(2), Kind::Focal, Kind::AntennaAt(2)] {
+        let (constant, truth) = (of(kind), truth(kind, flown.world.scenario()).expect("known"));
+        assert!((constant.value - truth).abs() < 3.5 * constant.sigma, "{constant:?}, truth {truth}");
+    }
+    // Of 0.2 s in velocity against 0.1 s in position.
+    let delay = of(Kind::VelocityDelay);
+    assert!(delay.value > 0.05 && delay.is_determined(), "{delay:?}");
 }
 
 /// A camera whose stamps are late: that it is late against compass and receiver is known, which of them are wrong is not.
@@ -107,6 +136,23 @@ fn meet(names: &[&str]) {
 }
 
 // `cargo test -p windhover-refine --test refine -- --ignored --nocapture proof_`
+
+/// Everything a little, over flights: of heading each flight is one draw.
+#[test]
+#[ignore = "minutes"]
+fn proof_all_a_little_is_met() {
+    let mut all = [Score::default(); 2];
+    for seed in 1..=6 {
+        let flown = fly("all-a-little", 20.0, seed, |_| {});
+        all[0].add(&Score::of(&flown.filtered(), &flown.world));
+        let refined = flown.refined();
+        let score = Score::of(refined.targets.iter().map(|(_, e)| e), &flown.world);
+        println!("all-a-little, seed {seed}, {:?}, refined: {score}", refined.felt);
+        all[1].add(&score);
+    }
+    println!("all, filter: {}\nall, refined: {}", all[0], all[1]);
+    assert!(all[1].nees <= MOST_NEES * all[1].frames, "{}", all[1]);
+}
 
 #[test]
 #[ignore = "minutes"]
