@@ -6,7 +6,7 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, Vector2};
 use windhover_base::geo::{Ground, wrap_angle};
 use windhover_base::msg::{
-    AttitudeSample, Disposition, FrameObservations, GnssEpoch, Stamped, TargetEstimate, TrackStatus,
+    AttitudeSample, Disposition, FrameObservations, GnssEpoch, Ownship, Stamped, TargetEstimate, TrackStatus,
 };
 use windhover_base::settings::{EstimatorConfig, Rig};
 use windhover_base::time::{MonoTime, Span};
