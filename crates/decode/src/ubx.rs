@@ -222,7 +222,8 @@ fn solution(pvt: &NavPvtRef<'_>) -> Result<Report, Refusal> {
     };
     let (valid, flags) = (pvt.valid_raw(), pvt.flags_raw());
     let mut report = Report::new(Kind::Pvt);
-    clock.fill(&mut report, valid & 2 != 0, valid & 1 != 0)?;
+    let time = clock.fill(&mut report, valid & 2 != 0, valid & 1 != 0);
+    report.optional("NAV-PVT time", time.map(Some));
     let ok = flags & 1 != 0;
     // Dead reckoning alone (1) and time alone (5) are not fixes.
     let fix = match pvt.fix_type_raw() {
@@ -236,10 +237,9 @@ fn solution(pvt: &NavPvtRef<'_>) -> Result<Report, Refusal> {
         return Ok(report);
     }
     let (lat, lon) = (pvt.latitude(), pvt.longitude());
-    if !(-90.0..=90.0).contains(&lat) || !(-180.0..=180.0).contains(&lon) {
-        return Err(Refusal::OutOfRange);
-    }
-    report.position_deg = Some((lat, lon));
+    let there = (-90.0..=90.0).contains(&lat) && (-180.0..=180.0).contains(&lon);
+    let position = if there { Ok(Some((lat, lon))) } else { Err(Refusal::OutOfRange) };
+    report.position_deg = report.optional("NAV-PVT position", position);
     report.solution = Some(match flags >> 6 {
         1 => Solution::RtkFloat,
         2 => Solution::RtkFixed,
@@ -344,10 +344,11 @@ impl Clock {
         if !has_time {
             return Ok(());
         }
-        if hour > 23 || minute > 59 || second > 60 {
+        let nanoseconds = i64::from(self.nanoseconds);
+        if hour > 23 || minute > 59 || second > 60 || nanoseconds.abs() > NS_PER_S {
             return Err(Refusal::OutOfRange);
         }
-        let exact_ns = (hour * 3600 + minute * 60 + second) * NS_PER_S + i64::from(self.nanoseconds);
+        let exact_ns = (hour * 3600 + minute * 60 + second) * NS_PER_S + nanoseconds;
         let rounded = |step: i64| (exact_ns + step / 2).div_euclid(step) * step;
         let coarse_ns = rounded(SENTENCE_STEP_NS);
         let near = (coarse_ns - exact_ns).abs() <= EPOCH_STEP_NS;

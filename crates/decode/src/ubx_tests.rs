@@ -122,6 +122,48 @@ fn other_packets_are_passed_over_and_damage_is_counted() {
 }
 
 #[test]
+fn what_cannot_be_costs_only_itself() {
+    let with = |at: usize, value: i32| {
+        let mut payload = pvt(5, 0, 3, 1)[6..98].to_vec();
+        payload[at..at + 4].copy_from_slice(&value.to_le_bytes());
+        ubx_framed(1, 7, &payload)
+    };
+    for (at, value) in [(24, 1_800_000_001), (24, -2_000_000_000), (28, 900_000_001), (28, i32::MIN)] {
+        let (epochs, counts) = decode(GpsFormat::Ubx, &with(at, value));
+        let epoch = epochs[0].epoch;
+        assert_eq!((epochs.len(), epoch.lat_deg, epoch.lon_deg), (1, None, None), "{value}: {counts}");
+        // An epoch without a place is no fix, unless a sentence beside it has the place.
+        assert_eq!((epoch.sats, epoch.fix), (Some(17), FixKind::None));
+        let sentence =
+            framed("GNRMC,150405.00,A,3842.20000,N,00911.00000,W,4.86,306.9,181126,,,A,V") + "\r\n";
+        let (epochs, counts) = decode(GpsFormat::Auto, &[with(at, value), sentence.into_bytes()].concat());
+        let epoch = epochs[0].epoch;
+        assert_eq!((epochs.len(), epoch.fix, epoch.sats), (1, FixKind::ThreeD, Some(17)), "{counts}");
+        assert!((epoch.lat_deg.expect("of the sentence") - 38.703_333_3).abs() < 1e-6);
+        assert_eq!((epoch.vel_ned_mps.is_some(), epoch.hpe_m), (true, Some(0.8)));
+        let counts = decode(GpsFormat::Ubx, &with(at, value)).1;
+        assert_eq!(counts.left_out().collect::<Vec<_>>(), [("NAV-PVT position", 1)]);
+        assert_eq!((counts.used, counts.refused_total()), (1, 0), "{counts}");
+    }
+    // Without its time a packet has no epoch; sentences beside it have.
+    let mut payload = pvt(5, 0, 3, 1)[6..98].to_vec();
+    payload[8] = 25;
+    let (_, counts) = decode(GpsFormat::Ubx, &ubx_framed(1, 7, &payload));
+    assert!(counts.left_out().any(|(name, n)| name == "NAV-PVT time" && n == 1), "{counts}");
+    // A variance that is no number costs its kind alone.
+    let mut covariance = vec![0; 64];
+    covariance[5..7].copy_from_slice(&[1, 1]);
+    for (at, variance) in [(16, f32::NAN), (28, 4.0), (36, 9.0), (40, 0.01), (52, 0.01), (60, 0.04)] {
+        covariance[at..at + 4].copy_from_slice(&variance.to_le_bytes());
+    }
+    let (epochs, counts) =
+        decode(GpsFormat::Ubx, &[pvt(5, 0, 3, 1), ubx_framed(1, 0x36, &covariance)].concat());
+    assert_eq!(counts.left_out().collect::<Vec<_>>(), [("NAV-COV position", 1)], "{counts}");
+    let sigma = epochs[0].epoch.velocity_sigma_mps.expect("of the velocity");
+    assert!((sigma - Vector3::new(0.1, 0.1, 0.2)).norm() < 1e-6, "{sigma}");
+}
+
+#[test]
 fn the_seventh_generation_is_read() {
     let long = pvt(5, 0, 3, 1);
     let (epochs, counts) = decode(GpsFormat::Auto, &ubx_framed(1, 7, &long[6..90]));

@@ -11,14 +11,17 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use tokio::sync::{Semaphore, mpsc};
-use zenoh::Wait as _;
 use zenoh::key_expr::KeyExpr;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::{Query, TimeRange, ZenohParameters as _};
 use zenoh::time::{NTP64, Timestamp, TimestampId};
+use zenoh::{Session, Wait as _};
 
 use super::history;
+use super::ros_graph::RosGraph;
+use crate::io::clock::HostClock;
 use crate::io::link::Arrival;
+use crate::io::proto::link::Thumbnail;
 use windhover_base::time::MonoTime;
 
 /// Where a station listens by default.
@@ -52,6 +55,7 @@ type Recent = Arc<Mutex<BTreeMap<String, VecDeque<Sample>>>>;
 pub struct Fleet {
     recent: Recent,
     publish: mpsc::Sender<Sample>,
+    ros: Option<RosGraph>,
 }
 
 /// The key expression of a payload's topic; `None` where the names contain reserved characters.
@@ -73,9 +77,9 @@ fn stamp(t: MonoTime, id: TimestampId) -> Timestamp {
     Timestamp::new(NTP64::from(since), id)
 }
 
-/// A configuration of Zenoh: a file in its own format, or an endpoint to connect to; the station listens on loopback.
-/// There is no multicast discovery, and nothing listens beyond loopback, unless a file configures it.
-fn configuration(words: &str) -> zenoh::Result<zenoh::Config> {
+/// A configuration of Zenoh: a file in its own format, an endpoint to connect to, or one on loopback where the station
+/// listens as a router. There is no multicast discovery, and nothing listens beyond loopback, unless a file configures it.
+fn configuration(words: &str, listens: bool) -> zenoh::Result<zenoh::Config> {
     let is_endpoint = ["tcp/", "udp/"].iter().any(|scheme| words.starts_with(scheme));
     if !is_endpoint {
         return zenoh::Config::from_file(words);
@@ -83,8 +87,8 @@ fn configuration(words: &str) -> zenoh::Result<zenoh::Config> {
     let mut config = zenoh::Config::default();
     let at = serde_json::json!([words]).to_string();
     config.insert_json5("scouting/multicast/enabled", "false")?;
-    if words == LOOPBACK {
-        config.insert_json5("mode", r#""peer""#)?;
+    if listens {
+        config.insert_json5("mode", r#""router""#)?;
         config.insert_json5("listen/endpoints", &at)?;
     } else {
         config.insert_json5("mode", r#""client""#)?;
@@ -93,10 +97,23 @@ fn configuration(words: &str) -> zenoh::Result<zenoh::Config> {
     Ok(config)
 }
 
+/// Joins Zenoh (see `configuration`). Where a router has the place on loopback already, the station connects to it.
+async fn join(words: &str) -> zenoh::Result<Session> {
+    if words != LOOPBACK {
+        return zenoh::open(configuration(words, false)?).await;
+    }
+    match zenoh::open(configuration(words, true)?).await {
+        Ok(session) => Ok(session),
+        Err(taken) => zenoh::open(configuration(words, false)?).await.map_err(|_| taken),
+    }
+}
+
 impl Fleet {
-    /// Joins Zenoh (see `configuration`) and answers queries from the files under `root`, until the program ends.
-    pub async fn open(words: &str, root: PathBuf) -> zenoh::Result<Self> {
-        let session = zenoh::open(configuration(words)?).await?;
+    /// Joins Zenoh (see `configuration`) and answers queries from the files under `root`, until the program ends. With
+    /// a domain the payloads are in its graph of ROS, too.
+    pub async fn open(words: &str, root: PathBuf, ros: Option<u8>) -> zenoh::Result<Self> {
+        let session = join(words).await?;
+        let ros = ros.map(|domain| RosGraph::join(session.clone(), domain, HostClock::start()));
         let id = TimestampId::from(session.zid());
         let queries = session.declare_queryable("windhover/**").await?;
         let recent = Recent::default();
@@ -126,11 +143,14 @@ impl Fleet {
                 let _ = put.await;
             }
         });
-        Ok(Self { recent, publish })
+        Ok(Self { recent, publish, ros })
     }
 
     /// Takes a record that arrived.
     pub fn record(&self, arrival: &Arrival) {
+        if let Some(ros) = &self.ros {
+            ros.record(arrival);
+        }
         let Some(key) = key(&arrival.payload, &arrival.channel.topic) else { return };
         let sample = Sample {
             key,
@@ -155,6 +175,15 @@ impl Fleet {
         if arrival.live {
             // The queue is full: Zenoh's engine is behind, and the next estimate is of more use than this one.
             let _ = self.publish.try_send(sample);
+        }
+    }
+}
+
+impl Fleet {
+    /// Takes a picture of a payload's camera; only ROS has a topic for it.
+    pub fn thumbnail(&self, payload: &Arc<str>, thumbnail: &Thumbnail) {
+        if let Some(ros) = &self.ros {
+            ros.thumbnail(payload, thumbnail);
         }
     }
 }

@@ -3,7 +3,7 @@
 //! ```text
 //! payloads ─► io::link ─► intake ─┬─► mirror (thread: MCAP, fsync once a second) ─► "stored" to the payload
 //!                                 ├─► view ─► web page, GeoJSON, KML, NMEA, Cursor on Target, OpenMetrics
-//!                                 ├─► Foxglove, Zenoh
+//!                                 ├─► Foxglove, Zenoh, ROS 2 on Zenoh
 //!                                 └─► one line a second per payload
 //! ```
 
@@ -19,6 +19,8 @@ mod freshness;
 mod history;
 pub mod mirror;
 mod nmea_port;
+#[cfg(feature = "zenoh")]
+mod ros_graph;
 mod terminal;
 pub mod view;
 pub mod web;
@@ -80,6 +82,9 @@ pub struct GroundSettings {
     /// How to join Zenoh: an endpoint, or a file with Zenoh's own configuration.
     #[cfg(feature = "zenoh")]
     pub zenoh: Option<String>,
+    /// The domain of ROS 2 (`ROS_DOMAIN_ID`) in which the payloads are published over Zenoh.
+    #[cfg(feature = "zenoh")]
+    pub ros: Option<u8>,
     /// Whether lines are rewritten in place, as on a terminal.
     pub terminal: bool,
 }
@@ -188,7 +193,7 @@ pub async fn run(settings: GroundSettings, stop: watch::Receiver<bool>) -> Resul
     #[cfg(feature = "zenoh")]
     let fleet = match settings.zenoh {
         None => None,
-        Some(words) => match fleet::Fleet::open(&words, settings.out.clone()).await {
+        Some(words) => match fleet::Fleet::open(&words, settings.out.clone(), settings.ros).await {
             Ok(fleet) => Some(fleet),
             Err(source) => return Err(GroundError::Zenoh { words, source }),
         },
@@ -317,6 +322,10 @@ async fn intake(
             Some(FromPayload::Thumbnail { payload, thumbnail }) => {
                 if let Some(scope) = &outputs.scope {
                     scope.thumbnail(&payload, &thumbnail);
+                }
+                #[cfg(feature = "zenoh")]
+                if let Some(fleet) = &outputs.fleet {
+                    fleet.thumbnail(&payload, &thumbnail);
                 }
                 Some(lock(&outputs.view).thumbnail(&payload, thumbnail))
             }

@@ -1,6 +1,6 @@
 //! The camera: images, lens, detections.
 
-use super::CAMERA;
+use super::{CAMERA, RosTranslator};
 use crate::io::proto::windhover::{Detections, Marker};
 use crate::io::proto::{foxglove as fox, host_time};
 use crate::io::ros::{
@@ -30,66 +30,72 @@ fn form(encoding: FrameEncoding) -> Form {
     }
 }
 
-/// `/camera/image/compressed` or `/camera/image`, with `/camera/camera_info` of the same stamp.
-pub(super) fn frame(
-    frame: &FramePayload,
-    log: MonoTime,
-    lens: Option<&CameraInfo>,
-    out: &mut Vec<RosRecord>,
-) {
-    let t = frame.t_exposure;
-    let header = Header::new(t, CAMERA);
-    let image = |encoding, data| Image {
-        header: header.clone(),
-        height: frame.height,
-        width: frame.width,
-        encoding,
-        step: frame.stride,
-        data,
-    };
-    let luma = frame.stride as usize * frame.height as usize;
-    out.push(match form(frame.encoding) {
-        Form::Compressed(format) => {
-            let image = CompressedImage { header: header.clone(), format, data: &frame.data };
-            RosRecord::new("/camera/image/compressed", log, t, &image)
+impl RosTranslator {
+    /// `/camera/image/compressed` or `/camera/image`, with `/camera/camera_info` of the same stamp.
+    pub(super) fn image(&self, frame: &FramePayload, log: MonoTime, out: &mut Vec<RosRecord>) {
+        let t = frame.t_exposure;
+        let header = Header::new(t, self.frame(CAMERA));
+        let image = |encoding, data| Image {
+            header: header.clone(),
+            height: frame.height,
+            width: frame.width,
+            encoding,
+            step: frame.stride,
+            data,
+        };
+        let luma = frame.stride as usize * frame.height as usize;
+        out.push(match form(frame.encoding) {
+            Form::Compressed(format) => {
+                let image = CompressedImage { header: header.clone(), format, data: &frame.data };
+                RosRecord::new(self.topic("/camera/image/compressed"), log, t, &image)
+            }
+            Form::Raw(encoding) => {
+                RosRecord::new(self.topic("/camera/image"), log, t, &image(encoding, &frame.data))
+            }
+            Form::Luma if frame.data.len() >= luma => {
+                RosRecord::new(self.topic("/camera/image"), log, t, &image("mono8", &frame.data[..luma]))
+            }
+            Form::Luma | Form::None => return,
+        });
+        if let Some(lens) = &self.lens {
+            let info = CameraInfo { header, ..lens.clone() };
+            out.push(RosRecord::new(self.topic("/camera/camera_info"), log, t, &info));
         }
-        Form::Raw(encoding) => RosRecord::new("/camera/image", log, t, &image(encoding, &frame.data)),
-        Form::Luma if frame.data.len() >= luma => {
-            RosRecord::new("/camera/image", log, t, &image("mono8", &frame.data[..luma]))
+    }
+
+    /// `/camera/thumbnail/compressed`: a picture of the camera for viewers, JPEG, its exposure at `t`.
+    pub fn thumbnail(&self, t: MonoTime, jpeg: &[u8]) -> RosRecord {
+        let image =
+            CompressedImage { header: Header::new(t, self.frame(CAMERA)), format: "jpeg", data: jpeg };
+        RosRecord::new(self.topic("/camera/thumbnail/compressed"), t, t, &image)
+    }
+
+    /// The lens in the form of `sensor_msgs`; distortion of another number of terms is written as zeros.
+    pub(super) fn lens_of(&self, calibration: fox::CameraCalibration) -> CameraInfo {
+        let distortion_model = match calibration.distortion_model.as_str() {
+            "kannala_brandt" | "fisheye" => "equidistant".to_owned(),
+            _ => calibration.distortion_model,
+        };
+        CameraInfo {
+            header: Header::new(host_time(calibration.timestamp.as_ref()), self.frame(CAMERA)),
+            height: calibration.height,
+            width: calibration.width,
+            distortion_model,
+            d: calibration.d,
+            k: calibration.k.try_into().unwrap_or_default(),
+            p: calibration.p.try_into().unwrap_or_default(),
         }
-        Form::Luma | Form::None => return,
-    });
-    if let Some(lens) = lens {
-        let info = CameraInfo { header, ..lens.clone() };
-        out.push(RosRecord::new("/camera/camera_info", log, t, &info));
     }
-}
 
-/// The lens in the form of `sensor_msgs`; distortion of another number of terms is written as zeros.
-pub(super) fn lens(calibration: fox::CameraCalibration) -> CameraInfo {
-    let distortion_model = match calibration.distortion_model.as_str() {
-        "kannala_brandt" | "fisheye" => "equidistant".to_owned(),
-        _ => calibration.distortion_model,
-    };
-    CameraInfo {
-        header: Header::new(host_time(calibration.timestamp.as_ref()), CAMERA),
-        height: calibration.height,
-        width: calibration.width,
-        distortion_model,
-        d: calibration.d,
-        k: calibration.k.try_into().unwrap_or_default(),
-        p: calibration.p.try_into().unwrap_or_default(),
+    /// `/camera/detections`: tags, and discs as the family `disc` with four corners at their centre.
+    pub(super) fn detections(&self, seen: &Detections, log: MonoTime) -> RosRecord {
+        let t = host_time(seen.timestamp.as_ref());
+        let array = AprilTagDetectionArray {
+            header: Header::new(t, self.frame(CAMERA)),
+            detections: seen.markers.iter().map(marker).collect(),
+        };
+        RosRecord::new(self.topic("/camera/detections"), log, t, &array)
     }
-}
-
-/// `/camera/detections`: tags, and discs as the family `disc` with four corners at their centre.
-pub(super) fn detections(seen: &Detections, log: MonoTime) -> RosRecord {
-    let t = host_time(seen.timestamp.as_ref());
-    let array = AprilTagDetectionArray {
-        header: Header::new(t, CAMERA),
-        detections: seen.markers.iter().map(marker).collect(),
-    };
-    RosRecord::new("/camera/detections", log, t, &array)
 }
 
 fn marker(marker: &Marker) -> AprilTag {

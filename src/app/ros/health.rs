@@ -1,5 +1,6 @@
 //! State of the parts, as diagnostics and as the log.
 
+use super::RosTranslator;
 use crate::io::proto::foxglove::log::Level;
 use crate::io::proto::windhover::{Health, SourceHealth, TargetHealth, TrackStatus};
 use crate::io::proto::{foxglove as fox, host_time};
@@ -11,19 +12,42 @@ const OK: u8 = 0;
 const WARN: u8 = 1;
 const STALE: u8 = 3;
 
-/// `/diagnostics`: one status for each source, target and misfit, and one of the whole with every value of the daemon.
-pub(super) fn diagnostics(health: &Health, log: MonoTime) -> RosRecord {
-    let t = host_time(health.timestamp.as_ref());
-    let mut status = vec![whole(health)];
-    status.extend(health.sources.iter().map(source));
-    status.extend(health.targets.iter().map(target));
-    status.extend(health.misfits.iter().map(|misfit| DiagnosticStatus {
-        level: WARN,
-        name: format!("windhover: misfit of {}", misfit.source),
-        message: format!("{}: {}", misfit.figure, misfit.cause),
-        values: vec![pair("kind", &misfit.kind), pair("advice", &misfit.advice)],
-    }));
-    RosRecord::new("/diagnostics", log, t, &DiagnosticArray { header: Header::new(t, ""), status })
+impl RosTranslator {
+    /// `/diagnostics`: one status for each source, target and misfit, and one of the whole with every value of the daemon.
+    pub(super) fn diagnostics(&self, health: &Health, log: MonoTime) -> RosRecord {
+        let t = host_time(health.timestamp.as_ref());
+        let mut status = vec![whole(health)];
+        status.extend(health.sources.iter().map(source));
+        status.extend(health.targets.iter().map(target));
+        status.extend(health.misfits.iter().map(|misfit| DiagnosticStatus {
+            level: WARN,
+            name: format!("windhover: misfit of {}", misfit.source),
+            message: format!("{}: {}", misfit.figure, misfit.cause),
+            values: vec![pair("kind", &misfit.kind), pair("advice", &misfit.advice)],
+        }));
+        if let Some(helicopter) = &self.helicopter {
+            status.iter_mut().for_each(|status| status.name.insert_str(0, &format!("{helicopter}/")));
+        }
+        RosRecord::new("/diagnostics", log, t, &DiagnosticArray { header: Header::new(t, ""), status })
+    }
+
+    /// `/rosout`
+    pub(super) fn log(&self, line: fox::Log, log: MonoTime) -> RosRecord {
+        let t = host_time(line.timestamp.as_ref());
+        let level = match line.level() {
+            Level::Unknown | Level::Debug => 10,
+            Level::Info => 20,
+            Level::Warning => 30,
+            Level::Error => 40,
+            Level::Fatal => 50,
+        };
+        let message = if line.message.is_empty() { line.name.clone() } else { line.message };
+        let name = self
+            .helicopter
+            .as_ref()
+            .map_or_else(|| line.name.clone(), |name| format!("{name}.{}", line.name));
+        RosRecord::new("/rosout", log, t, &Log { stamp: t, level, name, message })
+    }
 }
 
 fn pair(key: &str, value: impl ToString) -> (String, String) {
@@ -78,18 +102,4 @@ fn target(target: &TargetHealth) -> DiagnosticStatus {
         message: message.into(),
         values,
     }
-}
-
-/// `/rosout`
-pub(super) fn log(line: fox::Log, log: MonoTime) -> RosRecord {
-    let t = host_time(line.timestamp.as_ref());
-    let level = match line.level() {
-        Level::Unknown | Level::Debug => 10,
-        Level::Info => 20,
-        Level::Warning => 30,
-        Level::Error => 40,
-        Level::Fatal => 50,
-    };
-    let message = if line.message.is_empty() { line.name.clone() } else { line.message };
-    RosRecord::new("/rosout", log, t, &Log { stamp: t, level, name: line.name, message })
 }

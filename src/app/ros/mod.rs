@@ -8,10 +8,14 @@
 //! | `NAME/base_link` | forward, left, up | the reference point of target NAME, on the ground |
 //! | `camera_optical_frame` | right, down, along the optical axis | the camera |
 //! | `imu_link`, `gps_link` | the sensor's own; as `base_link` | the body frame; the antenna |
+//!
+//! Where several helicopters are in one graph, topics and frames of each begin with its name, but `earth` and the
+//! topics that ROS has once: `/tf`, `/tf_static`, `/diagnostics`, `/rosout`.
 
 mod camera;
 mod health;
 mod motion;
+mod names;
 mod sensors;
 
 use std::collections::BTreeMap;
@@ -24,6 +28,7 @@ use crate::io::proto::windhover as wh;
 use crate::io::proto::{foxglove as fox, host_time};
 use crate::io::records::topic;
 use crate::io::ros::{CameraInfo, Header, RosRecord, TfMessage, Transform};
+pub use names::RosNames;
 use windhover_base::geo::{Geodetic, LocalFrame};
 use windhover_base::msg::{Event, EventBody};
 use windhover_base::settings::ImuConfig;
@@ -37,19 +42,17 @@ const CAMERA: &str = "camera_optical_frame";
 const IMU: &str = "imu_link";
 const GPS: &str = "gps_link";
 
-/// Most targets of a flight: a configuration has at most half as many.
-const TARGETS: usize = 64;
-
 /// Variance of a quantity that is not estimated, as in drivers of mobile robots: finite, so that covariances stay
 /// invertible.
 const NOT_ESTIMATED: f64 = 1e6;
 
 /// Converts recorded messages to messages of ROS 2, in the same order.
 pub struct RosTranslator {
+    helicopter: Option<String>,
     imu: Option<ImuConfig>,
     antenna_m: [f64; 3],
     references_m: BTreeMap<String, f64>,
-    names: BTreeMap<String, String>,
+    names: RosNames,
     datum: Option<LocalFrame>,
     lens: Option<CameraInfo>,
     statics: BTreeMap<String, Transform>,
@@ -61,21 +64,35 @@ impl RosTranslator {
         let reference =
             |target: &windhover_base::settings::TargetConfig| (target.name.clone(), target.reference_m);
         Self {
+            helicopter: None,
             imu: config.and_then(|config| config.imu),
             antenna_m: config.map_or([0.0; 3], |config| config.gps.antenna_position_m),
             references_m: config
                 .map_or(BTreeMap::new(), |config| config.target.iter().map(reference).collect()),
-            names: BTreeMap::new(),
+            names: RosNames::with("target_"),
             datum: None,
             lens: None,
             statics: BTreeMap::new(),
         }
     }
 
+    /// A translator for a helicopter among others: topics and frames begin with its name, in characters of ROS.
+    pub fn of_helicopter(name: &str) -> Self {
+        Self { helicopter: Some(name.to_owned()), ..Self::new(None) }
+    }
+
+    fn topic(&self, topic: &str) -> String {
+        self.helicopter.as_ref().map_or_else(|| topic.to_owned(), |name| format!("/{name}{topic}"))
+    }
+
+    fn frame(&self, frame: &str) -> String {
+        self.helicopter.as_ref().map_or_else(|| frame.to_owned(), |name| format!("{name}/{frame}"))
+    }
+
     /// Appends the messages of an event: frames, and samples of rates and forces.
     pub fn event(&mut self, event: &Event, out: &mut Vec<RosRecord>) {
         match &event.body {
-            EventBody::Frame(frame) => camera::frame(frame, event.t_recv, self.lens.as_ref(), out),
+            EventBody::Frame(frame) => self.image(frame, event.t_recv, out),
             EventBody::Inertial { sample, .. } => self.inertial(sample, event.t_recv, out),
             _ => {}
         }
@@ -98,12 +115,12 @@ impl RosTranslator {
             topic::OWNSHIP_REFINED => self.ownship_refined(&wh::Ownship::decode(data)?, log, out),
             topic::GPS_EPOCH => self.fix(&wh::GnssEpoch::decode(data)?, log, out),
             topic::CAMERA_CALIBRATION => {
-                self.lens = Some(camera::lens(fox::CameraCalibration::decode(data)?))
+                self.lens = Some(self.lens_of(fox::CameraCalibration::decode(data)?))
             }
             topic::TF => self.mount(&fox::FrameTransform::decode(data)?, log, out),
-            topic::CAMERA_DETECTIONS => out.push(camera::detections(&wh::Detections::decode(data)?, log)),
-            topic::HEALTH => out.push(health::diagnostics(&wh::Health::decode(data)?, log)),
-            topic::LOG => out.push(health::log(fox::Log::decode(data)?, log)),
+            topic::CAMERA_DETECTIONS => out.push(self.detections(&wh::Detections::decode(data)?, log)),
+            topic::HEALTH => out.push(self.diagnostics(&wh::Health::decode(data)?, log)),
+            topic::LOG => out.push(self.log(fox::Log::decode(data)?, log)),
             _ => {
                 if let Some((_, what)) = name.strip_prefix("/target/").and_then(|rest| rest.rsplit_once('/'))
                 {
@@ -132,7 +149,7 @@ impl RosTranslator {
         let matrix = nalgebra::Rotation3::from_basis_unchecked(&axes);
         let earth_from_map = Transform {
             header: Header::new(host_time(datum.timestamp.as_ref()), "earth"),
-            child_frame_id: MAP.into(),
+            child_frame_id: self.frame(MAP),
             translation: at,
             rotation: UnitQuaternion::from_rotation_matrix(&matrix),
         };
@@ -149,8 +166,8 @@ impl RosTranslator {
         let body_from_camera = nalgebra::Quaternion::new(q.w, q.x, q.y, q.z);
         let Some(body_from_camera) = UnitQuaternion::try_new(body_from_camera, 1e-6) else { return };
         let mount = Transform {
-            header: Header::new(host_time(tf.timestamp.as_ref()), BASE_LINK),
-            child_frame_id: CAMERA.into(),
+            header: Header::new(host_time(tf.timestamp.as_ref()), self.frame(BASE_LINK)),
+            child_frame_id: self.frame(CAMERA),
             translation: motion::flu(&Vector3::new(at.x, at.y, at.z)),
             rotation: motion::flu_from_frd() * body_from_camera,
         };
@@ -164,48 +181,11 @@ impl RosTranslator {
         let all = TfMessage(self.statics.values().cloned().collect());
         out.push(RosRecord::new("/tf_static", log, stamp, &all));
     }
-
-    /// A target's name in characters that ROS allows in topics: letters, digits and `_`, no digit first, all different.
-    /// `None` for more targets than a flight has.
-    fn ros_name(&mut self, target: &str) -> Option<String> {
-        if let Some(known) = self.names.get(target) {
-            return Some(known.clone());
-        }
-        if self.names.len() >= TARGETS {
-            return None;
-        }
-        let allowed = |c: char| if c.is_ascii_alphanumeric() { c } else { '_' };
-        let mut name: String = target.chars().map(allowed).collect();
-        if !name.starts_with(|c: char| c.is_ascii_alphabetic()) {
-            name.insert_str(0, "target_");
-        }
-        while name.contains("__") {
-            name = name.replace("__", "_");
-        }
-        while self.names.values().any(|taken| *taken == name) {
-            name += "x";
-        }
-        self.names.insert(target.to_owned(), name.clone());
-        Some(name)
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn names_of_targets_are_names_of_ros() {
-        let mut ros = RosTranslator::new(None);
-        let named = ["ugv", "my-ugv", "my_ugv", "2nd", "a--b"].map(|name| ros.ros_name(name));
-        assert_eq!(
-            named,
-            ["ugv", "my_ugv", "my_ugvx", "target_2nd", "a_b"].map(|name| Some(name.to_owned()))
-        );
-        assert_eq!(ros.ros_name("my_ugv").as_deref(), Some("my_ugvx"));
-        let many = (0..2 * TARGETS).filter_map(|n| ros.ros_name(&format!("t{n}"))).count();
-        assert_eq!(many, TARGETS - 5);
-    }
 
     #[test]
     fn the_map_stands_upright_on_the_earth() {

@@ -119,40 +119,40 @@ fn ownship_covariance(own: &Ownship) -> Option<SMatrix<f64, 9, 9>> {
     })
 }
 
-/// The helicopter's place and motion, and whether its covariance is known.
-fn ownship_odometry(own: &Ownship) -> Option<(Odometry, bool)> {
-    let ned_from_body = nalgebra::Quaternion::new(own.qw, own.qx, own.qy, own.qz);
-    let ned_from_body = UnitQuaternion::try_new(ned_from_body, 1e-6).filter(|_| own.is_sound())?;
-    let velocity = Vector3::new(own.vn_mps, own.ve_mps, own.vd_mps);
-    let flu_from_ned = flu_from_frd() * ned_from_body.inverse();
-    let p = ownship_covariance(own);
-    let pose = p.as_ref().map_or_else(nothing_known, ownship_pose);
-    let matrix = flu_from_ned.to_rotation_matrix();
-    let twist = p.as_ref().map_or_else(nothing_known, |p| ownship_twist(p, &velocity, matrix.matrix()));
-    let odometry = Odometry {
-        header: Header::new(host_time(own.timestamp.as_ref()), MAP),
-        child_frame_id: BASE_LINK.into(),
-        position: Vector3::new(own.east_m, own.north_m, -own.down_m),
-        orientation: enu_from_ned() * ned_from_body * flu_from_frd(),
-        pose_covariance: rows(&pose),
-        linear: flu_from_ned * velocity,
-        angular: Vector3::zeros(),
-        twist_covariance: rows(&twist),
-    };
-    Some((odometry, p.is_some()))
-}
-
 impl RosTranslator {
+    /// The helicopter's place and motion, and whether its covariance is known.
+    fn ownship_odometry(&self, own: &Ownship) -> Option<(Odometry, bool)> {
+        let ned_from_body = nalgebra::Quaternion::new(own.qw, own.qx, own.qy, own.qz);
+        let ned_from_body = UnitQuaternion::try_new(ned_from_body, 1e-6).filter(|_| own.is_sound())?;
+        let velocity = Vector3::new(own.vn_mps, own.ve_mps, own.vd_mps);
+        let flu_from_ned = flu_from_frd() * ned_from_body.inverse();
+        let p = ownship_covariance(own);
+        let pose = p.as_ref().map_or_else(nothing_known, ownship_pose);
+        let matrix = flu_from_ned.to_rotation_matrix();
+        let twist = p.as_ref().map_or_else(nothing_known, |p| ownship_twist(p, &velocity, matrix.matrix()));
+        let odometry = Odometry {
+            header: Header::new(host_time(own.timestamp.as_ref()), self.frame(MAP)),
+            child_frame_id: self.frame(BASE_LINK),
+            position: Vector3::new(own.east_m, own.north_m, -own.down_m),
+            orientation: enu_from_ned() * ned_from_body * flu_from_frd(),
+            pose_covariance: rows(&pose),
+            linear: flu_from_ned * velocity,
+            angular: Vector3::zeros(),
+            twist_covariance: rows(&twist),
+        };
+        Some((odometry, p.is_some()))
+    }
+
     /// `/ownship/odometry`, `/ownship/imu` (attitude alone), `/ownship/fix`, `/tf`.
     pub(super) fn ownship(&mut self, own: &Ownship, log: MonoTime, out: &mut Vec<RosRecord>) {
-        let Some((odometry, is_known)) = ownship_odometry(own) else { return };
+        let Some((odometry, is_known)) = self.ownship_odometry(own) else { return };
         let (t, position, orientation) = (odometry.header.stamp, odometry.position, odometry.orientation);
         let pose = Matrix6::from_row_slice(&odometry.pose_covariance);
-        out.push(RosRecord::new("/ownship/odometry", log, t, &odometry));
+        out.push(RosRecord::new(self.topic("/ownship/odometry"), log, t, &odometry));
         let mut absent = [0.0; 9];
         absent[0] = -1.0;
         let imu = Imu {
-            header: Header::new(t, BASE_LINK),
+            header: Header::new(t, self.frame(BASE_LINK)),
             orientation,
             orientation_covariance: rows(&pose.fixed_view::<3, 3>(3, 3).into_owned()),
             angular_velocity: Vector3::zeros(),
@@ -160,9 +160,9 @@ impl RosTranslator {
             linear_acceleration: Vector3::zeros(),
             linear_acceleration_covariance: absent,
         };
-        out.push(RosRecord::new("/ownship/imu", log, t, &imu));
+        out.push(RosRecord::new(self.topic("/ownship/imu"), log, t, &imu));
         let fix = NavSatFix {
-            header: Header::new(t, BASE_LINK),
+            header: Header::new(t, self.frame(BASE_LINK)),
             status: 0,
             latitude: own.lat_deg,
             longitude: own.lon_deg,
@@ -170,14 +170,19 @@ impl RosTranslator {
             position_covariance: rows(&pose.fixed_view::<3, 3>(0, 0).into_owned()),
             position_covariance_type: if is_known { 3 } else { 0 },
         };
-        out.push(RosRecord::new("/ownship/fix", log, t, &fix));
-        transform(t, log, BASE_LINK, position, orientation, out);
+        out.push(RosRecord::new(self.topic("/ownship/fix"), log, t, &fix));
+        self.transform(t, log, &self.frame(BASE_LINK), position, orientation, out);
     }
 
     /// `/ownship/odometry_refined`: the refined estimate.
     pub(super) fn ownship_refined(&self, own: &Ownship, log: MonoTime, out: &mut Vec<RosRecord>) {
-        if let Some((odometry, _)) = ownship_odometry(own) {
-            out.push(RosRecord::new("/ownship/odometry_refined", log, odometry.header.stamp, &odometry));
+        if let Some((odometry, _)) = self.ownship_odometry(own) {
+            out.push(RosRecord::new(
+                self.topic("/ownship/odometry_refined"),
+                log,
+                odometry.header.stamp,
+                &odometry,
+            ));
         }
     }
 
@@ -187,8 +192,8 @@ impl RosTranslator {
         if !s.known || !s.is_sound() || s.status() == TrackStatus::Lost {
             return;
         }
-        let Some(name) = self.ros_name(&s.target) else { return };
-        let frame = format!("{name}/base_link");
+        let Some(name) = self.names.of(&s.target) else { return };
+        let frame = self.frame(&format!("{name}/base_link"));
         let t = host_time(s.timestamp.as_ref());
         let place = Geodetic { lat_deg: s.lat_deg, lon_deg: s.lon_deg, height_m: s.height_m };
         let up = self.datum.as_ref().map_or(0.0, |datum| -datum.ned(place).z);
@@ -199,7 +204,7 @@ impl RosTranslator {
         let turn = -s.yaw_rate_radps;
         let ahead = self.references_m.get(&s.target).copied().unwrap_or(0.0);
         let odometry = Odometry {
-            header: Header::new(t, MAP),
+            header: Header::new(t, self.frame(MAP)),
             child_frame_id: frame.clone(),
             position,
             orientation,
@@ -208,7 +213,7 @@ impl RosTranslator {
             angular: Vector3::new(0.0, 0.0, turn),
             twist_covariance: rows(&twist),
         };
-        out.push(RosRecord::new(format!("/target/{name}/odometry{later}"), log, t, &odometry));
+        out.push(RosRecord::new(self.topic(&format!("/target/{name}/odometry{later}")), log, t, &odometry));
         if !later.is_empty() {
             return;
         }
@@ -221,22 +226,28 @@ impl RosTranslator {
             position_covariance: rows(&pose.fixed_view::<3, 3>(0, 0).into_owned()),
             position_covariance_type: u8::from(p.is_some()),
         };
-        out.push(RosRecord::new(format!("/target/{name}/fix"), log, t, &fix));
-        transform(t, log, &frame, position, orientation, out);
+        out.push(RosRecord::new(self.topic(&format!("/target/{name}/fix")), log, t, &fix));
+        self.transform(t, log, &frame, position, orientation, out);
     }
-}
 
-fn transform(
-    t: MonoTime,
-    log: MonoTime,
-    child: &str,
-    translation: Vector3<f64>,
-    rotation: UnitQuaternion<f64>,
-    out: &mut Vec<RosRecord>,
-) {
-    let transform =
-        Transform { header: Header::new(t, MAP), child_frame_id: child.into(), translation, rotation };
-    out.push(RosRecord::new("/tf", log, t, &TfMessage(vec![transform])));
+    /// `/tf`: a frame in the map.
+    fn transform(
+        &self,
+        t: MonoTime,
+        log: MonoTime,
+        child: &str,
+        translation: Vector3<f64>,
+        rotation: UnitQuaternion<f64>,
+        out: &mut Vec<RosRecord>,
+    ) {
+        let transform = Transform {
+            header: Header::new(t, self.frame(MAP)),
+            child_frame_id: child.into(),
+            translation,
+            rotation,
+        };
+        out.push(RosRecord::new("/tf", log, t, &TfMessage(vec![transform])));
+    }
 }
 
 #[cfg(test)]

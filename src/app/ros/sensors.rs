@@ -14,10 +14,10 @@ impl RosTranslator {
     /// sigma, the horizontal one as that of both axes together.
     pub(super) fn fix(&mut self, epoch: &GnssEpoch, log: MonoTime, out: &mut Vec<RosRecord>) {
         let t = host_time(epoch.timestamp.as_ref());
-        if !self.statics.contains_key(GPS) {
+        if !self.statics.contains_key(&self.frame(GPS)) {
             let lever = Transform {
-                header: Header::new(t, BASE_LINK),
-                child_frame_id: GPS.into(),
+                header: Header::new(t, self.frame(BASE_LINK)),
+                child_frame_id: self.frame(GPS),
                 translation: motion::flu(&Vector3::from(self.antenna_m)),
                 rotation: UnitQuaternion::identity(),
             };
@@ -35,7 +35,7 @@ impl RosTranslator {
         };
         let height = epoch.alt_msl_m.zip(epoch.geoid_m).map(|(above_sea, geoid)| above_sea + geoid);
         let fix = NavSatFix {
-            header: Header::new(t, GPS),
+            header: Header::new(t, self.frame(GPS)),
             status,
             latitude: epoch.lat_deg.unwrap_or(f64::NAN),
             longitude: epoch.lon_deg.unwrap_or(f64::NAN),
@@ -43,7 +43,7 @@ impl RosTranslator {
             position_covariance: covariance,
             position_covariance_type: u8::from(variances.is_some()),
         };
-        out.push(RosRecord::new("/gps/fix", log, t, &fix));
+        out.push(RosRecord::new(self.topic("/gps/fix"), log, t, &fix));
     }
 
     /// `/imu/data`, in the sensor's own axes, with their mount as a transform and the configured noise as covariance
@@ -51,11 +51,11 @@ impl RosTranslator {
     pub(super) fn inertial(&mut self, sample: &InertialSample, t_recv: MonoTime, out: &mut Vec<RosRecord>) {
         let settings = self.imu.unwrap_or_default();
         let t = t_recv - Span::from_ms(settings.latency_ms);
-        if !self.statics.contains_key(IMU) {
+        if !self.statics.contains_key(&self.frame(IMU)) {
             let body_from_imu = UnitQuaternion::from_rotation_matrix(&settings.body_from_imu());
             let mount = Transform {
-                header: Header::new(t, BASE_LINK),
-                child_frame_id: IMU.into(),
+                header: Header::new(t, self.frame(BASE_LINK)),
+                child_frame_id: self.frame(IMU),
                 translation: Vector3::zeros(),
                 rotation: motion::flu_from_frd() * body_from_imu,
             };
@@ -63,7 +63,7 @@ impl RosTranslator {
         }
         let sigma = |figure: f64| if self.imu.is_some() { figure } else { 0.0 };
         let imu = Imu {
-            header: Header::new(t, IMU),
+            header: Header::new(t, self.frame(IMU)),
             orientation: Rotation3::identity().into(),
             orientation_covariance: diagonal(-1.0, 0.0),
             angular_velocity: sample.rate_rps.unwrap_or_default(),
@@ -71,7 +71,7 @@ impl RosTranslator {
             linear_acceleration: sample.force_mps2.unwrap_or_default(),
             linear_acceleration_covariance: of(sample.force_mps2, sigma(settings.force_noise_mps2)),
         };
-        out.push(RosRecord::new("/imu/data", t_recv, t, &imu));
+        out.push(RosRecord::new(self.topic("/imu/data"), t_recv, t, &imu));
     }
 }
 

@@ -1,6 +1,8 @@
-//! The camera as a task: a V4L2 device, a recording played at its own pace, or frames of another program.
+//! The camera as a task: a V4L2 device, a recording played at its own pace, frames of another program, or GStreamer.
 
 mod format;
+#[cfg(feature = "gstreamer")]
+mod gst;
 mod recorded;
 mod socket;
 mod trigger;
@@ -17,14 +19,15 @@ use tokio::sync::watch;
 use windhover_base::settings::PixelFormat;
 
 use super::clock::HostClock;
-use super::device::{Backoff, NoteKind, Report, Reports};
+use super::device::{Backoff, Fault, FaultKind, NoteKind, Report, Reports};
 use trigger::Counted;
 
 /// The requested settings of the camera.
 #[derive(Clone, PartialEq, Debug)]
 pub struct CameraSettings {
     /// Path of a V4L2 device; `capture:PATH` for a recording (`capture-loop:PATH` plays it repeatedly); `socket:PATH`
-    /// for frames of another program (`socket.rs`).
+    /// for frames of another program (`socket.rs`); `rtsp://…` or `gst:PIPELINE` for GStreamer (`gst.rs`, built with
+    /// the feature `gstreamer`).
     pub device: String,
     /// Frame width, pixels.
     pub width: u32,
@@ -77,12 +80,41 @@ pub async fn run(
         } else if let Some(path) = recording("socket:") {
             without_controls(inputs, reports);
             socket::stream(&path, clock, reports, &mut || backoff.reset()).await
+        } else if is_gstreamer(&settings.device) {
+            without_controls(inputs, reports);
+            gstreamer(settings, clock, reports, &mut || backoff.reset()).await
         } else {
             v4l2::stream(settings, &inputs.exposure, clock, reports, &mut || backoff.reset()).await
         };
         reports(Report::Down(fault));
         backoff.wait(reports).await;
     }
+}
+
+/// Whether a device is opened by GStreamer.
+fn is_gstreamer(device: &str) -> bool {
+    ["rtsp://", "rtsps://", "gst:"].iter().any(|prefix| device.starts_with(prefix))
+}
+
+#[cfg(feature = "gstreamer")]
+async fn gstreamer(
+    settings: &CameraSettings,
+    clock: HostClock,
+    reports: Reports<'_>,
+    delivered: &mut (dyn FnMut() + Send),
+) -> Fault {
+    gst::stream(settings, clock, reports, delivered).await
+}
+
+#[cfg(not(feature = "gstreamer"))]
+async fn gstreamer(
+    settings: &CameraSettings,
+    _clock: HostClock,
+    _reports: Reports<'_>,
+    _delivered: &mut (dyn FnMut() + Send),
+) -> Fault {
+    let advice = "this windhover was built without GStreamer: build it with `cargo build --release --features gstreamer`";
+    Fault::new(FaultKind::Unsuitable, &settings.device, advice)
 }
 
 /// Reports that a source of frames without controls cannot do what is requested.

@@ -116,4 +116,82 @@ mod tests {
             RosType::Odometry.definition().starts_with("std_msgs/Header header\nstring child_frame_id\n")
         );
     }
+
+    /// Numbers of types in a type description (`type_description_interfaces/msg/FieldType`): of one value, of an array
+    /// of fixed length, of a sequence.
+    fn described(field: &str) -> Option<String> {
+        const PLAIN: [(&str, u32); 13] = [
+            ("int8", 2),
+            ("uint8", 3),
+            ("int16", 4),
+            ("uint16", 5),
+            ("int32", 6),
+            ("uint32", 7),
+            ("int64", 8),
+            ("uint64", 9),
+            ("float32", 10),
+            ("float64", 11),
+            ("bool", 15),
+            ("byte", 16),
+            ("string", 17),
+        ];
+        let mut words = field.split_whitespace();
+        let (kind, name) = (words.next()?, words.next()?);
+        let (kind, length) = kind
+            .strip_suffix(']')
+            .and_then(|kind| kind.split_once('['))
+            .map_or((kind, None), |(k, n)| (k, Some(n)));
+        let plain = PLAIN.iter().find(|(plain, _)| *plain == kind).map(|(_, number)| *number);
+        let nested = if plain.is_some() { String::new() } else { kind.replacen('/', "/msg/", 1) };
+        let (beyond, capacity) = match length {
+            None => (0, "0"),
+            Some("") => (144, "0"),
+            Some(length) => (48, length),
+        };
+        let number = plain.unwrap_or(1) + beyond;
+        // A constant has a value and is no field.
+        (!field.contains('=')).then(|| {
+            format!(
+                "{{\"name\": \"{name}\", \"type\": {{\"type_id\": {number}, \"capacity\": {capacity}, \
+                 \"string_capacity\": 0, \"nested_type_name\": \"{nested}\"}}}}"
+            )
+        })
+    }
+
+    fn description(name: &str, body: &str) -> String {
+        let fields: Vec<String> = body.lines().filter_map(described).collect();
+        let name = name.replacen('/', "/msg/", 1);
+        format!("{{\"type_name\": \"{name}\", \"fields\": [{}]}}", fields.join(", "))
+    }
+
+    /// The hash of REP-2016: SHA-256 of the type description as JSON, with those of all types of its fields in order.
+    fn hashed(name: &str, body: &'static str) -> String {
+        let mut nested = BTreeSet::new();
+        let mut waiting: Vec<&str> = parts(body).collect();
+        while let Some(part) = waiting.pop() {
+            if nested.insert(part) {
+                waiting.extend(parts(body_of(part)));
+            }
+        }
+        let nested: Vec<String> = nested.iter().map(|part| description(part, body_of(part))).collect();
+        let text = format!(
+            "{{\"type_description\": {}, \"referenced_type_descriptions\": [{}]}}",
+            description(name, body),
+            nested.join(", ")
+        );
+        let digest = ring::digest::digest(&ring::digest::SHA256, text.as_bytes());
+        digest.as_ref().iter().fold("RIHS01_".to_owned(), |all, byte| all + &format!("{byte:02x}"))
+    }
+
+    #[test]
+    fn hashes_are_those_of_the_definitions() {
+        // As ROS publishes it in rmw_zenoh's design document.
+        assert_eq!(
+            hashed("std_msgs/String", "string data\n"),
+            "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+        );
+        for &kind in RosType::ALL {
+            assert_eq!(hashed(kind.short_name(), body_of(kind.short_name())), kind.hash(), "{}", kind.name());
+        }
+    }
 }

@@ -5,6 +5,8 @@ mod cdr;
 mod definitions;
 mod encodings;
 mod messages;
+#[cfg(feature = "zenoh")]
+pub mod rmw;
 
 pub use bag::{Bag, FILES as BAG_FILES};
 pub use definitions::RosType;

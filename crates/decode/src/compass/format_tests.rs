@@ -259,6 +259,15 @@ fn vectornav_tells_angles_or_a_quaternion() {
         assert!((angle.expect("given") - wanted).abs() < 1e-3, "{angle:?}");
     }
     assert_eq!(said(CompassFormat::Vectornav, "VNQTN,0.5,0.5,0.5,0.6"), Err(Refusal::OutOfRange));
+    for (body, expected) in [
+        ("VNYPR,nan,-000.900,+000.800", (None, Some(-0.9), Some(0.8))),
+        ("VNYPR,+085.123,+inf,+000.800", (Some(85.123), None, Some(0.8))),
+        ("VNYPR,+085.123,-000.900,+900.0", (Some(85.123), Some(-0.9), None)),
+    ] {
+        let (heading, pitch, roll, ..) = reading(CompassFormat::Vectornav, body);
+        assert_eq!((heading, pitch, roll), expected, "{body}");
+    }
+    assert!(said(CompassFormat::Vectornav, "VNYPR,nan,nan,nan").is_err());
     let ins = |status| {
         format!(
             "VNINS,333811.902862,1694,{status},+009.500,-004.754,-000.225,+32.95602815,-096.7,160.4,0,0,0,1.0,0.1,0.1"

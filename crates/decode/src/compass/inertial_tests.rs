@@ -78,7 +78,13 @@ fn bno08x_tells_tilt_and_a_yaw_that_is_no_heading() {
         "yaw has an arbitrary zero"
     );
     assert_eq!((received.len(), counts.refused(Refusal::BadChecksum) > 0), (2, true), "{counts}");
-    assert!(all(CompassFormat::Bno08xRvc, &record([20_000, 0, 0])).1.refused(Refusal::OutOfRange) > 0);
+    let (mut decoder, mut received) = (CompassDecoder::new(CompassFormat::Bno08xRvc), Vec::new());
+    decoder.push(&record([20_000, 250, -30_000]), MonoTime::default(), &mut received);
+    let left_out: Vec<_> = decoder.counts().left_out().collect();
+    assert_eq!((received.len(), left_out), (1, vec![("RVC roll", 1), ("RVC yaw", 1)]));
+    assert_eq!((received[0].reading.heading_deg, received[0].reading.roll_deg), (None, None));
+    assert!(near(received[0].reading.pitch_deg, 2.5));
+    assert!(all(CompassFormat::Bno08xRvc, &record([20_000; 3])).1.refused(Refusal::OutOfRange) > 0);
 }
 
 #[test]

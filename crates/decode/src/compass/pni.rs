@@ -1,7 +1,8 @@
 //! PNI binary packets (TCM3, TCM5, TCM XB, TargetPoint, TRAX, TRAX2 and successors).
 //!
 //! A data response is a count and that many components, each an identity and its value. Heading, pitch, roll,
-//! distortion and heading status are used, the others skipped by their lengths. Bytes after a component of unknown
+//! distortion and heading status are used, the others skipped by their lengths. An angle that is not a number or out of
+//! range is left out alone. Bytes after a component of unknown
 //! length cannot be read: the packet is used up to there, and the component is counted by its number.
 //!
 //! Packet: u16 length of the whole packet, frame identity, payload, u16 CRC, big-endian; the CRC is polynomial 0x1021
@@ -124,6 +125,16 @@ impl PacketFramer {
         self.buffer.drain(..bytes);
     }
 
+    /// Takes the other byte order where it makes more of the angles plausible.
+    fn settle_order(&mut self, components: &[Component]) {
+        let plausible = |little: bool| {
+            components.iter().filter(|part| part.angle().is_some() && part.is_plausible(little)).count()
+        };
+        if plausible(!self.little_endian) > plausible(self.little_endian) {
+            self.little_endian = !self.little_endian;
+        }
+    }
+
     /// Components of a data response: a count, then identity and value of each.
     fn reading(
         &mut self,
@@ -137,17 +148,18 @@ impl PacketFramer {
         let (components, unknown) = components_of(&payload[2..], count)?;
         if let Some(identity) = unknown {
             counts.leave_out(format!("component {identity}, of unknown length, and the rest after it"));
-            if !components.iter().any(|component| matches!(component.identity, HEADING | PITCH | ROLL)) {
+            if !components.iter().any(|component| component.angle().is_some()) {
                 return Err(Refusal::Malformed);
             }
         }
-        let plausible = |little: bool| components.iter().all(|component| component.is_plausible(little));
-        if !plausible(self.little_endian) {
-            if !plausible(!self.little_endian) {
-                return Err(Refusal::OutOfRange);
-            }
-            self.little_endian = !self.little_endian;
+        self.settle_order(&components);
+        let is_impossible =
+            |part: &Component| part.angle().is_some() && !part.is_plausible(self.little_endian);
+        let (impossible, components): (Vec<_>, Vec<_>) = components.into_iter().partition(is_impossible);
+        if !impossible.is_empty() && !components.iter().any(|part| part.angle().is_some()) {
+            return Err(Refusal::OutOfRange);
         }
+        impossible.iter().filter_map(Component::angle).for_each(|name| counts.leave_out(name));
         let mut reading = CompassReading::default();
         let mut distorted = false;
         for component in &components {
@@ -206,6 +218,16 @@ struct Component {
 impl Component {
     fn float(&self, little_endian: bool) -> f32 {
         if little_endian { f32::from_le_bytes(self.bytes) } else { f32::from_be_bytes(self.bytes) }
+    }
+
+    /// Its name where it is an angle of the attitude.
+    const fn angle(&self) -> Option<&'static str> {
+        match self.identity {
+            HEADING => Some("PNI heading"),
+            PITCH => Some("PNI pitch"),
+            ROLL => Some("PNI roll"),
+            _ => None,
+        }
     }
 
     /// Whether the float is plausible for a compass: in range, and zero or not tiny. In the wrong byte order most
@@ -349,6 +371,38 @@ mod tests {
         let (out, counts) = readings(&response(&components));
         assert_eq!((out.len(), counts.refused(Refusal::Malformed)), (0, 1));
         assert!(counts.to_string().contains("component 99,"), "{counts}");
+    }
+
+    #[test]
+    fn an_impossible_angle_costs_only_itself() {
+        let all = [Some(123.5), Some(-2.25), Some(4.0)];
+        for (at, name) in ["PNI heading", "PNI pitch", "PNI roll"].into_iter().enumerate() {
+            for wrong in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 400.0, -1e20, 1e-30] {
+                for little in [false, true] {
+                    let angles = [(HEADING, 123.5), (PITCH, -2.25), (ROLL, 4.0)];
+                    let mut parts = angles.map(|(identity, angle): (u8, f32)| {
+                        component(identity, &if little { angle.to_le_bytes() } else { angle.to_be_bytes() })
+                    });
+                    let bytes = if little { wrong.to_le_bytes() } else { wrong.to_be_bytes() };
+                    parts[at] = component(angles[at].0, &bytes);
+                    let (out, counts) = readings(&response(&parts));
+                    let mut expected = all;
+                    expected[at] = None;
+                    assert_eq!(out.len(), 1, "{name} {wrong} {little}: {counts}");
+                    assert_eq!(
+                        [out[0].heading_deg, out[0].pitch_deg, out[0].roll_deg],
+                        expected,
+                        "{name} {wrong}"
+                    );
+                    assert_eq!(counts.left_out().collect::<Vec<_>>(), [(name, 1)]);
+                    assert_eq!((counts.used, counts.refused_total()), (1, 0));
+                }
+            }
+        }
+        // Without any angle there is no reading.
+        let none = [component(HEADING, &f32::NAN.to_be_bytes()), component(PITCH, &f32::NAN.to_be_bytes())];
+        let (out, counts) = readings(&response(&none));
+        assert_eq!((out.len(), counts.refused(Refusal::OutOfRange)), (0, 1));
     }
 
     proptest::proptest! {

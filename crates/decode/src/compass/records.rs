@@ -16,8 +16,8 @@ pub(super) struct RecordForm {
     pub length: usize,
     /// Index of the first summed byte: up to the last but one, modulo 256.
     pub summed_from: usize,
-    /// Reads a record; `None` where it has no attitude.
-    pub read: fn(&[u8], &mut Gathered) -> Result<Option<CompassReading>, Refusal>,
+    /// Reads a record; `None` where it has no attitude. Values left out are counted.
+    pub read: fn(&[u8], &mut Gathered, &mut DecodeCounts) -> Result<Option<CompassReading>, Refusal>,
 }
 
 /// Values from records before the one with the attitude.
@@ -58,7 +58,7 @@ impl RecordFramer {
             let record: Vec<u8> = self.buffer.drain(..).collect();
             let bytes_after = bytes.len() - 1 - index;
             let span = LineSpan { t_last: t_recv, bytes_after, bytes: record.len(), ..LineSpan::default() };
-            match (self.form.read)(&record, &mut self.gathered) {
+            match (self.form.read)(&record, &mut self.gathered, counts) {
                 Ok(Some(reading)) => {
                     counts.used += 1;
                     out.push(received(reading, span, span, counts));

@@ -25,15 +25,16 @@ pub(super) fn read(
     counts: &mut DecodeCounts,
 ) -> Result<Option<CompassReading>, Refusal> {
     match sentence.address() {
-        "VNYPR" | "VNYBA" | "VNYIA" => angles(sentence, 1).map(Some),
-        "VNYMR" => {
-            Ok(Some(CompassReading { inertial: inertial_at(sentence, 7, counts), ..angles(sentence, 1)? }))
-        }
+        "VNYPR" | "VNYBA" | "VNYIA" => angles(sentence, 1, counts).map(Some),
+        "VNYMR" => Ok(Some(CompassReading {
+            inertial: inertial_at(sentence, 7, counts),
+            ..angles(sentence, 1, counts)?
+        })),
         "VNQTN" => quaternion(sentence).map(Some),
         "VNQMR" => {
             Ok(Some(CompassReading { inertial: inertial_at(sentence, 8, counts), ..quaternion(sentence)? }))
         }
-        "VNINS" => inertial(sentence).map(Some),
+        "VNINS" => inertial(sentence, counts).map(Some),
         address if address.starts_with("VN") => Ok(None),
         _ => nmea::read(sentence, counts),
     }
@@ -53,18 +54,25 @@ fn inertial_at(sentence: &Sentence<'_>, first: usize, counts: &mut DecodeCounts)
     (force_mps2.is_some() || rate_rps.is_some()).then_some(InertialSample { rate_rps, force_mps2 })
 }
 
-fn angles(sentence: &Sentence<'_>, first: usize) -> Result<CompassReading, Refusal> {
+fn angles(
+    sentence: &Sentence<'_>,
+    first: usize,
+    counts: &mut DecodeCounts,
+) -> Result<CompassReading, Refusal> {
     if sentence.fields() < first + 2 {
         return Err(Refusal::Malformed);
     }
-    let angle = |index: usize| tilt(sentence.field(first + index));
-    let heading_deg = sentence.number(first, -360.0, 360.0)?.map(|yaw| yaw.rem_euclid(360.0));
-    let flagged = heading_deg.is_none();
+    let yaw = sentence.number(first, -360.0, 360.0);
+    let (pitch, roll) = (tilt(sentence.field(first + 1)), tilt(sentence.field(first + 2)));
+    if let (Err(why), Err(_), Err(_)) = (yaw, pitch, roll) {
+        return Err(why);
+    }
+    let heading_deg = optional(counts, "VN yaw", yaw).map(|yaw| yaw.rem_euclid(360.0));
     Ok(CompassReading {
         heading_deg,
-        pitch_deg: angle(1)?,
-        roll_deg: angle(2)?,
-        flagged,
+        pitch_deg: optional(counts, "VN pitch", pitch),
+        roll_deg: optional(counts, "VN roll", roll),
+        flagged: heading_deg.is_none(),
         ..CompassReading::default()
     })
 }
@@ -86,9 +94,9 @@ fn quaternion(sentence: &Sentence<'_>) -> Result<CompassReading, Refusal> {
 }
 
 /// Time, week, status (hexadecimal), yaw, pitch, roll, position, velocity, uncertainties.
-fn inertial(sentence: &Sentence<'_>) -> Result<CompassReading, Refusal> {
+fn inertial(sentence: &Sentence<'_>, counts: &mut DecodeCounts) -> Result<CompassReading, Refusal> {
     let status = u16::from_str_radix(sentence.field(3), 16).map_err(|_| Refusal::Malformed)?;
-    let mut reading = angles(sentence, 4)?;
+    let mut reading = angles(sentence, 4, counts)?;
     reading.heading_is_true = true;
     if !INS_MODES.contains(&(status & 3)) {
         reading.heading_deg = None;

@@ -10,7 +10,7 @@ use nalgebra::{Rotation3, Vector3};
 
 use super::reading::CompassReading;
 use super::records::{Gathered, RecordForm, figure};
-use crate::counts::Refusal;
+use crate::counts::{DecodeCounts, Refusal};
 use windhover_base::msg::InertialSample;
 
 /// Its records.
@@ -26,7 +26,11 @@ const FORCE_RANGE: f64 = 16.0 * 9.806_65;
 const RATE_RANGE: f64 = 2_000.0 * std::f64::consts::PI / 180.0;
 const ANGLE_RANGE: f64 = std::f64::consts::PI;
 
-fn read(record: &[u8], gathered: &mut Gathered) -> Result<Option<CompassReading>, Refusal> {
+fn read(
+    record: &[u8],
+    gathered: &mut Gathered,
+    _: &mut DecodeCounts,
+) -> Result<Option<CompassReading>, Refusal> {
     let figures = |range: f64| Vector3::new(2, 4, 6).map(|at| figure(record, at) * range / STEPS);
     match record.get(1) {
         Some(&FORCE) => gathered.force_mps2 = Some(in_body(&figures(FORCE_RANGE)).into()),

@@ -179,33 +179,34 @@ impl AutopilotDecoder {
                 let t = self.at(ms(q.time_boot_ms), t)?;
                 let [w, x, y, z] = [q.q1, q.q2, q.q3, q.q4].map(f64::from);
                 let q4 = Quaternion::new(w, x, y, z);
+                let rates = [q.rollspeed, q.pitchspeed, q.yawspeed];
                 if !(0.9..1.1).contains(&q4.norm()) {
-                    return Err(Refusal::OutOfRange);
+                    return self.attitude(t, [f64::NAN; 3], rates, out);
                 }
                 self.quaternion = Some(t);
                 let (heading, pitch, roll) =
                     euler_321(&UnitQuaternion::from_quaternion(q4).to_rotation_matrix());
-                self.attitude(t, heading, Tilt { pitch, roll }, [q.rollspeed, q.pitchspeed, q.yawspeed], out)
+                self.attitude(t, [heading, pitch, roll], rates, out)
             }
             MavMessage::ATTITUDE(a) => {
                 let t = self.at(ms(a.time_boot_ms), t)?;
                 if self.quaternion.is_some_and(|last| t - last < LATELY) {
                     return Ok(false);
                 }
-                let tilt = Tilt { pitch: a.pitch.into(), roll: a.roll.into() };
-                self.attitude(t, a.yaw.into(), tilt, [a.rollspeed, a.pitchspeed, a.yawspeed], out)
+                let angles = [a.yaw, a.pitch, a.roll].map(f64::from);
+                self.attitude(t, angles, [a.rollspeed, a.pitchspeed, a.yawspeed], out)
             }
             MavMessage::SCALED_IMU(imu) => {
                 let t = self.at(ms(imu.time_boot_ms), t)?;
                 let rate = Vector3::new(imu.xgyro, imu.ygyro, imu.zgyro).map(|x| f64::from(x) * 1e-3);
                 let force = Vector3::new(imu.xacc, imu.yacc, imu.zacc).map(|x| f64::from(x) * 1e-3 * GRAVITY);
-                Ok(self.inertial(t, rate, Some(force), out))
+                self.inertial(t, rate, Some(force), out)
             }
             MavMessage::HIGHRES_IMU(imu) if imu.id == 0 => {
                 let t = self.at(self.since_boot(imu.time_usec)?, t)?;
                 let rate = Vector3::new(imu.xgyro, imu.ygyro, imu.zgyro).map(f64::from);
                 let force = Vector3::new(imu.xacc, imu.yacc, imu.zacc).map(f64::from);
-                Ok(self.inertial(t, rate, Some(force), out))
+                self.inertial(t, rate, Some(force), out)
             }
             MavMessage::GPS_RAW_INT(fix) => self.fix(fix, t, out),
             MavMessage::GLOBAL_POSITION_INT(place) => self.position(place, t, out),
@@ -238,23 +239,38 @@ impl AutopilotDecoder {
         sent.is_some()
     }
 
+    /// Heading, pitch and roll, and the rates of turn; what is not finite or no angle is left out alone.
     fn attitude(
         &mut self,
         t: MonoTime,
-        heading: f64,
-        tilt: Tilt,
+        angles: [f64; 3],
         rates: [f32; 3],
         out: &mut Vec<ReceivedAutopilot>,
     ) -> Result<bool, Refusal> {
-        if ![heading, tilt.pitch, tilt.roll].iter().all(|angle| angle.is_finite() && angle.abs() < 7.0) {
+        let [heading, pitch, roll] = angles.map(|angle| Some(angle).filter(|angle| angle.abs() < 7.0));
+        let tilt = pitch.zip(roll).map(|(pitch, roll)| Tilt { pitch, roll });
+        let rates_wanted = self.forces.is_none_or(|last| t - last >= LATELY);
+        let rates = Vector3::from(rates).map(f64::from);
+        let rates_there = rates_wanted && is_finite(&rates);
+        if heading.is_none() && tilt.is_none() && !rates_there {
             return Err(Refusal::OutOfRange);
         }
-        let sample = AttitudeSample { heading: Some(heading), heading_is_true: true, tilt: Some(tilt) };
-        out.push(ReceivedAutopilot { t, measurement: AutopilotMeasurement::Attitude(sample) });
-        if self.forces.is_none_or(|last| t - last >= LATELY) {
-            self.inertial(t, Vector3::from(rates).map(f64::from), None, out);
+        self.left_out(heading.is_none(), "heading of the attitude");
+        self.left_out(tilt.is_none(), "pitch and roll of the attitude");
+        if heading.is_some() || tilt.is_some() {
+            let sample = AttitudeSample { heading, heading_is_true: true, tilt };
+            out.push(ReceivedAutopilot { t, measurement: AutopilotMeasurement::Attitude(sample) });
+        }
+        if rates_wanted {
+            self.inertial(t, rates, None, out)?;
         }
         Ok(true)
+    }
+
+    fn left_out(&mut self, is: bool, name: &'static str) {
+        if is {
+            self.frames.counts_mut().leave_out(name);
+        }
     }
 
     fn inertial(
@@ -263,13 +279,18 @@ impl AutopilotDecoder {
         rate: Vector3<f64>,
         force: Option<Vector3<f64>>,
         out: &mut Vec<ReceivedAutopilot>,
-    ) -> bool {
-        if force.is_some() {
+    ) -> Result<bool, Refusal> {
+        let (rate_rps, force_mps2) = (Some(rate).filter(is_finite), force.filter(is_finite));
+        self.left_out(rate_rps.is_none(), "rates of turn");
+        self.left_out(force.is_some() && force_mps2.is_none(), "specific forces");
+        if force_mps2.is_some() {
             self.forces = Some(t);
         }
-        let sample = InertialSample { rate_rps: Some(rate), force_mps2: force };
-        out.push(ReceivedAutopilot { t, measurement: AutopilotMeasurement::Inertial(sample) });
-        true
+        let sample = InertialSample { rate_rps, force_mps2 };
+        if rate_rps.is_some() || force_mps2.is_some() {
+            out.push(ReceivedAutopilot { t, measurement: AutopilotMeasurement::Inertial(sample) });
+        }
+        Ok(true)
     }
 
     fn fix(
@@ -284,13 +305,13 @@ impl AutopilotDecoder {
         }
         let boot = self.since_boot(fix.time_usec)?;
         let (lat_deg, lon_deg) = (f64::from(fix.lat) * 1e-7, f64::from(fix.lon) * 1e-7);
-        if lat_deg.abs() > 90.0 || lon_deg.abs() > 180.0 {
-            return Err(Refusal::OutOfRange);
-        }
+        let is_place = lat_deg.abs() <= 90.0 && lon_deg.abs() <= 180.0;
+        self.left_out(!is_place, "position of the fix");
         self.fix_usec = fix.time_usec;
         // A fix's own clock gives its time, never its arrival here.
         let t = self.clock.host(boot).unwrap_or(t);
-        let kind = fix_kind(fix.fix_type);
+        // Without its place it is no fix.
+        let kind = if is_place { fix_kind(fix.fix_type) } else { FixKind::None };
         let metres = |mm: u32| (mm > 0 && mm < u32::MAX).then(|| f64::from(mm) * 1e-3);
         let (across, up) = (metres(fix.h_acc), metres(fix.v_acc));
         let (speed, course) = (known(fix.vel).map(|v| v * 1e-2), known(fix.cog).map(|c| c * 1e-2));
@@ -350,6 +371,10 @@ impl AutopilotDecoder {
         out.push(ReceivedAutopilot { t, measurement: AutopilotMeasurement::Position(said) });
         Ok(true)
     }
+}
+
+fn is_finite(vector: &Vector3<f64>) -> bool {
+    vector.iter().all(|axis| axis.is_finite())
 }
 
 /// A number that is not the value for "unknown".

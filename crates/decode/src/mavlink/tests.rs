@@ -186,17 +186,86 @@ fn an_autopilot_that_starts_anew_is_followed() {
 }
 
 #[test]
-fn values_that_cannot_be_are_refused_and_noise_is_passed_over() {
-    let mut decoder = following();
-    for odd in [f32::NAN, f32::INFINITY, 1e9] {
-        assert_eq!(received(&mut decoder, &attitude(100_000, odd), at(0.0)), []);
+fn what_cannot_be_costs_only_itself() {
+    let parts = |messages: &[ReceivedAutopilot]| {
+        let (mut attitude, mut inertial) = (None, None);
+        for one in messages {
+            match one.measurement {
+                AutopilotMeasurement::Attitude(sample) => {
+                    attitude = Some((sample.heading.is_some(), sample.tilt.is_some()))
+                }
+                AutopilotMeasurement::Inertial(sample) => {
+                    inertial = Some((sample.rate_rps.is_some(), sample.force_mps2.is_some()))
+                }
+                _ => {}
+            }
+        }
+        (attitude, inertial)
+    };
+    for odd in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e9] {
+        let mut decoder = following();
+        let of = |roll, yaw, rollspeed| {
+            let sound = ATTITUDE_DATA { time_boot_ms: 100_000, ..ATTITUDE_DATA::DEFAULT };
+            MavMessage::ATTITUDE(ATTITUDE_DATA { roll, yaw, rollspeed, ..sound })
+        };
+        let mut shown = |message| parts(&received(&mut decoder, &message, at(0.0)));
+        assert_eq!(shown(of(0.1, odd, 0.0)), (Some((false, true)), Some((true, false))), "{odd}");
+        assert_eq!(shown(of(odd, 0.5, 0.0)), (Some((true, false)), Some((true, false))), "{odd}");
+        assert_eq!(shown(of(odd, odd, 0.0)), (None, Some((true, false))), "{odd}");
+        if !odd.is_finite() {
+            assert_eq!(shown(of(0.1, 0.5, odd)), (Some((true, true)), None), "{odd}");
+        }
+        assert_eq!(decoder.counts().refused_total(), 0, "{}", decoder.counts());
+        assert!(decoder.counts().left_out().count() >= 2, "{}", decoder.counts());
     }
+    let mut decoder = following();
+    let nothing = MavMessage::ATTITUDE(ATTITUDE_DATA {
+        time_boot_ms: 100_000,
+        roll: f32::NAN,
+        yaw: f32::NAN,
+        yawspeed: f32::NAN,
+        ..ATTITUDE_DATA::DEFAULT
+    });
+    assert_eq!(received(&mut decoder, &nothing, at(0.0)), []);
+    assert_eq!(decoder.counts().refused(crate::Refusal::OutOfRange), 1);
+    // A quaternion that is none leaves the rates.
     let zero = MavMessage::ATTITUDE_QUATERNION(ATTITUDE_QUATERNION_DATA {
         time_boot_ms: 100_000,
         ..Default::default()
     });
-    assert_eq!(received(&mut decoder, &zero, at(0.0)), []);
-    assert_eq!(decoder.counts().refused(crate::Refusal::OutOfRange), 4);
+    assert_eq!(parts(&received(&mut decoder, &zero, at(0.0))), (None, Some((true, false))));
+    let imu = |xgyro, zacc| {
+        MavMessage::HIGHRES_IMU(HIGHRES_IMU_DATA {
+            time_usec: 100_000_000,
+            xgyro,
+            zacc,
+            ..HIGHRES_IMU_DATA::DEFAULT
+        })
+    };
+    assert_eq!(parts(&received(&mut decoder, &imu(f32::NAN, -9.8), at(0.0))).1, Some((false, true)));
+    assert_eq!(parts(&received(&mut decoder, &imu(0.1, f32::NAN), at(0.0))).1, Some((true, false)));
+    // A place beyond the pole is no fix; the satellites are counted.
+    let fix = MavMessage::GPS_RAW_INT(GPS_RAW_INT_DATA {
+        time_usec: 100_000_000,
+        fix_type: GpsFixType::GPS_FIX_TYPE_3D_FIX,
+        lat: 910_000_000,
+        vel: 250,
+        cog: 9_000,
+        satellites_visible: 9,
+        ..GPS_RAW_INT_DATA::DEFAULT
+    });
+    let messages = received(&mut decoder, &fix, at(0.0));
+    let epoch = messages.iter().find_map(|one| match &one.measurement {
+        AutopilotMeasurement::Gnss(epoch) => Some(*epoch),
+        _ => None,
+    });
+    let epoch = epoch.expect("a fix without its place");
+    assert_eq!((epoch.lat_deg, epoch.lon_deg, epoch.fix, epoch.sats), (None, None, FixKind::None, Some(9)));
+}
+
+#[test]
+fn noise_is_passed_over() {
+    let mut decoder = following();
     // A frame among noise, in parts, and with one bit of another changed.
     let good = frame(1, 1, &attitude(100_100, 0.5));
     let mut bad = good.clone();
