@@ -198,3 +198,64 @@ fn rounded(value: f64, decimals: i32) -> f64 {
     let scale = 10f64.powi(decimals);
     (value * scale).round() / scale
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A flight that determines these constants to differ from their expected values.
+    fn refined(wrong: &[ConstantKind]) -> Refined {
+        let constant = |kind: &ConstantKind| Constant {
+            kind: *kind,
+            value: 0.02,
+            sigma: 1e-3,
+            prior: 0.0,
+            prior_sigma: 0.01,
+        };
+        Refined { constants: wrong.iter().map(constant).collect(), ..Refined::default() }
+    }
+
+    fn config() -> Config {
+        Config::parse(include_str!("../../../config/windhover.toml")).expect("the shipped configuration")
+    }
+
+    /// Three parts are printed; of four their names are given, each once, however many of their constants are wrong.
+    #[test]
+    fn of_too_many_wrong_parts_only_the_names_are_given() {
+        use ConstantKind as Kind;
+        let config = config();
+        let tag = Kind::Tag { target: 0, marker: 0, part: 0 };
+        let three = [Kind::GpsDelay, Kind::Mount(0), Kind::Mount(1), Kind::Mount(2), tag];
+        assert!(too_many(&refined(&three), &config).is_empty());
+        let toml = adopted(&refined(&three), &config);
+        let table: toml::Table = toml.parse().expect("TOML");
+        assert!(
+            table.contains_key("gps") && table.contains_key("camera") && table.contains_key("target"),
+            "{toml}"
+        );
+        let four = [&three[..], &[Kind::HeadingBias, Kind::TiltBias(0)]].concat();
+        let markers = format!("the markers of {}", config.target[0].name);
+        let named = ["the receiver's latency", "the compass's angles", "its mount", &markers];
+        assert_eq!(too_many(&refined(&four), &config), named);
+    }
+
+    /// What no key of the configuration holds, and what is within three sigmas, makes no part wrong.
+    #[test]
+    fn only_settled_parts_of_the_configuration_count() {
+        use ConstantKind as Kind;
+        let kinds = [
+            Kind::GpsDelay,
+            Kind::Focal,
+            Kind::Readout,
+            Kind::Drag,
+            Kind::Trim(0),
+            Kind::Iron(0),
+            Kind::Lens(0),
+        ];
+        let mut found = refined(&kinds);
+        found.constants[0].sigma = 9e-3;
+        assert!(too_many(&found, &config()).is_empty());
+        found.constants[0].sigma = 1e-3;
+        assert_eq!(too_many(&found, &config()).len(), 4);
+    }
+}
