@@ -34,7 +34,8 @@ stop() {
 trap stop EXIT
 trap 'exit 130' INT TERM
 keys="$folder/live/keys"
-"$windhover" simulate --live --duration "$seconds" --dir "$folder/live" > "$folder/live.log" 2>&1 &
+# At a smaller scale two processors have time for the browser too.
+"$windhover" simulate --live --scale 0.6 --duration "$seconds" --dir "$folder/live" > "$folder/live.log" 2>&1 &
 flight=$!
 until [ -s "$keys/station-demo.key" ]; do
     kill -0 "$flight" 2> /dev/null || { cat "$folder/live.log" >&2; exit 1; }
