@@ -64,7 +64,7 @@ build: setup
 debug: setup
 	$(CARGO) build --locked --bins --examples
 
-# A profile of its own, with less optimisation, takes a third of a release build; a release build that is there is used.
+# A profile of its own, with less optimisation, builds faster than release; a release build that is there is used.
 PROFILE = $(if $(wildcard target/release/windhover),release,demo)
 demo: setup
 	@test -x target/$(PROFILE)/windhover || echo "== building the program, once: some minutes on two processors (about 370 crates; the libraries for JPEG and H.264 take longest)"
