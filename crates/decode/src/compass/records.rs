@@ -16,9 +16,12 @@ pub(super) struct RecordForm {
     pub length: usize,
     /// Index of the first summed byte: up to the last but one, modulo 256.
     pub summed_from: usize,
-    /// Reads a record; `None` where it has no attitude. Values left out are counted.
-    pub read: fn(&[u8], &mut Gathered, &mut DecodeCounts) -> Result<Option<CompassReading>, Refusal>,
+    /// Reads a record.
+    pub read: Read,
 }
+
+/// Reads a record; `None` where it has no attitude. Values left out are counted.
+type Read = fn(&[u8], &mut Gathered, &mut DecodeCounts) -> Result<Option<CompassReading>, Refusal>;
 
 /// Values from records before the one with the attitude.
 #[derive(Clone, Copy, Debug, Default)]
