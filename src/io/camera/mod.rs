@@ -19,7 +19,7 @@ use tokio::sync::watch;
 use windhover_base::settings::PixelFormat;
 
 use super::clock::HostClock;
-use super::device::{Backoff, Fault, FaultKind, NoteKind, Report, Reports};
+use super::device::{Backoff, Fault, NoteKind, Report, Reports};
 use trigger::Counted;
 
 /// The requested settings of the camera.
@@ -114,7 +114,7 @@ async fn gstreamer(
     _delivered: &mut (dyn FnMut() + Send),
 ) -> Fault {
     let advice = "this windhover was built without GStreamer: build it with `cargo build --release --features gstreamer`";
-    Fault::new(FaultKind::Unsuitable, &settings.device, advice)
+    Fault::new(super::device::FaultKind::Unsuitable, &settings.device, advice)
 }
 
 /// Reports that a source of frames without controls cannot do what is requested.
