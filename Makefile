@@ -64,12 +64,11 @@ build: setup
 debug: setup
 	$(CARGO) build --locked --bins --examples
 
-# A profile of its own, with less optimisation, builds faster than release; a release build that is there is used.
-PROFILE = $(if $(wildcard target/release/windhover),release,demo)
+# The first build takes minutes on two processors: 370 crates, libjpeg-turbo and OpenH264 among them.
 demo: setup
-	@test -x target/$(PROFILE)/windhover || echo "== building the program, once: some minutes on two processors (about 370 crates; the libraries for JPEG and H.264 take longest)"
-	$(CARGO) build --profile $(PROFILE) --locked --bin windhover
-	@sh tests/demo.sh target/$(PROFILE)/windhover $(DEMO) $(WEB)
+	@test -x target/release/windhover || echo "== building the program, once: a quarter of an hour on two processors (about 370 crates; the libraries for JPEG and H.264 take longest)"
+	$(CARGO) build --release --locked --bin windhover
+	@sh tests/demo.sh target/release/windhover $(DEMO) $(WEB)
 
 test: setup-python
 	$(CARGO) test --locked --no-fail-fast
