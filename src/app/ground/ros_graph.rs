@@ -120,9 +120,12 @@ struct RosPublisher {
     _token: LivelinessToken,
 }
 
+/// A message and its attachment.
+type Message = (Vec<u8>, Vec<u8>);
+
 /// The last message of a latched topic with its attachment, for late subscribers.
 struct Latch {
-    last: Arc<Mutex<Option<(Vec<u8>, Vec<u8>)>>>,
+    last: Arc<Mutex<Option<Message>>>,
     _answers: Queryable<()>,
     _token: LivelinessToken,
 }
@@ -231,7 +234,7 @@ impl Latch {
     /// Zenoh's advanced subscribers find the publisher by a token of this name and ask it for its history there.
     fn declare(session: &Session, key: &str, entity: u32) -> zenoh::Result<Self> {
         let history = format!("{key}/@adv/pub/{}/{entity}/_", session.zid());
-        let last: Arc<Mutex<Option<(Vec<u8>, Vec<u8>)>>> = Arc::default();
+        let last: Arc<Mutex<Option<Message>>> = Arc::default();
         let (kept, key) = (Arc::clone(&last), key.to_owned());
         let answers = session
             .declare_queryable(history.clone())

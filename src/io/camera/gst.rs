@@ -92,7 +92,9 @@ struct Running(gst::Pipeline);
 impl Drop for Running {
     fn drop(&mut self) {
         let pipeline = self.0.clone();
-        let stop = move || drop(pipeline.set_state(gst::State::Null));
+        let stop = move || {
+            let _ = pipeline.set_state(gst::State::Null);
+        };
         // Without a thread there is no memory for one either: the pipeline stops with its last reference.
         let _ = std::thread::Builder::new().name("gst-stop".into()).spawn(stop);
     }
