@@ -67,7 +67,7 @@ fn compare(flight: &Path, station: &Path) -> Result<serde_json::Value, ReadError
         "topics": topics.len(),
         "flown": flown.values().sum::<u32>(),
         "received": received.values().sum::<u32>(),
-        "received_twice": received.iter().filter(|(m, count)| flown.get(*m).is_some_and(|f| f < count)).count(),
+        "received_twice": received.iter().filter(|(m, count)| flown.get(*m).is_some_and(|f| f < *count)).count(),
         "only_flown": only_flown.len(),
         "only_flown_since_ns": only_flown.first(),
         "only_received": only_received.len(),

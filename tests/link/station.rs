@@ -78,6 +78,8 @@ fn alone(keys: &Keys, web: SocketAddr) -> GroundSettings {
         foxglove: None,
         #[cfg(feature = "zenoh")]
         zenoh: None,
+        #[cfg(feature = "zenoh")]
+        ros: None,
         terminal: false,
     }
 }
