@@ -60,7 +60,7 @@ pub mod columns {
     pub const TILT_BIAS: Range<usize> = own::TILT_BIAS.range();
     /// How much older the receiver's fixes are than configured, s.
     pub const GPS_DELAY: Range<usize> = own::GPS_DELAY.range();
-    /// How much older the receiver's velocity is than its position, s.
+    /// Time constant of the low-pass that the receiver applies to velocity, s.
     pub const VELOCITY_DELAY: Range<usize> = own::VELOCITY_DELAY.range();
     /// Drag, 1/s.
     pub const DRAG: Range<usize> = own::DRAG.range();

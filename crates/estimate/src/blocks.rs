@@ -102,7 +102,7 @@ pub(crate) mod own {
     /// How much longer than configured the camera takes from its first row to its last, s.
     pub(crate) const READOUT: Block<1> = Block::after(LENS);
 
-    /// How much older the receiver's velocity is than its position, s.
+    /// Time constant of the low-pass that the receiver applies to velocity, s.
     pub(crate) const VELOCITY_DELAY: Block<1> = Block::after(READOUT);
 
     /// Constant error of the gyros, body axes, rad/s. From here on only where there is an IMU.

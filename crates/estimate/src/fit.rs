@@ -229,20 +229,37 @@ mod tests {
 
     use super::*;
 
-    /// Feeds innovations of a sigma this large and a mean this large, at 5 Hz for a minute.
-    fn fed(sigma: f64, mean: f64) -> Fit {
-        let mut fit = Fit::default();
-        let mut innovation = [0.0; MAX_MEASURED];
+    /// Feeds innovations of two components at 5 Hz for a minute; `next` makes each from the one before.
+    fn taken(mut next: impl FnMut(u32, &mut [f64])) -> Fit {
+        let (mut fit, mut innovation) = (Fit::default(), [0.0; MAX_MEASURED]);
         for k in 0..300 {
-            // Two components of a deterministic sequence of unit variance.
-            let angle = 2.4 * f64::from(k);
-            innovation[0] = mean + sigma * 2f64.sqrt() * angle.sin();
-            innovation[1] = mean + sigma * 2f64.sqrt() * angle.cos();
+            next(k, &mut innovation[..2]);
             let squared = innovation[0].powi(2) + innovation[1].powi(2);
             let t = MonoTime::from_ns(1_000_000_000) + Span::from_s(0.2 * f64::from(k));
             fit.take(t, squared, &innovation, &[1.0; MAX_MEASURED], 2, false);
         }
         fit
+    }
+
+    /// Innovations of a sigma this large and a mean this large.
+    fn fed(sigma: f64, mean: f64) -> Fit {
+        taken(|k, innovation| {
+            // Two components of a deterministic sequence of unit variance.
+            let angle = 2.4 * f64::from(k);
+            innovation[0] = mean + sigma * 2f64.sqrt() * angle.sin();
+            innovation[1] = mean + sigma * 2f64.sqrt() * angle.cos();
+        })
+    }
+
+    /// A first-order autoregressive sequence of unit variance with this correlation.
+    fn coloured(correlation: f64) -> Fit {
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        taken(|_, innovation| {
+            for one in innovation {
+                let new: f64 = StandardNormal.sample(&mut rng);
+                *one = correlation * *one + (1.0 - correlation * correlation).sqrt() * new;
+            }
+        })
     }
 
     #[test]
@@ -261,22 +278,6 @@ mod tests {
         assert!(cause == MisfitCause::Bias && (-1.0..-0.8).contains(&figure), "{figure}");
         // The noise that the filter has learnt counts too.
         assert!(fed(1.0, 0.0).misfit(4.0).is_some());
-    }
-
-    /// Feeds a first-order autoregressive sequence of unit variance with this correlation, at 5 Hz for a minute.
-    fn coloured(correlation: f64) -> Fit {
-        let mut rng = ChaCha8Rng::seed_from_u64(7);
-        let (mut fit, mut innovation) = (Fit::default(), [0.0; MAX_MEASURED]);
-        for k in 0..300 {
-            for one in &mut innovation[..2] {
-                let new: f64 = StandardNormal.sample(&mut rng);
-                *one = correlation * *one + (1.0 - correlation * correlation).sqrt() * new;
-            }
-            let squared = innovation[0].powi(2) + innovation[1].powi(2);
-            let t = MonoTime::from_ns(1_000_000_000) + Span::from_s(0.2 * f64::from(k));
-            fit.take(t, squared, &innovation, &[1.0; MAX_MEASURED], 2, false);
-        }
-        fit
     }
 
     #[test]

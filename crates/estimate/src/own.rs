@@ -45,7 +45,7 @@ pub(crate) struct Own {
     pub(crate) lens: Vector4<f64>,
     /// How much longer than configured the camera takes from its first row to its last, s.
     pub(crate) readout_s: f64,
-    /// How much older the receiver's velocity is than its position, s.
+    /// Time constant of the low-pass that the receiver applies to velocity, s.
     pub(crate) velocity_delay_s: f64,
     /// Of the gyros, rad/s, and of the accelerometers, m/s², body axes.
     pub(crate) rate_bias: Vector3<f64>,

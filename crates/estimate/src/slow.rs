@@ -107,7 +107,7 @@ const SLOW: [Slow; 23] = [
     Slow {
         first: place(own::COMPASS_DELAY),
         mean: |own| std::slice::from_mut(&mut own.compass_delay_s),
-        // Filters of compasses and drivers of cameras have tens of milliseconds that no data sheet tells.
+        // Filters of compasses and drivers of cameras have tens of milliseconds that no data sheet gives.
         start_var: |_| [0.03f64.powi(2); 3],
         wander: Drift::Walk(1e-4),
     },

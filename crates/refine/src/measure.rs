@@ -2,7 +2,7 @@
 //! measurement, with the columns that only a whole flight can determine: delays, mount, places, focal length, read-out,
 //! iron.
 
-use nalgebra::{Matrix3, Vector2, Vector3};
+use nalgebra::{Vector2, Vector3};
 
 use windhover_estimate::batch::{Linear, columns};
 
@@ -215,18 +215,6 @@ impl Instant<'_> {
             let from_principal = seen[k] - linear.residual(k) - displaced[k] - lens.principal_px[k];
             self.constant(row + k, constant::FOCAL, from_principal, rows);
             self.constant(row + k, constant::READOUT, share * flow[k], rows);
-        }
-    }
-
-    /// Adds what a receiver that smooths its velocity makes of jerk, the turning of the thrust with the body: `s da/dt`.
-    pub(crate) fn smoothed(&self, smoothing_s2: f64, residual: &mut [f64], rows: &mut Rows) {
-        let [x, y, z] = [0, 1, 2].map(|i| self.pushed.1[i].1);
-        let by_rate = Matrix3::from_columns(&[x, y, z]) * self.state.attitude.matrix();
-        let jerk = by_rate * self.state.three(knot::RATE);
-        for (row, left) in residual.iter_mut().enumerate() {
-            *left -= smoothing_s2 * jerk[row];
-            self.constant(row, constant::VELOCITY_SMOOTHING, jerk[row], rows);
-            (0..3).for_each(|i| rows.add(row, self.at + knot::RATE + i, smoothing_s2 * by_rate[(row, i)]));
         }
     }
 

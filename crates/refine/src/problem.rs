@@ -228,11 +228,7 @@ impl<'a> Pass<'a> {
                 let flows = instant.write(&linear, &mut self.rows);
                 instant.timed(&flows, constant::CAMERA_DELAY, 1.0, &mut self.rows);
                 instant.antenna(&linear, &mut self.rows);
-                let mut residual: Vec<f64> = (0..linear.len()).map(|i| linear.residual(i)).collect();
-                if source == Source::GpsVelocity {
-                    let smoothing_s2 = values.constants[constant::VELOCITY_SMOOTHING];
-                    instant.smoothed(smoothing_s2, &mut residual, &mut self.rows);
-                }
+                let residual: Vec<f64> = (0..linear.len()).map(|i| linear.residual(i)).collect();
                 let (noise, factor) = (|a, b| linear.noise(a, b), noise.of(source));
                 if measure::finish(&self.rows, noise, &residual, factor, &mut self.block) {
                     take(Origin::of(source), &self.block);

@@ -84,10 +84,8 @@ pub enum ConstantKind {
     Focal,
     /// A distortion term of the lens relative to its configuration: k1, k2, p1, p2; of a fisheye its four.
     Lens(usize),
-    /// How much older the receiver's velocity is than its position: receivers filter velocity longer.
+    /// Time constant of the low-pass that the receiver applies to velocity and not to position.
     VelocityDelay,
-    /// How far the receiver smooths its velocity beyond delaying it, s²: `v − a τ + s da/dt`; a filter of first order has τ².
-    VelocitySmoothing,
     /// Of a tag: logarithm of its size over that configured; place forward, right; turn.
     Tag {
         /// Index of the target.
@@ -102,10 +100,7 @@ pub enum ConstantKind {
 impl ConstantKind {
     /// Whether its expected value is from the configuration.
     const fn is_configured(self) -> bool {
-        !matches!(
-            self,
-            Self::Trim(_) | Self::Drag | Self::TiltShare | Self::VelocityDelay | Self::VelocitySmoothing
-        )
+        !matches!(self, Self::Trim(_) | Self::Drag | Self::TiltShare | Self::VelocityDelay)
     }
 }
 
@@ -127,8 +122,7 @@ pub(crate) mod constant {
     pub(crate) const FOCAL: usize = 24;
     pub(crate) const LENS: usize = 25;
     pub(crate) const VELOCITY_DELAY: usize = 29;
-    pub(crate) const VELOCITY_SMOOTHING: usize = 30;
-    pub(crate) const TAGS: usize = 31;
+    pub(crate) const TAGS: usize = 30;
 }
 
 /// The prior of a constant.
@@ -211,7 +205,6 @@ const FOCAL: f64 = 0.005;
 const LENS: [f64; 4] = [0.02, 0.02, 0.0005, 0.0005];
 /// Receivers filter velocity over some tenths of a second, s.
 const VELOCITY_DELAY: f64 = 0.1;
-const VELOCITY_SMOOTHING: f64 = 0.02;
 /// A tag as printed and glued on: share of its size, m, m, rad.
 const TAG: [f64; TAG_COLUMNS] = [0.005, 0.01, 0.01, 0.0175];
 
@@ -243,7 +236,6 @@ pub(crate) fn priors(rig: &Rig, predictor: &Predictor, share: Option<f64>, blind
     all.push(prior(Kind::Focal, FOCAL));
     all.extend((0..4).map(|i| prior(Kind::Lens(i), LENS[i])));
     all.push(prior(Kind::VelocityDelay, VELOCITY_DELAY));
-    all.push(prior(Kind::VelocitySmoothing, VELOCITY_SMOOTHING));
     let mut last = None;
     for (target, marker) in predictor.tags() {
         // Place and yaw of a target's first tag define the target's frame.

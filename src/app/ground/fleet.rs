@@ -177,9 +177,7 @@ impl Fleet {
             let _ = self.publish.try_send(sample);
         }
     }
-}
 
-impl Fleet {
     /// Takes a picture of a payload's camera; only ROS has a topic for it.
     pub fn thumbnail(&self, payload: &Arc<str>, thumbnail: &Thumbnail) {
         if let Some(ros) = &self.ros {

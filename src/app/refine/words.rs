@@ -42,7 +42,6 @@ pub fn constant_words(kind: ConstantKind, targets: &[TargetConfig]) -> ConstantW
         Kind::CameraAt(i) => (format!("camera_{}", AXES[i]), metre),
         Kind::AntennaAt(i) => (format!("antenna_{}", AXES[i]), metre),
         Kind::VelocityDelay => ("gps_velocity_delay".into(), ms),
-        Kind::VelocitySmoothing => ("gps_velocity_smoothing".into(), ("s^2", 1.0)),
         Kind::Focal => ("focal_length".into(), percent),
         Kind::Lens(i) => (format!("lens_{}", LENS[i]), ("", 1.0)),
         Kind::Tag { target, marker, part } => {

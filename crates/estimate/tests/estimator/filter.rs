@@ -182,7 +182,7 @@ fn the_order_of_arrival_does_not_matter() {
         inputs.iter().chain([&last]).for_each(|h| h.give(&mut filter, &mut out));
         let state =
             out.iter().rev().find_map(|o| if let EstimatorOutput::Ownship(s) = o { Some(*s) } else { None });
-        state.expect("a frame tells the helicopter's state")
+        state.expect("a frame gives the helicopter's state")
     };
     // From the same start: everything in order of validity and received at once, compared with the order of arrival.
     let mut in_order = flight.inputs.clone();

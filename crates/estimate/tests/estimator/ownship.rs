@@ -74,7 +74,7 @@ fn at_a_frame_it_is_that_frames() {
         EstimatorOutput::Ownship(own) => Some(*own),
         _ => None,
     });
-    let of_frame = of_frame.expect("a frame tells the helicopter's state");
+    let of_frame = of_frame.expect("a frame gives the helicopter's state");
     assert_eq!(of_frame.frame, Some(77));
     assert_eq!(filter.ownship(t), Some(Ownship { frame: None, ..of_frame }));
 }
